@@ -282,7 +282,7 @@ def test_commands_pack_and_describe(folder, tmp_path):
 def test_shipped_bundle_is_small_and_wide():
     info = read_bundle().info
     assert info.name == "wfsat" and info.subpixel
-    assert shipped_path().stat().st_size <= stage.LARGEST_SHIPPED
+    assert shipped_path().stat().st_size <= stage.MAX_SHIPPED_BYTES
     assert info.snr_min < 5 and info.snr_max > 500
     faint = [row["mse"] / row["mse_noisy"] for row in info.metrics if row["snr"] < 50]
     assert len(faint) >= 3 and max(faint) < 0.2
@@ -307,7 +307,7 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     rows = [row | {"coverage68": 0.5} for row in tiny.info.metrics]
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
-    with pytest.raises(BundleError, match=r"error68 holds 50\.0%"):
+    with pytest.raises(BundleError, match=r"error68 contains 50\.0%"):
         stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
 
 

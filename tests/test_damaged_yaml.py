@@ -10,7 +10,7 @@ from command_line import refused as refusal
 from psfdae.files import ProductError
 from psfdae.reading import read_yaml
 from psfdae_paper.configuration import compose
-from psfdae_paper.configuration.compose import config_dir, forget, load
+from psfdae_paper.configuration.compose import clear_caches, config_dir, load
 
 
 @pytest.fixture
@@ -18,9 +18,9 @@ def folder(tmp_path, monkeypatch):
     """A copy of the configuration that commands take instead."""
     shutil.copytree(config_dir(), tmp_path / "config")
     monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
-    forget()
+    clear_caches()
     yield tmp_path / "config"
-    forget()
+    clear_caches()
 
 
 GOOD = b"# One.\nepochs: 12\nbatch: 32"
@@ -63,17 +63,17 @@ def test_a_network_s_configuration_is_texts_and_numbers(tmp_path, text, words):
 
 
 def test_a_kept_composition_is_whole_and_up_to_date(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(compose, "KEPT", [tmp_path / "kept"])
+    monkeypatch.setattr(compose, "CACHE_FOLDERS", [tmp_path / "kept"])
     first = load()
     (kept,) = (tmp_path / "kept").iterdir()
-    forget()
+    clear_caches()
     with monkeypatch.context() as patch:
         patch.setattr(compose, "_by_hydra", None)
         assert load() == first
     kept.write_bytes(kept.read_bytes().replace(b"0", b"1", 1))
-    forget()
+    clear_caches()
     assert load() == first
     path = folder / "config.yaml"
     path.write_text(path.read_text().replace(f"seed: {first.seed}", "seed: 7"))
-    forget()
+    clear_caches()
     assert load().seed == 7

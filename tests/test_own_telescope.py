@@ -9,7 +9,7 @@ from astropy.io import fits
 
 from command_line import psfdae
 from docs_pages import commands, read
-from psfdae_paper.configuration.compose import config_dir, forget
+from psfdae_paper.configuration.compose import clear_caches, config_dir
 from workflow_runs import planned
 
 STARS = ["grid.points=3", "stars.count=200"]
@@ -39,9 +39,9 @@ def workshop(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PSFDAE_CONFIG", str(folder / "config"))
         patch.chdir(folder)
-        forget()
+        clear_caches()
         yield folder
-    forget()
+    clear_caches()
 
 
 def words(program):

@@ -36,7 +36,7 @@ def sweep(tmp_path, monkeypatch):
     folder = tmp_path / "config"
     shutil.copytree(config_dir(), folder)
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.forget()
+    compose.clear_caches()
 
     def plan(tree, *given, name="tried"):
         text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
@@ -44,7 +44,7 @@ def sweep(tmp_path, monkeypatch):
         return plan_sweep(name, ("preset=smoke", *given))
 
     yield plan
-    compose.forget()
+    compose.clear_caches()
 
 
 @pytest.mark.parametrize("name", sweep_names())
@@ -185,7 +185,7 @@ def test_asking_is_a_function_of_what_is_known():
 def test_trial_waits_for_all_but_those_beside_it(sweep):
     tree = {**GRID, "kind": "adaptive", "trials": 5, "parallel": 2}
     plan = sweep(tree)
-    slots = [[other.slot for other in plan.known(p)] for p in plan.points.values()]
+    slots = [[other.slot for other in plan.earlier_trials(p)] for p in plan.points.values()]
     assert slots == [[], [], [0], [0, 1], [0, 1, 2]]
 
 

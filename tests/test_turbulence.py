@@ -14,8 +14,8 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.fields import square_grid
 from psfdae_paper.stars.scenes import template_wavefronts
 from psfdae_paper.stars.turbulence import (
+    HALF_FRIED_CONSTANT,
     SPECTRUM,
-    STRENGTH,
     Footprints,
     draw_waves,
     fitted_planes,
@@ -55,7 +55,7 @@ def disc(axis):
 
 def test_limits_of_the_structure_function():
     """Kolmogorov's law far below the outer scale, twice the variance far above it."""
-    constants = np.array([2 * STRENGTH, SPECTRUM])
+    constants = np.array([2 * HALF_FRIED_CONSTANT, SPECTRUM])
     assert constants == pytest.approx([6.88, 0.0229], rel=2e-3)
     separation = np.array([0.005, 1.0])
     ratio = structure_function(separation, R0, L0) / (6.88 * (separation / R0) ** (5 / 3))

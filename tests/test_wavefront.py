@@ -106,7 +106,7 @@ def test_one_posterior_serves_both_references(data, fitted, noisy):
     other = replace(kind, data=replace(data, reference="template"))
     position = data.positions[-TEST:][:4]
     posterior = kind.posterior(noisy[:4], LEVEL, position)
-    found = other.estimated(*posterior, noisy[:4], LEVEL, position)
+    found = other.estimate_from_posterior(*posterior, noisy[:4], LEVEL, position)
     field = (position @ [1, kind.bank.points]).astype(int)
     static = kind.static[field].astype(float)
     apart = np.abs(found.psf[:, None] - static).max(axis=(2, 3)).min(axis=1)

@@ -1,4 +1,4 @@
-"""What code a stage consists of, and which commit it is: a workflow reruns what changed."""
+"""Hash of the code of a stage, by which a workflow reruns it if it has changed, and git commit."""
 
 from __future__ import annotations
 
@@ -16,18 +16,24 @@ SOURCES = Path(__file__).resolve().parents[1]
 
 
 def source_hash(*names: str, chosen: Iterable[str] = ()) -> str:
-    """Hash of modules and of all modules of the packages that they import, and these, and so on.
+    """Return the hash of modules and of all modules of the packages on which they depend.
 
-    Docstrings, comments and formatting do not count, nor do imports that only annotations or
-    decorators use. What is imported by a computed name is not seen: it is `chosen`.
+    These are the modules that they import, the modules that those import, and so on. Docstrings,
+    comments and formatting do not count, nor do imports that only annotations or decorators use.
+    Modules that are imported by a computed name cannot be recognised; name them in `chosen`.
 
     Parameters
     ----------
     *names : str
         Commands, such as "figure templates"; modules; or files of programs, relative to the
-        repository, whose imports are looked for beside them, too.
+        repository, whose imports are also searched in their folder.
     chosen : iterable of str
         Further modules, such as that of the method that is fitted.
+
+    Returns
+    -------
+    str
+        16 hexadecimal digits.
 
     Raises
     ------
@@ -36,40 +42,45 @@ def source_hash(*names: str, chosen: Iterable[str] = ()) -> str:
     """
     commands = found()
     queue = [commands[name][0] if name in commands else name for name in (*names, *chosen)]
-    reached = dict.fromkeys(queue)
+    # Breadth-first search of the imports; the list grows while it is processed.
+    digests = dict.fromkeys(queue)
     for name in queue:
-        reached[name], imported = _module(name)
-        queue += [other for other in imported if other not in reached]
-        reached |= {other: reached.get(other) for other in imported}
-    listed = "\n".join(f"{name} {digest}" for name, digest in sorted(reached.items()))
-    return hashlib.sha256(listed.encode()).hexdigest()[:16]
+        digests[name], imported = _module(name)
+        queue += [module for module in imported if module not in digests]
+        digests |= {module: digests.get(module) for module in imported}
+    lines = "\n".join(f"{name} {digest}" for name, digest in sorted(digests.items()))
+    return hashlib.sha256(lines.encode()).hexdigest()[:16]
 
 
 @cache
 def _module(name: str) -> tuple[str, list[str]]:
-    """Digest of a module, or of a program's file, and the modules that it imports."""
+    """Return the digest of a module, or of a program's file, and the modules that it imports."""
     path = SOURCES.parent / name if name.endswith(".py") else _path(name)
     if path is None or not path.is_file():
         raise ValueError(f"{name}: no such command, module or file")
     tree = ast.parse(path.read_bytes())
     parts = [ast.dump(_without_docstrings(tree))]
-    if path.name == "__init__.py":  # its package may have tables
+    # A package may have tables, which its functions read.
+    if path.name == "__init__.py":
         data = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix != ".py")
         parts += [f"{p.name} {hashlib.sha256(p.read_bytes()).hexdigest()}" for p in data]
-    beside = path.parent if name.endswith(".py") else None
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest(), [*_imported(tree, beside)]
+    program_folder = path.parent if name.endswith(".py") else None
+    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    return digest, [*_imported(tree, program_folder)]
 
 
 def _path(module: str) -> Path | None:
-    """File of a module of the packages; None for those of others."""
+    """Return the file of a module of the packages; None for modules of other packages."""
     path = SOURCES.joinpath(*module.split("."))
     files = (path.with_suffix(".py"), path / "__init__.py")
     return next((file for file in files if file.is_file()), None)
 
 
-def _imported(tree: ast.Module, beside: Path | None) -> Iterator[str]:
-    used = _used(tree)
+def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
+    """Yield the modules of the packages that a module imports, and files beside a program."""
+    used = _used_names(tree)
     for node in ast.walk(tree):
+        # `from a import b` imports the module a.b if there is one, else the module a.
         if isinstance(node, ast.Import):
             candidates = [[alias.name] for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -79,38 +90,43 @@ def _imported(tree: ast.Module, beside: Path | None) -> Iterator[str]:
             continue
         for modules in candidates:
             yield from [module for module in modules if _path(module)][:1]
-            file = beside and beside / f"{modules[-1]}.py"
+            file = program_folder and program_folder / f"{modules[-1]}.py"
             if file and file.is_file():
                 yield str(file.relative_to(SOURCES.parent))
 
 
-def _used(tree: ast.Module) -> set[str]:
-    """Names that code uses, but for annotations and decorators."""
-    unused = set()
+def _used_names(tree: ast.Module) -> set[str]:
+    """Return the names that code uses, without those of annotations and decorators."""
+    ignored_nodes = set()
     for node in ast.walk(tree):
         parts = [getattr(node, name, None) for name in ("annotation", "returns")]
         for part in [*parts, *getattr(node, "decorator_list", ())]:
-            unused |= {id(inner) for inner in ast.walk(part)} if part else set()
+            ignored_nodes |= {id(child) for child in ast.walk(part)} if part else set()
     names = (node for node in ast.walk(tree) if isinstance(node, ast.Name))
-    return {node.id for node in names if id(node) not in unused}
+    return {node.id for node in names if id(node) not in ignored_nodes}
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
+    """Remove all statements that are only a constant, such as docstrings, from a syntax tree."""
+
+    def is_text(statement: ast.stmt) -> bool:
+        return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
-            node.body = [s for s in body if not _is_text(s)]  # type: ignore[attr-defined]
+            node.body = [s for s in body if not is_text(s)]  # type: ignore[attr-defined]
     return tree
 
 
-def _is_text(statement: ast.stmt) -> bool:
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-
-
 def git_commit() -> str:
-    """Commit of the source tree; "-dirty" if it differs from it, "unknown" outside git."""
+    """Return the commit of the source tree.
+
+    It ends in "-dirty" if files differ from the commit, and is "unknown" outside git.
+    """
     try:
-        # Installed into an environment inside somebody else's repository, it is not ours.
+        # A package that is installed into an environment inside another repository does not
+        # belong to that repository.
         if Path(git("rev-parse", "--show-toplevel")).resolve() != SOURCES.parent:
             return "unknown"
         dirty = "-dirty" if git("status", "--porcelain", "--untracked-files=no") else ""
@@ -120,6 +136,6 @@ def git_commit() -> str:
 
 
 def git(*arguments: str) -> str:
-    """What git says of the folder that the package lies in; CalledProcessError, OSError."""
+    """Return the output of git in the folder of the package; CalledProcessError, OSError."""
     command = ["git", "-C", str(SOURCES.parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

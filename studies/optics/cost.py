@@ -31,7 +31,7 @@ from psfdae_paper.stages.evaluate import estimators
 
 DATASET, LEVEL, REFERENCE = "dataset3", 1e-3, "realisation"
 REPEATS = 3
-DEFAULT = {"starts": None, "draws": wavefront.DRAWS}
+DEFAULT = {"starts": None, "draws": wavefront.DRAWS_PER_STAR}
 EFFORTS = (
     {"starts": 1, "draws": 25},
     {"starts": 2, "draws": 50},
@@ -84,7 +84,7 @@ def main(results: Path, out: Path, picture: Path) -> None:
             starts = effort["starts"]
             few = {"fields": starts, "offsets": starts} if starts else {}
             sampling.SEARCH = usual._replace(**few)
-            wavefront.DRAWS = effort["draws"]
+            wavefront.DRAWS_PER_STAR = effort["draws"]
             chosen = usual.offsets if kind.needs.position else usual.fields
             add(kind, fitted, effort | {"starts": starts or chosen}, repeats=1)
     commit = subprocess.run(

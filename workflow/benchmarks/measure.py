@@ -85,7 +85,8 @@ def cost_of_command(words, out, tree=None):
     (name, *given), before = [*map(str, words), "--out", str(out)], _files(out.parent)
     with TemporaryDirectory() as folder:
         if tree is not None:
-            reads = stage(name).stage.settings.of({"name": given[0]})  # of the method that it names
+            # A command that fits a method reads the groups of the method that it names.
+            reads = stage(name).stage.settings.names({"name": given[0]})
             settings = write_settings(Path(folder), name, reads, tree)
             given += ["--config", str(settings)]
         resting, start, start_cpu = _memory("VmRSS", forget=True), perf_counter(), process_time()

@@ -22,7 +22,7 @@ from psfdae.reading import read_table, read_yaml
 from psfdae.settings import Group, Reference
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import config_dir, decisive, load_file, part
+from psfdae_paper.configuration.compose import config_dir, decisive_settings, load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config
@@ -82,7 +82,7 @@ def knee_table(
     test = star_sets.split_stars(product, "random", config).test
     images, levels = product["realisation"][test], config.noise.levels
     noisy = {level: star_sets.noisy_test_images(config, product, test, level) for level in levels}
-    configured = decisive(config.model_dump(include={"dae", "train"}))
+    configured = decisive_settings(config.model_dump(include={"dae", "train"}))
     rows, idle = [], []
     for name, folder in folders.items():
         network = Dae.load(folder, evaluation=config.evaluation)
@@ -110,7 +110,7 @@ def settings_of(folder, configured):
     """What a training was, and whether it is the one that the configuration uses."""
     from psfdae.method import CONFIG
 
-    tree = decisive(read_yaml(folder / CONFIG))
+    tree = decisive_settings(read_yaml(folder / CONFIG))
     same = tree["parts"]["test_stars"] > 1
     row = {"width": max(tree["dae"]["widths"])}
     row |= {key: tree["train"][key] for key in ("epochs", "batch", "lr", "schedule", "noise")}

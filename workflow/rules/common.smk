@@ -17,11 +17,11 @@ from psfdae.settings import ConfigError, as_overrides
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir
-from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load
+from psfdae_paper.configuration.compose import compose, dataset_names, decisive_settings, load
 from psfdae_paper.configuration.compose import (
-    keep_in,
+    cache_compositions,
     load_groups,
-    neutral,
+    neutral_settings,
     overrides_for,
 )
 from psfdae_paper.configuration.compose import write_settings
@@ -32,7 +32,7 @@ from psfdae.files import DIGESTS, ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
-keep_in(Path(".snakemake/compositions"))
+cache_compositions(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
@@ -125,7 +125,7 @@ def settings(name, /, *choice, more=(), **options):
     program, _, function = name.rpartition(".")
     stage_of = getattr(import_module(program), function) if program else stage(name)
     spec = stage_of.stage.settings
-    reads = spec.of(options)
+    reads = spec.names(options)
     tree = composed(*spec.choice, *choice, more=more)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.

@@ -41,7 +41,7 @@ def sweep_data(w):
 
 def sweep_known(w):
     """Results that a trial of an adaptive sweep learns from."""
-    known = sweep_plan(w.sweep).known(sweep_point_of(w))
+    known = sweep_plan(w.sweep).earlier_trials(sweep_point_of(w))
     return [f"{SWEEPS}/{w.sweep}/points/{point.name}/result.json" for point in known]
 
 
@@ -63,7 +63,7 @@ def sweep_options(w):
     if point.slot is not None:
         search = json.dumps(plan.search, sort_keys=True)
         options += [f"--slot={point.slot}", f"--search={search}"]
-        options += [f"--known={other.name}" for other in plan.known(point)]
+        options += [f"--known={other.name}" for other in plan.earlier_trials(point)]
     return options
 
 

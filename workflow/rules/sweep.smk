@@ -37,8 +37,8 @@ rule sweep_point:
     resources:
         mem_mb=2000,
     params:
-        config=lambda w: as_overrides(decisive(sweep_point_of(w).config)),
-        free=lambda w, threads: as_overrides(neutral(sweep_point_of(w).config)),
+        config=lambda w: as_overrides(decisive_settings(sweep_point_of(w).config)),
+        free=lambda w, threads: as_overrides(neutral_settings(sweep_point_of(w).config)),
         options=sweep_options,
         data=lambda w, input: [
             word for role in sweep_data(w) for word in ("--data", role, input[role])

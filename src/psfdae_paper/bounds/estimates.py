@@ -29,7 +29,7 @@ from psfdae_paper.bounds.tight import Evidence
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, relative_field
 from psfdae_paper.stars.framing import Propagation
-from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
+from psfdae_paper.stars.scenes import aberration_columns, star_wavefronts, template_wavefronts
 
 SPLIT = "random"
 """The split that is bounded: its test stars lie in all fields."""
@@ -191,7 +191,7 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
         ),
         "field_index": Column(star_field, "1", "field of the star"),
         "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
-        **drawn_columns(source),
+        **aberration_columns(source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
 

@@ -1,1 +1,1 @@
-"""Typed configuration: Hydra composes it from `config/`, pydantic checks it."""
+"""Typed configuration: Hydra composes it from `config/`, and pydantic checks it."""

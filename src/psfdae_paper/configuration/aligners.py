@@ -10,27 +10,31 @@ from psfdae.method import Look
 
 @dataclass(frozen=True)
 class Aligner:
-    """How states are estimated, or how well they can be.
+    """Method that estimates states of misalignment, or a bound of such estimates.
 
-    To add a network is to add one of these with `states`, and its settings `train_<name>` to
+    To add a network, add one of these with `states`, and its settings `train_<name>` to
     `config/config.yaml`.
 
     Attributes
     ----------
     name : str
+        Name in tables and files.
     look : Look
+        Label, colour and marker in figures.
     short : str
-        Above small panels, if it has some.
+        Title of small panels; empty if it has none.
     states : str
-        Set of states that the network of this name is trained on; empty if there is none.
-    noisy, denoised : bool
-        The network is trained on noisy stamps; it sees what the DAE makes of stamps.
-    other : str
-        Network of another method that this one takes: to estimate, or to start a fit.
+        Set of states that the network of this name is trained on; empty if there is no network.
+    noisy : bool
+        The network is trained on noisy stamps.
+    denoised : bool
+        The input of the network is the output of the DAE.
+    borrowed_network : str
+        Method whose network this one uses: to estimate, or to start a fit.
     fitted : bool
-        Every state is fitted.
-    free : bool
-        Flux and place of the stars in their stamps are not given.
+        Every state is fitted by maximum likelihood.
+    unknown_flux : bool
+        Flux and position of the stars in their stamps are not given.
     swept : tuple of str
         Settings that a sweep may change.
     """
@@ -41,15 +45,15 @@ class Aligner:
     states: Literal["", "grid", "train"] = ""
     noisy: bool = False
     denoised: bool = False
-    other: str = ""
+    borrowed_network: str = ""
     fitted: bool = False
-    free: bool = False
+    unknown_flux: bool = False
     swept: tuple[str, ...] = ()
 
     @property
     def network(self) -> str:
-        """Name of the network that it takes; empty if none."""
-        return self.name if self.states else self.other
+        """Method whose network is used, this or another one; empty if none is."""
+        return self.name if self.states else self.borrowed_network
 
 
 _ALIGNERS = [
@@ -66,7 +70,7 @@ _ALIGNERS = [
         Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
         "dae",
         denoised=True,
-        other="original",
+        borrowed_network="original",
     ),
     Aligner(
         "noise_trained",
@@ -88,22 +92,28 @@ _ALIGNERS = [
         "max_likelihood",
         Look("maximum likelihood", "#009e73"),
         "max. likelihood",
-        other="noise_trained",
+        borrowed_network="noise_trained",
         fitted=True,
     ),
     Aligner(
         "max_likelihood_free",
         Look("maximum likelihood, flux and place free", "black"),
-        other="noise_trained",
+        borrowed_network="noise_trained",
         fitted=True,
-        free=True,
+        unknown_flux=True,
     ),
     Aligner("cramer_rao", Look("Cramér–Rao bound", "black")),
     Aligner("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
-    Aligner("cramer_rao_free", Look("Cramér–Rao bound, flux and place free", "black"), free=True),
+    Aligner(
+        "cramer_rao_free", Look("Cramér–Rao bound, flux and place free", "black"), unknown_flux=True
+    ),
 ]
 ALIGNERS = {aligner.name: aligner for aligner in _ALIGNERS}
+"""Methods and bounds by name."""
+
 ESTIMATORS = [aligner for aligner in _ALIGNERS if aligner.network]
+"""Methods that estimate states with a network, alone or before a fit."""
+
 LEARNED = [aligner for aligner in ESTIMATORS if not aligner.fitted]
 """Methods of the product "alignment_estimates", in its order."""
 
@@ -114,13 +124,18 @@ BOUNDS = [ALIGNERS["cramer_rao"], ALIGNERS["cramer_rao_free"]]
 """Bounds of the product "alignment_bound", in its order."""
 
 TRAINED = [aligner.name for aligner in _ALIGNERS if aligner.states]
+"""Methods that have a network of their own."""
+
 SWEPT = [aligner.name for aligner in _ALIGNERS if aligner.swept]
 """Networks that sweeps may train."""
 
 WEIGHTS = "network.safetensors"
-"""File of a network, in its folder."""
+"""Name of a network's file in its folder."""
 
 
-def of_set(aligners: list[Aligner], test_set: str) -> list[Aligner]:
-    """What a test set is for: flux and place are free for uniform states only, as pages quote."""
-    return [aligner for aligner in aligners if test_set == "uniform" or not aligner.free]
+def methods_of_set(aligners: list[Aligner], test_set: str) -> list[Aligner]:
+    """Return the methods that are applied to a test set.
+
+    Those with unknown flux and position are applied to uniform states only.
+    """
+    return [aligner for aligner in aligners if test_set == "uniform" or not aligner.unknown_flux]

@@ -40,12 +40,12 @@ class Alignment(Group):
     model_tolerance_waves: Positive = Field(
         5e-4, description="Largest RMS by which the quadratic model may differ from ray tracing"
     )
-    # Centred on the centroid, no jitter: no shift is left to be estimated.
+    # Stamps are centred on the centroid and not jittered, so that there is no shift to estimate.
     stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = Field(
         16, description="Side d of a stamp, centred on the image's centroid"
     )
     least_energy: Annotated[float, Field(gt=0, lt=1)] = Field(
-        0.9, description="A stamp that holds less of the light is refused"
+        0.9, description="A stamp with less than this part of the light is refused"
     )
     # 5 levels in each of 4 degrees of freedom: the paper's 625 states.
     grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
@@ -64,7 +64,7 @@ class Alignment(Group):
 class Cnn(Group):
     """Convolutions and a linear layer, the paper's network (section 3.3)."""
 
-    # They are not in the text; with these the paper's training takes less than a minute.
+    # The paper does not state them; with these its training takes less than a minute.
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
         [64, 64, 128, 128, 128], description="Channels after every convolution"
     )
@@ -79,8 +79,9 @@ class Cnn(Group):
     )
 
     @model_validator(mode="after")
-    def _shape(self) -> Cnn:
-        if any(k % 2 == 0 for k in self.kernels):
+    def _check_layers(self) -> Cnn:
+        """Require odd kernels, and as many kernels and strides as widths."""
+        if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
         for name in ("kernels", "strides"):
             values = getattr(self, name)
@@ -93,7 +94,7 @@ class Cnn(Group):
 
 
 class Perceptron(Group):
-    """Fully connected layers behind the stamps' leading principal components, our own."""
+    """Fully connected layers after the stamps' leading principal components; not in the paper."""
 
     components: Count = Field(
         128, description="Principal components of all stamps of a state together"
@@ -110,7 +111,7 @@ NETWORKS: dict[str, type[Cnn] | type[Perceptron]] = {"cnn": Cnn, "perceptron": P
 class NetworkTrain(Group):
     """Optimisation of one network; the defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋."""
 
-    network: Literal["cnn", "perceptron"] = Field("cnn", description="Which one is trained")
+    network: Literal["cnn", "perceptron"] = Field("cnn", description="Network that is trained")
     epochs: Count = Field(100, description="Passes over the training states")
     batch: Annotated[int, Field(ge=2)] = Field(10, description="States per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
@@ -140,17 +141,17 @@ class NetworkTrain(Group):
 class Fit(Group):
     """Maximum-likelihood fit of a state."""
 
-    # More are slower and nearer to the optics.
+    # With more states the fit is slower, and closer to the exact optics.
     neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
         125,
         description="Computed states that a stamp is interpolated from, in all but the last step",
     )
-    # Without them estimates at the edge of the range would be worse.
+    # Without these states, estimates at the edge of the range would be less accurate.
     outer_states: Count = Field(
         1000, description="States beyond the range that are computed for it"
     )
     iterations: Count = Field(12, description="Most steps of a fit")
-    # A step of 0.3 standard errors leaves a few hundredths to the maximum.
+    # After a step of 0.3 standard errors, a few hundredths remain to the maximum.
     tolerance: Positive = Field(
         0.3, description="A step of this many standard errors or fewer is the last"
     )
@@ -161,12 +162,12 @@ class Fit(Group):
 
 
 NAME = "alignment"
-"""Of scene 3 among the datasets."""
+"""Name of scene 3 among the datasets."""
 
 CHOICE = (f"dataset={NAME}",)
 """Override that chooses scene 3."""
 
-OWN_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
+SHARED_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
 """Groups of which an option that is chosen for a whole run applies to scene 3, too."""
 
 GROUPS = (
@@ -175,16 +176,15 @@ GROUPS = (
 )
 """Groups of the configuration that scene 3 reads."""
 
-OF_STATES = ("seed", "telescope", "prescription", "alignment", "optics")
+STATE_GROUPS = ("seed", "telescope", "prescription", "alignment", "optics")
 """Groups that decide the stamps of states."""
 
-DETECTOR = ("telescope.pixel_scale_arcsec", "alignment.stamp_px")
-STATES = (
+WAVEFRONT_KEYS = (
     *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m", "prescription"),
     *("alignment.decenter_range_m", "alignment.tilt_range_deg", "alignment.defocus_m"),
     *("alignment.field_radius_deg", "alignment.field_points", "alignment.highest_zernike"),
 )
-"""What decides the wavefront of a state of scene 3."""
+"""Keys that decide the wavefront of a state of scene 3."""
 
-STATE_STAMPS = (*STATES, *DETECTOR)
-"""What decides the stamps of a state of scene 3."""
+STAMP_KEYS = (*WAVEFRONT_KEYS, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
+"""Keys that decide the stamps of a state of scene 3."""

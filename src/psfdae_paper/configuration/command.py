@@ -18,34 +18,39 @@ Function = TypeVar("Function", bound=Callable[..., None])
 
 @dataclass(frozen=True)
 class Groups:
-    """Reads groups of the configuration; which may depend on a command's options.
+    """Reader of the groups of the configuration that a command needs.
 
-    `choice` are words before those of the command line, such as the dataset that it is about.
+    Attributes
+    ----------
+    reads : tuple of str, or callable
+        Names of the groups, or a function of the command's options that returns them.
+    choice : tuple of str
+        Overrides that precede those of the command line, such as the dataset of the command.
     """
 
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
     choice: tuple[str, ...] = ()
 
-    def of(self, options: Mapping[str, Any]) -> tuple[str, ...]:
-        """Names of the groups that a command with these options reads."""
+    def names(self, options: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the names of the groups that a command with these options reads."""
         return self.reads(**options) if callable(self.reads) else self.reads
 
     def __call__(
         self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]
     ) -> Config:
-        """The checked groups, from a file that the workflow has written, or from overrides."""
+        """Return the checked groups, from a file of the workflow, or from overrides `words`."""
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
-        reads = self.of(options)
+        reads = self.names(options)
         if file is not None:
             return load_settings(file, reads)
-        return load_stage(reads, self.chosen(words))
+        return load_stage(reads, self.with_choice(words))
 
-    def chosen(self, words: Sequence[str]) -> tuple[str, ...]:
-        """Words of a command line behind its choice, which none of them may change."""
+    def with_choice(self, words: Sequence[str]) -> tuple[str, ...]:
+        """Return the command's choice, then overrides; ConfigError if one changes the choice."""
         for word in words if self.choice else ():
             if word.startswith("dataset="):
-                raise ConfigError(f"{word}: this command is about {', '.join(self.choice)}")
+                raise ConfigError(f"{word}: this command is for {', '.join(self.choice)} only")
         return (*self.choice, *words)
 
 
@@ -54,5 +59,8 @@ def command(
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
     choice: tuple[str, ...] = (),
 ) -> Callable[[Function], Function]:
-    """`psfdae.cli.command`, whose `config` has groups of the configuration as attributes."""
+    """Make a function the command `name`; its `config` has groups of the configuration.
+
+    See `psfdae.cli.command`, and `Groups` for `reads` and `choice`.
+    """
     return cli.command(name, Groups(reads, choice))

@@ -1,4 +1,9 @@
-"""From a Hydra command line to a checked configuration, and back to stage overrides."""
+"""Composition of a checked configuration from Hydra overrides, and the part that each stage reads.
+
+`compose` resolves overrides to a tree of plain values. `load`, `load_groups` and `load_stage` check
+it and return models. `write_settings` writes the groups of a stage to a file, `load_settings` reads
+them. `overrides_for` selects those of a workflow's overrides that concern one dataset.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +24,23 @@ from psfdae.reading import parse_yaml
 from psfdae.settings import NEUTRAL, ConfigError, Group, validate
 from psfdae_paper.configuration import alignment
 from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.consistency import stage_model, with_derived
+from psfdae_paper.configuration.consistency import stage_model, with_derived_values
 from psfdae_paper.configuration.methods import all_groups, methods_in
-from psfdae_paper.configuration.outline import filled, outline_of
+from psfdae_paper.configuration.outline import fill_marks, outline_of
 from psfdae_paper.configuration.schema import Config, whole_config
 
 ROOT = "config.yaml"
+"""File of the configuration folder at which Hydra begins."""
+
+OUTLINE = "_outline"
+"""Option of the group dataset that stands for all files of one outline."""
+
+CACHE_FOLDERS: list[Path] = []
+"""Folders for compositions, of which the last one is used; empty for none."""
 
 
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Resolved configuration tree of a list of Hydra overrides, not yet checked.
+    """Resolve a list of Hydra overrides to a configuration tree, not yet checked.
 
     Raises
     ------
@@ -38,76 +50,77 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     return _composed(tuple(overrides))
 
 
-def forget() -> None:
+def clear_caches() -> None:
     """Compose everything anew, for example after a change of the config folder."""
     _composed.cache_clear()
-    _kept.cache_clear()
+    _cached_composition.cache_clear()
     methods_in.cache_clear()
 
 
-def keep_in(folder: Path) -> None:
-    """Keep compositions, of which each takes Hydra some 0.15 s, for the next process.
+def cache_compositions(folder: Path) -> None:
+    """Store compositions in a folder for the next process; Hydra needs some 0.15 s for each.
 
-    A file's name is the hash of all that its composition is made of, so that none is out of
-    date; one that is damaged is composed anew. None is kept where the configuration asks a
-    resolver, which may look at the environment or the time.
+    A file's name is the hash of all inputs of its composition, so that none is out of date; one
+    that is damaged is composed anew. None is stored where the configuration asks a resolver,
+    which may depend on the environment or the time.
     """
-    KEPT.append(folder)
-
-
-KEPT: list[Path] = []
+    CACHE_FOLDERS.append(folder)
 
 
 @cache
 def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
-    chosen = [word for word in overrides if re.fullmatch(r"dataset=\w+", word)]
-    if len(chosen) == 1:
-        found = outline_of(config_dir() / f"dataset/{chosen[0].removeprefix('dataset=')}.yaml")
-        if found:
-            words = tuple(f"dataset={OUTLINE}" if word in chosen else word for word in overrides)
-            with suppress(ConfigError, KeyError):  # composed as it is, it says what is wrong
-                return dict(filled(_kept(words, json.dumps(found[0])), found[1]))
-    return _kept(overrides)
-
-
-OUTLINE = "_outline"
-"""Option of the group dataset that stands for all files of one outline."""
+    """Compose overrides, with one composition for all datasets that differ in values only."""
+    datasets = [word for word in overrides if re.fullmatch(r"dataset=\w+", word)]
+    if len(datasets) == 1:
+        outline = outline_of(config_dir() / f"dataset/{datasets[0].removeprefix('dataset=')}.yaml")
+        if outline:
+            marked_tree, values = outline
+            words = tuple(f"dataset={OUTLINE}" if word in datasets else word for word in overrides)
+            # What the outline does not permit is composed from the file itself, whose error
+            # message names the right keys.
+            with suppress(ConfigError, KeyError):
+                composition = _cached_composition(words, json.dumps(marked_tree))
+                return dict(fill_marks(composition, values))
+    return _cached_composition(overrides)
 
 
 @cache
-def _kept(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
-    """A composition from the folder where they are kept, or by Hydra, then kept there."""
-    name = _made_of(overrides, outline) if KEPT or outline else ""
+def _cached_composition(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
+    """Read a composition from the cache folder, or compose and store it there."""
+    name = _composition_hash(overrides, outline) if CACHE_FOLDERS or outline else ""
     if outline and not name:
         raise ConfigError("a resolver may look at values that an outline does not have")
-    if not (name and KEPT):
+    if not (name and CACHE_FOLDERS):
         return _by_hydra(overrides, outline)
-    path = Path(KEPT[-1], name)
+    # A file is the hash of its second line, then JSON: a damaged one is not used.
+    path = Path(CACHE_FOLDERS[-1], name)
     digest, _, text = path.read_bytes().partition(b"\n") if path.is_file() else (b"", b"", b"")
     if digest.decode("latin1") == hashlib.sha256(text).hexdigest():
-        kept: dict[str, Any] = json.loads(text)
-        return kept
+        stored_tree: dict[str, Any] = json.loads(text)
+        return stored_tree
     tree = _by_hydra(overrides, outline)
-    written = json.dumps(tree)
-    # Somebody may have edited the configuration meanwhile.
-    if json.loads(written) == tree and _made_of(overrides, outline) == name:
-        write_text(path, f"{hashlib.sha256(written.encode()).hexdigest()}\n{written}")
+    serialised = json.dumps(tree)
+    # Do not store a tree that JSON changes, or whose files were edited while Hydra read them.
+    if json.loads(serialised) == tree and _composition_hash(overrides, outline) == name:
+        write_text(path, f"{hashlib.sha256(serialised.encode()).hexdigest()}\n{serialised}")
     return tree
 
 
-def _made_of(overrides: tuple[str, ...], outline: str) -> str:
-    """Hash of all that a composition is made of, "" if a resolver may add more."""
+def _composition_hash(overrides: tuple[str, ...], outline: str) -> str:
+    """Return the hash of all inputs of a composition, "" if a resolver may add more."""
     folder = config_dir()
     versions = version("hydra-core"), version("omegaconf")
     words = (overrides, outline, all_groups(), _class_defaults(), *versions)
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
         parts += [str(path.relative_to(folder)).encode(), path.read_bytes()]
-    resolves = any(re.search(rb"\$\{[\w.]+:", part) for part in parts)
-    return "" if resolves else hashlib.sha256(b"\0".join(parts)).hexdigest()
+    # A colon in the braces calls a resolver; without one, the braces refer to another key.
+    has_resolver = any(re.search(rb"\$\{[\w.]+:", part) for part in parts)
+    return "" if has_resolver else hashlib.sha256(b"\0".join(parts)).hexdigest()
 
 
 def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
+    """Compose with Hydra; an outline is the content of the dataset option `OUTLINE`, as JSON."""
     import hydra
     from hydra.core.config_store import ConfigStore
     from hydra.core.global_hydra import GlobalHydra
@@ -129,42 +142,51 @@ def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
 
 
 def _primary(folder: Path) -> str:
-    """Name of a root file that begins with the defaults of the classes of its settings.
+    """Return the name of a root file that begins with the defaults of the settings' classes.
 
-    Files of the groups hold what differs from these. The settings of every method are there,
-    whether the root's list of defaults has them or not.
+    Files of the groups hold only values that differ from these. The settings of every method are
+    included, even if the root's list of defaults does not have them.
     """
     from hydra.core.config_store import ConfigStore
 
     tree = parse_yaml(folder / ROOT)
     defaults = tree.get("defaults", [])
-    groups = {*all_groups()} - {g for entry in defaults if isinstance(entry, dict) for g in entry}
-    # Before all others, so that datasets and presets may change them.
-    more = [{f"optional {group}": "default"} for group in sorted(groups)]
+    listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
+    # Before the list of the file, so that datasets and presets may change these settings.
+    method_defaults = [
+        {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
+    ]
+    all_defaults = ["class_defaults", *method_defaults, *defaults]
     store = ConfigStore.instance()
     store.store("class_defaults", _class_defaults(), package="_global_")
-    store.store("with_class_defaults", {**tree, "defaults": ["class_defaults", *more, *defaults]})
+    store.store("with_class_defaults", {**tree, "defaults": all_defaults})
     return "with_class_defaults"
 
 
 def _class_defaults() -> dict[str, Any]:
-    """Groups of a configuration with the values that their classes give, where they give some."""
-    fields = whole_config().model_fields.items()
-    kinds = {name: field.annotation for name, field in fields}
+    """Return the groups of a configuration with the defaults of their classes, if any."""
     groups = {
         name: {
             key: field.get_default(call_default_factory=True)
-            for key, field in kind.model_fields.items()
+            for key, field in group_class.model_fields.items()
             if not (field.is_required() or field.exclude)
         }
-        for name, kind in kinds.items()
-        if isinstance(kind, type) and issubclass(kind, Group)
+        for name, group_class in _group_classes().items()
     }
     return {name: values for name, values in groups.items() if values}
 
 
+def _group_classes() -> dict[str, type[Group]]:
+    """Return the classes of the configuration's groups by name."""
+    return {
+        name: field.annotation
+        for name, field in whole_config().model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
+    }
+
+
 def _reason(error: Exception, folder: Path) -> str:
-    """One line on why a composition failed: the file that is no YAML, if there is one."""
+    """Return one line on why a composition failed: the file that is no YAML, if there is one."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -187,56 +209,58 @@ def load(overrides: Sequence[str] = ()) -> Config:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    return checked(compose(overrides))
+    return validate_tree(compose(overrides))
 
 
-def checked(tree: Mapping[str, Any]) -> Config:
-    """As `load`, of a tree that is composed."""
-    if not _aligns(tree):
+def validate_tree(tree: Mapping[str, Any]) -> Config:
+    """Check a composed configuration; raises ConfigError like `load`."""
+    if not _is_alignment(tree):
         return validate(whole_config(), tree)
-    _require_known(tree)
+    _require_known_groups(tree)
     return part(alignment.GROUPS, tree)
 
 
-def _aligns(tree: Mapping[str, Any]) -> bool:
-    """Whether a tree is that of scene 3."""
+def _is_alignment(tree: Mapping[str, Any]) -> bool:
+    """Return True for the configuration of scene 3."""
     dataset = tree.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else None
     return "scene" not in tree and name == alignment.NAME
 
 
-def _require_known(tree: Mapping[str, Any]) -> None:
+def _require_known_groups(tree: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a tree has a group that the configuration does not have."""
     unknown = sorted(set(tree) - set(whole_config().model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
 
 
 def load_groups(overrides: Sequence[str] = ()) -> Config:
-    """As `load`, with every group checked by itself, not what groups owe each other.
+    """Compose the configuration and check every group by itself, not against other groups.
 
     Raises
     ------
     ConfigError
-        As `load`.
+        Names each wrong key with its value and the allowed range.
     """
-    return _settings(_groups_model(), _derived(compose(overrides)))
+    return _validated_groups(_independent_groups_model(), _derived(compose(overrides)))
 
 
 @cache
-def _groups_model() -> type[Group]:
+def _independent_groups_model() -> type[Group]:
+    """Return a model of the whole configuration without the checks between groups."""
     fields: dict[str, Any] = {
         key: (field.rebuild_annotation(), ...) for key, field in whole_config().model_fields.items()
     }
     return create_model("Groups", __base__=Group, **fields)
 
 
-def _settings(model: type[Group], tree: Mapping[str, Any]) -> Config:
-    """Checked groups of the configuration, whose type for all that read them is the whole one."""
+def _validated_groups(model: type[Group], tree: Mapping[str, Any]) -> Config:
+    """Check some groups; for type checkers they are a whole `Config`, as stages annotate it."""
     return cast(Config, validate(model, tree))
 
 
 Model = TypeVar("Model", bound=Group)
-T = TypeVar("T")
+Checked = TypeVar("Checked")
 
 
 def load_file(model: type[Model], path: Path) -> Model:
@@ -257,11 +281,11 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
+    return _with_file_name(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
 
 
-def _named(path: Path, check: Callable[[], T]) -> T:
-    """What a check gives; its refusals name the file."""
+def _with_file_name(path: Path, check: Callable[[], Checked]) -> Checked:
+    """Return the result of a check; each line of its ConfigError begins with the file's name."""
     try:
         return check()
     except ConfigError as error:
@@ -275,29 +299,30 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     Returns
     -------
     Config
-        With these groups alone.
+        Only these groups.
 
     Raises
     ------
     ConfigError
-        As `load`; an unknown group at the top is refused, too.
+        Names each wrong key with its value and the allowed range, and unknown groups.
     """
     tree = compose(overrides)
-    _require_known(tree)
+    _require_known_groups(tree)
     return part(reads, stage_tree(reads, tree))
 
 
 def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
-    """The groups that a stage reads from a file that `write_settings` has written.
+    """Read the groups of a stage from a file that `write_settings` has written.
 
     Raises
     ------
     ConfigError, ProductError
-        If the file is no YAML or holds something else; names file, key and range.
+        If the file is no YAML or has other groups; names file, key and range.
     """
     tree = parse_yaml(path)
+    groups = tree if isinstance(tree, dict) else {}
     model = stage_model(reads, whole_config())
-    return _named(path, lambda: _settings(model, tree if isinstance(tree, dict) else {}))
+    return _with_file_name(path, lambda: _validated_groups(model, groups))
 
 
 def write_settings(
@@ -307,54 +332,55 @@ def write_settings(
     tree: Mapping[str, Any],
     dry: bool = False,
 ) -> Path:
-    """Write the checked groups that a stage reads; the same settings have the same name.
+    """Write the checked groups that a stage reads; the same settings have the same file name.
 
-    What cannot change a result is in the file, but not in its name.
+    Settings that cannot change a result are in the file, but do not change its name.
 
     Returns
     -------
     Path
-        Of the file in `folder`; it is only named if `dry`.
+        File in `folder`. With `dry` it is named, but not written.
     """
     import yaml
 
-    checked = part(reads, stage_tree(reads, tree)).model_dump()
-    digest = hashlib.sha256(json.dumps(decisive(checked), sort_keys=True).encode()).hexdigest()
+    settings = part(reads, stage_tree(reads, tree)).model_dump()
+    serialised = json.dumps(decisive_settings(settings), sort_keys=True)
+    digest = hashlib.sha256(serialised.encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
     if not dry:
-        text = yaml.safe_dump(checked, sort_keys=True, allow_unicode=True)
-        # Damaged ones are written again: a view, which needs no digest.
+        text = yaml.safe_dump(settings, sort_keys=True, allow_unicode=True)
+        # A file that is damaged, or has other neutral settings, is written again.
         if not (path.is_file() and path.read_bytes() == text.encode()):
             write_text(path, text)
     return path
 
 
 def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
-    """Some groups of a configuration, a tree or a model, checked.
+    """Select and check some groups of a configuration, which is a tree or a model.
 
     Raises
     ------
     ConfigError
-        As `load`.
+        Names each wrong key with its value and the allowed range.
     """
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
-    found = {key: tree[key] for key in reads if key in tree}
-    return _settings(stage_model(reads, whole_config()), found)
+    groups = {key: tree[key] for key in reads if key in tree}
+    return _validated_groups(stage_model(reads, whole_config()), groups)
 
 
 def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a configuration tree that a stage reads.
+    """Select the groups of a configuration tree that a stage reads.
 
-    What follows from groups that it does not read is filled in.
+    Values that follow from groups that it does not read are filled in.
 
     Raises
     ------
     ConfigError
-        If nothing can follow from them.
+        If a group is missing, or groups contradict each other.
     """
     tree = _derived(tree)
     missing = [key for key in reads if key not in tree]
-    if missing and _aligns(tree):
+    if missing and _is_alignment(tree):
         raise ConfigError(
             f"dataset = {alignment.NAME}: scene 3 has no simulated stars, which are needed here; "
             "its commands are `psfdae alignment …`, its target is scene3"
@@ -365,24 +391,25 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
 
 
 def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Fill in values that follow from other groups; raises ConfigError."""
     try:
-        return with_derived(tree)
+        return with_derived_values(tree)
     except ValueError as error:
         raise ConfigError(str(error)) from None
 
 
 def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple[str, ...]:
-    """Those of the workflow's overrides that concern a dataset.
+    """Select those of a workflow's overrides that concern a dataset.
 
     The workflow takes one list for everything. A key that only other datasets have is left
-    out; one that none has stays and is refused by name. The options of a group that all
-    datasets take, scene 3 takes only of `alignment.OWN_OPTIONS`.
+    out; one that no dataset has stays, so that it is refused by name. Options of a group apply
+    to all datasets, but only those of `alignment.SHARED_OPTIONS` to scene 3.
 
     Parameters
     ----------
     overrides : sequence of str
     choice : sequence of str
-        What chooses the dataset, such as dataset=dataset7.
+        Override that chooses the dataset, such as dataset=dataset7.
 
     Raises
     ------
@@ -390,39 +417,51 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
         If an option does not exist.
     """
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
-    chosen = [
+    applicable_options = [
         word
         for word in options
-        if tuple(choice) != alignment.CHOICE or _key(word) in alignment.OWN_OPTIONS
+        if tuple(choice) != alignment.CHOICE or _key(word) in alignment.SHARED_OPTIONS
     ]
 
-    def has(key: str, choice: Sequence[str]) -> bool:
-        return _knows(compose((*choice, *chosen)), key)
+    def has_key(choice: Sequence[str], dotted_key: str) -> bool:
+        node: Any = compose((*choice, *applicable_options))
+        for name in dotted_key.split("."):
+            if not isinstance(node, Mapping) or name not in node:
+                return False
+            node = node[name]
+        return True
 
     def concerns(override: str) -> bool:
-        for key in _places(override):
-            if has(key, choice):
+        for key in _deciding_keys(override):
+            if has_key(choice, key):
                 return True
-            if any(has(key, [f"dataset={name}"]) for name in dataset_names()):
+            if any(has_key([f"dataset={name}"], key) for name in dataset_names()):
                 return False
         return True
 
     return tuple(
-        word for word in overrides if word in chosen or (word not in options and concerns(word))
+        word
+        for word in overrides
+        if word in applicable_options or (word not in options and concerns(word))
     )
 
 
 def dataset_names() -> list[str]:
-    """Options of the group dataset, those for other files to start from left out."""
+    """Return the options of the group dataset, without those that other files start from."""
     return sorted(path.stem for path in config_dir().glob("dataset/[!_]*.yaml"))
 
 
 def _key(override: str) -> str:
+    """Return the key of an override such as `+group.key=value` or `group@package=option`."""
     return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
 
 
-def _places(override: str) -> list[str]:
-    """Keys that tell where an override belongs: its own, or the group to which it adds one."""
+def _deciding_keys(override: str) -> list[str]:
+    """Return keys whose presence decides which datasets an override concerns.
+
+    That is the override's key; for `+group.key`, which adds a key, the group; for `++group.key`,
+    which changes or adds one, first the key and then the group.
+    """
     key = _key(override)
     group = key.rpartition(".")[0]
     if not override.startswith("+"):
@@ -430,48 +469,41 @@ def _places(override: str) -> list[str]:
     return ([key] if override.startswith("++") else []) + ([group] if group else [])
 
 
-def _knows(tree: Mapping[str, Any], key: str) -> bool:
-    """Whether a configuration tree has a dotted key."""
-    node: Any = tree
-    for part in key.split("."):
-        if not isinstance(node, Mapping) or part not in node:
-            return False
-        node = node[part]
-    return True
-
-
 @cache
 def _neutral_keys() -> frozenset[tuple[str, str]]:
-    """Group and name of the settings that cannot change a result."""
+    """Return group and name of the settings that cannot change a result."""
     return frozenset(
         (group, name)
-        for group, field in whole_config().model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
-        for name, inner in field.annotation.model_fields.items()
-        if NEUTRAL in inner.metadata
+        for group, group_class in _group_classes().items()
+        for name, field in group_class.model_fields.items()
+        if NEUTRAL in field.metadata
     )
 
 
-def decisive(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration tree without the settings that cannot change a result."""
-    return _part(tree, lambda place: place not in _neutral_keys())
+def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration tree without the settings that cannot change a result."""
+    return _filtered(tree, lambda key: key not in _neutral_keys())
 
 
-def neutral(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Those settings of a configuration tree that cannot change a result."""
-    return _part(tree, lambda place: place in _neutral_keys())
+def neutral_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those settings of a configuration tree that cannot change a result."""
+    return _filtered(tree, lambda key: key in _neutral_keys())
 
 
-def _part(tree: Mapping[str, Any], wanted: Callable[[tuple[str, str]], bool]) -> dict[str, Any]:
-    part: dict[str, Any] = {}
+def _filtered(
+    tree: Mapping[str, Any], accepts: Callable[[tuple[str, str]], bool]
+) -> dict[str, Any]:
+    """Return a tree with those settings whose group and name are accepted."""
+    filtered: dict[str, Any] = {}
     for group, value in tree.items():
         if isinstance(value, Mapping):
-            part[group] = {key: inner for key, inner in value.items() if wanted((group, key))}
-        elif wanted((group, "")):
-            part[group] = value
-    return part
+            filtered[group] = {key: value[key] for key in value if accepts((group, key))}
+        elif accepts((group, "")):
+            filtered[group] = value
+    return filtered
 
 
 def _first_lines(error: Exception) -> str:
+    """Return the first two lines of an error's text as one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines[:2])

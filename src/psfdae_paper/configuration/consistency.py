@@ -1,4 +1,4 @@
-"""What groups of the configuration owe each other: derived values and contradictions."""
+"""Relations between groups of the configuration: derived values and contradictions."""
 
 from __future__ import annotations
 
@@ -19,11 +19,8 @@ SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "frami
 STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
 """Groups that decide the static PSFs."""
 
-OWN_SCENE = "telescope"
-"""The scene of a telescope that brings its own aberrations."""
-
-SEARCH_PX = (4, 256)
-"""Least and largest distance in pixels that follows from one in λ/D."""
+TELESCOPE_SCENE = "telescope"
+"""Name of the scene whose aberrations are settings of the telescope."""
 
 
 class Consistent(Group):
@@ -37,13 +34,15 @@ class Consistent(Group):
     @model_validator(mode="before")
     @classmethod
     def _derive(cls, tree: object) -> object:
+        """Fill in derived values before the groups are checked."""
         if not isinstance(tree, Mapping):
             return tree
         _check_scene(tree)
-        return with_derived(tree)
+        return with_derived_values(tree)
 
     @model_validator(mode="after")
-    def _jitter_is_drawn(self) -> Consistent:
+    def _check_jitter(self) -> Consistent:
+        """Refuse a jitter of aberrations for stars that have no random aberrations."""
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
         if stars is None or not jitter:
@@ -57,45 +56,53 @@ class Consistent(Group):
         return self
 
     @model_validator(mode="after")
-    def _suits_the_scene(self) -> Consistent:
+    def _check_scene_groups(self) -> Consistent:
+        """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
             if prescription is not None and prescription.secondary is None:
-                raise ValueError("prescription: secondary: missing, nothing else can be misaligned")
+                raise ValueError("prescription: secondary: missing, it is what is misaligned")
         elif optics is not None and not hasattr(optics, "backend"):
             raise ValueError("optics.backend: missing")
         return self
 
 
-def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """A whole configuration with values in place of those nulls that follow from other groups."""
-    filled = {name: _filled(group, _derived_values(name, tree)) for name, group in tree.items()}
-    if isinstance(filled.get("grid"), dict):
-        _space(filled["grid"])
-    return filled
+def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration with values for those nulls that follow from other groups."""
+    derived = {name: _without_nulls(group, _derived(name, tree)) for name, group in tree.items()}
+    grid = derived.get("grid")
+    if isinstance(grid, dict) and grid.get("spacing_deg", 0) is None:
+        # The outermost field points are at the edge of the field. One point has no neighbour, for
+        # which any distance is right; `points` that are no integer are refused by the next check.
+        edge, points = grid.get("edge_deg"), grid.get("points")
+        if isinstance(edge, int | float):
+            intervals = max(points - 1, 1) if isinstance(points, int) else 2
+            grid["spacing_deg"] = 2.0 * edge / intervals
+    return derived
 
 
 def _check_scene(tree: Mapping[str, Any]) -> None:
+    """Raise ValueError if scene and telescope do not have the same source of aberrations."""
     scene, telescope = tree.get("scene"), tree.get("telescope")
     if scene is None and "alignment" in tree:
         scene = {"name": "alignment"}
     if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
         return
-    name, own = telescope.get("name"), has_own_aberrations(telescope)
-    if own and scene.get("name") != OWN_SCENE:
+    name, has_aberrations = telescope.get("name"), has_own_aberrations(telescope)
+    if has_aberrations and scene.get("name") != TELESCOPE_SCENE:
         raise ValueError(
             f"telescope = {name}: brings its own aberrations, but scene = {scene.get('name')} has "
             "others; choose a dataset made for it (dataset=_telescope, or one that starts from it)"
         )
-    if not own and scene.get("name") == OWN_SCENE:
+    if not has_aberrations and scene.get("name") == TELESCOPE_SCENE:
         raise ValueError(
-            f"telescope = {name}: has no aberrations; scene = {OWN_SCENE} needs a telescope with "
-            "the keys field_edge_deg and aberrations, such as example_zernike"
+            f"telescope = {name}: has no aberrations; scene = {TELESCOPE_SCENE} needs a telescope "
+            "with the keys field_edge_deg and aberrations, such as example_zernike"
         )
 
 
-def _filled(group: Any, values: Mapping[str, Any]) -> Any:
-    """A group with values in place of those keys that are null."""
+def _without_nulls(group: Any, values: Mapping[str, Any]) -> Any:
+    """Return a group with values in place of those keys that are null."""
     if not isinstance(group, Mapping):
         return group
     return {
@@ -104,28 +111,31 @@ def _filled(group: Any, values: Mapping[str, Any]) -> Any:
     }
 
 
-def _derived_values(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """What null means for the keys of a group."""
+def _derived(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that replace null in the keys of a group."""
     telescope = tree.get("telescope")
     if not isinstance(telescope, Mapping):
         return {}
     if name == "grid":
         return {"edge_deg": telescope.get("field_edge_deg")}
     if name in ("framing", "stars"):
-        return {"search_px": _search(tree[name], _pixel(telescope))}
+        return {"search_px": _search_px(tree[name], _pixel(telescope))}
     return {}
 
 
-def _search(group: object, pixel: float | None) -> int:
-    """Search distance in pixels; any number for a group that will be refused in a moment."""
-    reach = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
-    if isinstance(reach, bool) or not isinstance(reach, int | float) or not reach > 0:
-        reach = SEARCH
-    return int(np.clip(np.ceil(reach / (pixel or 1.0)), *SEARCH_PX))
+def _search_px(group: object, pixel: float | None) -> int:
+    """Return a search distance in pixels from one in λ/D, between 4 and 256.
+
+    `pixel` is its width in λ/D. For settings that the next check refuses, any number is right.
+    """
+    distance = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
+    if isinstance(distance, bool) or not isinstance(distance, int | float) or not distance > 0:
+        distance = SEARCH
+    return int(np.clip(np.ceil(distance / (pixel or 1.0)), 4, 256))
 
 
 def _pixel(telescope: Mapping[str, Any]) -> float | None:
-    """Pixel width in λ/D; None for a telescope that will be refused in a moment."""
+    """Return the pixel width in λ/D; None for a telescope that the next check refuses."""
     keys = [key for key in Telescope.model_fields if key in telescope]
     try:
         return Telescope.model_validate({key: telescope[key] for key in keys}).pixel
@@ -133,18 +143,10 @@ def _pixel(telescope: Mapping[str, Any]) -> float | None:
         return None
 
 
-def _space(grid: dict[str, Any]) -> None:
-    """Put the outermost field points at the edge of the field, if no spacing is given."""
-    edge, points = grid.get("edge_deg"), grid.get("points")
-    if grid.get("spacing_deg", 0) is None and isinstance(edge, int | float):
-        # One point has no neighbour; any distance will do.
-        grid["spacing_deg"] = 2.0 * edge / max(points - 1, 1) if isinstance(points, int) else edge
-
-
 @cache
-def stage_model(keys: tuple[str, ...], whole: type[Group]) -> type[Consistent]:
-    """Some groups of a whole configuration as a model of their own."""
+def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
+    """Return a model of some groups of a whole configuration."""
     fields: dict[str, Any] = {
-        key: (whole.model_fields[key].rebuild_annotation(), ...) for key in keys
+        key: (whole_model.model_fields[key].rebuild_annotation(), ...) for key in keys
     }
     return create_model("Settings", __base__=Consistent, **fields)

@@ -15,19 +15,22 @@ from psfdae_paper.configuration.base import config_dir
 
 
 def registered() -> tuple[type[Method], ...]:
-    """The methods that the configuration lists, in the order of tables; then all others.
+    """Return the methods that the configuration lists, in the order of tables; then all others.
 
     Raises
     ------
     ConfigError
-        If the list is missing, or names something else.
+        If the list is missing, or names something that is not a method.
     """
     return methods_in(config_dir() / "config.yaml")
 
 
 @cache
 def methods_in(path: Path) -> tuple[type[Method], ...]:
-    """The methods of a file `config.yaml`, then all others."""
+    """Return the methods that a file `config.yaml` lists, then all others.
+
+    Raises ConfigError as `registered` does.
+    """
     try:
         tree = parse_yaml(path)
         names = tree.get("methods") if isinstance(tree, dict) else None
@@ -41,11 +44,11 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
 
 
 def all_groups() -> tuple[str, ...]:
-    """Groups of the configuration that are settings of methods."""
+    """Return the groups of the configuration that are settings of methods."""
     return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
 
 
 def oracles_last(names: Iterable[str]) -> list[type[Method]]:
-    """Methods among some names in the order of legends: those that are given λ at the end."""
+    """Return the methods of some names in the order of legends: those that are given λ last."""
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

@@ -10,18 +10,19 @@ HEADER = "# @package _global_\n"
 """First line of a dataset's file: its keys are those of the whole configuration."""
 
 MARK = "\0"
-"""Around a key that stands for its value. No YAML file can hold this character."""
+"""Character before and after a key that stands for its value. No YAML file can contain it."""
 
 
 def outline_of(path: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
-    """Content of a dataset's file with a mark in place of every value, and the marked values.
+    """Read a dataset's file; return it with a mark in place of every value, and the values.
 
-    Left as they are: the list of defaults, null, and what contains an interpolation.
+    The list of defaults, null, and text with an interpolation are not replaced.
 
     Returns
     -------
     tuple of dict, or None
-        None for a file that Hydra must read itself: it has another header, or is damaged.
+        The marked tree, and the values by their marks. None for a file that Hydra must read
+        itself: it has another header, or is damaged.
     """
     from omegaconf import OmegaConf
 
@@ -29,7 +30,7 @@ def outline_of(path: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
         text = path.read_text(encoding="utf-8")
         # OmegaConf reads 4e-3 as a number; plain YAML takes it for text.
         tree = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except Exception:  # what is wrong is for Hydra to say
+    except Exception:  # Hydra reads the file again and reports the error
         return None
     if not (text.startswith(HEADER) and isinstance(tree, dict)):
         return None
@@ -38,22 +39,26 @@ def outline_of(path: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
     return {**defaults, **_marked(tree, "", values)}, values
 
 
-def _marked(tree: Mapping[Any, Any], above: str, values: dict[str, Any]) -> dict[str, Any]:
+def _marked(tree: Mapping[Any, Any], prefix: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return a tree with marks in place of values, which are added to `values`.
+
+    `prefix` is the dotted key of the tree, with a dot at the end.
+    """
     marked: dict[Any, Any] = {}
     for key, value in tree.items():
-        place = f"{above}{key}"
+        dotted_key = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            marked[key] = _marked(value, f"{place}.", values)
+            marked[key] = _marked(value, f"{dotted_key}.", values)
         elif value is None or any(sign in str(value) for sign in ("${", "???")):
             marked[key] = value
         else:
-            marked[key] = f"{MARK}{place}{MARK}"
+            marked[key] = f"{MARK}{dotted_key}{MARK}"
             values[marked[key]] = value
     return marked
 
 
-def filled(tree: Any, values: Mapping[str, Any]) -> Any:
-    """A composed tree with the values in place of their marks.
+def fill_marks(tree: Any, values: Mapping[str, Any]) -> Any:
+    """Return a composed tree with the values in place of their marks.
 
     Raises
     ------
@@ -61,7 +66,7 @@ def filled(tree: Any, values: Mapping[str, Any]) -> Any:
         If a mark has become part of another text.
     """
     if isinstance(tree, Mapping):
-        return {key: filled(value, values) for key, value in tree.items()}
+        return {key: fill_marks(value, values) for key, value in tree.items()}
     if isinstance(tree, list):
-        return [filled(value, values) for value in tree]
+        return [fill_marks(value, values) for value in tree]
     return values[tree] if isinstance(tree, str) and MARK in tree else tree

@@ -103,9 +103,13 @@ class WholePeriodOptics(Group):
     pupil_samples: PupilSamples = Field(
         description="Grid sizes N, ascending; each wavefront takes the first that suffices"
     )
-    precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
+    precision: Literal["complex64", "complex128"] = Field(
+        description="Precision of the propagation"
+    )
     batch: Count = Field(description="Wavefronts per batch")
-    threads: Count = Field(description="Batches at once, each with one thread of linear algebra")
+    threads: Count = Field(
+        description="Batches in parallel, each with one thread of linear algebra"
+    )
 
 
 class Optics(WholePeriodOptics):
@@ -115,13 +119,14 @@ class Optics(WholePeriodOptics):
 
 
 def _optics(tree: object) -> object:
+    """Check settings of the optics by the class that has their keys."""
     if not isinstance(tree, Mapping):
         return tree
     return (Optics if "backend" in tree else WholePeriodOptics).model_validate(tree)
 
 
 if TYPE_CHECKING:
-    # Of every dataset with a scene (`Consistent`); scene 3 reads no more than the base class.
+    # Every dataset with a scene has it (`Consistent`); scene 3 reads the base class only.
     AnyOptics = Optics
 else:
     AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
@@ -143,7 +148,7 @@ class Dataset(Group):
 
 
 class Calibration(Group):
-    """Scan of what the paper leaves open."""
+    """Scan of parameters that the paper does not state."""
 
     stars: Count = Field(description="Stars simulated per point of the scan")
     pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)] = Field(
@@ -173,21 +178,21 @@ class Benchmark(Group):
 
 
 class Bounds(Group):
-    """Best possible estimates."""
+    """Lower bounds of the error of any estimate."""
 
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
     position_stars: Count = Field(
         description="Further draws, which only the bound uses that is given the field"
     )
     star_draws: Annotated[int, Field(ge=20)] = Field(
-        description="Draws around the best matches of a star that few of the bank resemble"
+        description="Draws around the best matches of a star that few stars of the bank resemble"
     )
     test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
     threads: Count = Field(description="Threads of the linear algebra")
 
 
 class Workflow(Group):
-    """What the default target of the workflow builds."""
+    """Datasets of the default target of the workflow."""
 
     datasets: Annotated[list[Name], Field(min_length=1)] = Field(
         description="Options of the group dataset"
@@ -197,15 +202,15 @@ class Workflow(Group):
 class Config(Consistent):
     """The whole configuration of one dataset.
 
-    The type of what stages get, too: a model with those of these groups that they read, as
-    scene 3 reads `alignment.GROUPS`. Settings of methods are added by `whole_config`.
+    Stages get a model with those of these groups that they read, and annotate it as `Config`, too.
+    Scene 3 reads `alignment.GROUPS`. `whole_config` adds the settings of methods.
     """
 
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...
 
-    seed: Seed = Field(description="Of every random draw")
+    seed: Seed = Field(description="Seed of every random draw")
     workflow: Workflow
     methods: MethodNames = Field(
         description="Methods that are fitted, measured and drawn, in the order of tables"
@@ -234,11 +239,12 @@ class Config(Consistent):
     fit: Fit
 
     @model_validator(mode="after")
-    def _consistent(self) -> Config:
-        used = self.parts.train_stars + self.parts.test_stars
-        if used > self.stars.count:
+    def _check_groups(self) -> Config:
+        """Refuse values of single groups that contradict those of other groups."""
+        part_stars = self.parts.train_stars + self.parts.test_stars
+        if part_stars > self.stars.count:
             raise ValueError(
-                f"parts.train_stars + parts.test_stars = {used}: "
+                f"parts.train_stars + parts.test_stars = {part_stars}: "
                 f"must be at most stars.count = {self.stars.count}"
             )
         if self.framing.subpixel and "template" in self.dataset.references:
@@ -257,12 +263,13 @@ class Config(Consistent):
 
 
 def whole_config() -> type[Config]:
-    """`Config` with the settings of all methods, and of the trainings of scene 3."""
+    """Return `Config` with the settings of all methods, and of the trainings of scene 3."""
     return _with_settings(registered())
 
 
 @cache
 def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
+    """Return the model with the settings of some methods; it is made only once."""
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }

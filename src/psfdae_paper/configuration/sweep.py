@@ -23,11 +23,12 @@ Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
 
 def models() -> tuple[str, ...]:
-    """What a sweep may train: methods that are fitted to a file, and networks of scene 3."""
-    return (*(kind.name for kind in registered() if kind.storage), *SWEPT)
+    """Return the models that a sweep may train: stored methods, and networks of scene 3."""
+    return (*(method_class.name for method_class in registered() if method_class.storage), *SWEPT)
 
 
 def _trainable(name: str) -> str:
+    """Return the name of a model unchanged; ValueError if a sweep cannot train it."""
     if name not in models():
         raise ValueError(f"{name!r} is not one of {', '.join(models())}")
     return name
@@ -36,15 +37,17 @@ def _trainable(name: str) -> str:
 Model = Annotated[str, AfterValidator(_trainable)]
 
 METRICS = ("validation_mse", "validation_ssim")
+"""Metrics of methods: errors of images of validation stars."""
+
 NETWORK_METRICS = ("validation_mae",)
-"""What points can be compared by: errors of images, or of states of misalignment."""
+"""Metric of scene 3's networks: error of states of misalignment."""
 
 RESERVED = ("point", "status", "reason", "epochs", "attempt", "best")
 """Columns of the summary that no axis may be called."""
 
 
 class Axis(Group):
-    """One thing that is varied: listed values, named sets of values, or a range."""
+    """Setting that a sweep varies: listed values, named sets of values, or a range."""
 
     values: Annotated[list[Value], Field(min_length=1)] | None = Field(
         default=None, description="Listed values; a bare list means the same"
@@ -65,22 +68,23 @@ class Axis(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _short_forms(cls, given: object) -> object:
-        """A bare list are values; names of choices may look like numbers."""
-        if isinstance(given, list):
-            return {"values": given}
-        if isinstance(given, Mapping) and isinstance(given.get("choices"), Mapping):
-            return {**given, "choices": {str(k): v for k, v in given["choices"].items()}}
-        return given
+    def _expand_short_forms(cls, tree: object) -> object:
+        """Accept a bare list as values, and names of choices that YAML reads as numbers."""
+        if isinstance(tree, list):
+            return {"values": tree}
+        if isinstance(tree, Mapping) and isinstance(tree.get("choices"), Mapping):
+            return {**tree, "choices": {str(name): v for name, v in tree["choices"].items()}}
+        return tree
 
     @model_validator(mode="after")
-    def _one_form(self) -> Axis:
-        ends = (self.low is not None) + (self.high is not None)
-        forms = (self.values is not None) + (self.choices is not None) + (ends > 0)
-        if forms != 1 or ends == 1:
+    def _check_form(self) -> Axis:
+        """Require exactly one of the three forms, with its own keys only."""
+        end_count = (self.low is not None) + (self.high is not None)
+        form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
+        if form_count != 1 or end_count == 1:
             raise ValueError("needs either values, or choices, or low and high")
         if self.choices is not None and (self.keys or self.repeat):
-            raise ValueError("choices name their keys themselves: no keys, no repeat")
+            raise ValueError("choices contain their keys: remove keys and repeat")
         if self.low is not None and self.high is not None:
             if not self.low < self.high:
                 raise ValueError(f"low = {self.low:g}: must be below high = {self.high:g}")
@@ -99,13 +103,13 @@ class Axis(Group):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Of a range."""
+        """Lower and upper end of a range."""
         assert self.low is not None
         assert self.high is not None
         return self.low, self.high
 
     def changes(self, name: str, value: Value) -> dict[str, Value]:
-        """Configuration keys and their values at a value of this axis."""
+        """Return the configuration keys and their values at a value of the axis `name`."""
         if self.choices is not None:
             return dict(self.choices[str(value)])
         if self.repeat is not None:
@@ -133,7 +137,7 @@ class Sweep(Group):
         description="What is varied, by name"
     )
     trials: Count | None = Field(default=None, description="Number of draws; a grid has none")
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Of the draws")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Seed of the draws")
     startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
     parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
 
@@ -149,7 +153,7 @@ class Sweep(Group):
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """Keys and groups that may differ; all points share their stars and their parts."""
+        """Keys and groups that may differ between points; all points share their stars."""
         return (
             ALIGNERS[self.model].swept
             if self.model in SWEPT
@@ -157,7 +161,8 @@ class Sweep(Group):
         )
 
     @model_validator(mode="after")
-    def _fits_together(self) -> Sweep:
+    def _check_model(self) -> Sweep:
+        """Require a dataset and a metric that the model has, and trials for random draws."""
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         if (self.model in SWEPT) != (self.dataset is None):
@@ -166,12 +171,14 @@ class Sweep(Group):
             raise ValueError(f"dataset = {NAME}: scene 3 has no stars that methods restore")
         metrics = NETWORK_METRICS if self.dataset is None else METRICS
         if self.metric not in metrics:
-            allowed = " or ".join(metrics)
-            raise ValueError(f"metric = {self.metric}: model {self.model} has {allowed}")
+            raise ValueError(
+                f"metric = {self.metric}: model {self.model} has {' or '.join(metrics)}"
+            )
         return self
 
     @model_validator(mode="after")
-    def _axes_fit(self) -> Sweep:
+    def _check_axes(self) -> Sweep:
+        """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
         for name, axis in self.space.items():
             if name in RESERVED or name.startswith(("validation_", "test_")):
                 raise ValueError(f"space.{name}: is a column of the summary; choose another name")
@@ -182,30 +189,32 @@ class Sweep(Group):
         return self
 
     @model_validator(mode="after")
-    def _keys_fit(self) -> Sweep:
-        allowed = self.varied
+    def _check_keys(self) -> Sweep:
+        """Refuse keys that the model does not read, and keys that are set by two axes."""
         keys = list(self.overrides)
         for name, axis in self.space.items():
             # A range has the same keys at every value.
             options = axis.options or [0]
             keys += {key for option in options for key in axis.changes(name, option)}
         for key in keys:
-            if not any(key == k or key.startswith(f"{k}.") for k in allowed):
-                raise ValueError(f"{key}: a sweep of {self.model} may change {', '.join(allowed)}")
+            if not any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.varied):
+                raise ValueError(
+                    f"{key}: a sweep of {self.model} may change {', '.join(self.varied)}"
+                )
             if keys.count(key) > 1:
                 raise ValueError(f"{key}: set more than once")
         return self
 
 
 def point_groups(model: str) -> tuple[str, ...]:
-    """Groups of the configuration that a point of a model reads."""
+    """Return the groups of the configuration that a point of a model reads."""
     if model in SWEPT:
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
 
 
 def sweep_names() -> list[str]:
-    """Sweeps that the configuration folder has."""
+    """Return the names of the sweeps of the configuration folder."""
     return sorted(path.stem for path in config_dir().glob("sweep/[!_]*.yaml"))
 
 

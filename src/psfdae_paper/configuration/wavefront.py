@@ -1,4 +1,4 @@
-"""Where the wavefront of a scene comes from: aberrations of a telescope, or turbulence."""
+"""Settings of a scene's wavefront: atmospheric turbulence, or the telescope's aberrations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class VonKarman(Group):
     """Static atmospheric turbulence in layers."""
 
     kind: Literal["von_karman"] = Field(description="Tells which keys follow")
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of the turbulence")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Seed of the turbulence")
     r0_m: Positive = Field(description="Fried parameter of all layers at the telescope's band")
     outer_scale_m: Positive = Field(description="Outer scale L0")
     layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)] = Field(
@@ -26,7 +26,8 @@ class VonKarman(Group):
     remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
 
     @model_validator(mode="after")
-    def _layers(self) -> VonKarman:
+    def _check_layers(self) -> VonKarman:
+        """Require one strength for each layer, which add up to 1."""
         if len(self.layer_heights_m) != len(self.layer_strengths):
             raise ValueError(
                 f"layer_strengths = {self.layer_strengths}: one for each of the "
@@ -38,6 +39,6 @@ class VonKarman(Group):
 
 
 class OfTelescope(Group):
-    """The aberrations that the group telescope brings."""
+    """Aberrations that are settings of the group telescope."""
 
     kind: Literal["telescope"] = Field(description="Tells which keys follow")

@@ -1,1 +1,1 @@
-"""How good an estimate is, with its uncertainty."""
+"""Errors of estimates with their uncertainty: tables, comparisons and figures."""

@@ -1,4 +1,4 @@
-"""Tables of scene 3: errors and their correlations, ours alone and beside the paper's."""
+"""Tables of scene 3: errors of states and their correlations, measured and published."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.paper import published
 
 PARAMETERS = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
-SI_UNITS = ("m", "m", "rad", "rad")
+"""The four numbers of a state of misalignment."""
 
 CORRELATED = ("decenter_x-tilt_y", "decenter_y-tilt_y", "tilt_x-tilt_y")
-"""The pairs that the paper tabulates."""
+"""Pairs of parameters whose correlation the paper tabulates."""
 
 TEST_SETS = (
     "Test set `grid`: the very states that the networks were trained on, with new noise; "
     "`uniform`: other states of the same range."
 )
-"""What the paper's tables beside ours say of their column `test_set`."""
+"""Explanation of the column `test_set` below tables that include the paper's."""
 
 Row = dict[str, object]
-"""Of a table, by column."""
+"""Row of a table: values by column."""
 
 
 def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) -> list[Row]:
-    """Rows of the error table of one method.
+    """Return the rows of one method in the table of errors.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) 
     Returns
     -------
     list of dict
-        One row in units of the range and one in SI units for each parameter. The
-        variance of the signed error is about its mean; `variance_abs` is that of
-        the absolute error, which is what the paper tabulates.
+        One row in units of the range and one in SI units for each parameter. `variance` is that
+        of the signed error about its mean; `variance_abs` is that of the absolute error, which
+        the paper tabulates.
     """
     absolute = np.abs(errors)
     statistics = {
@@ -59,7 +59,7 @@ def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) 
 
 
 def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndarray) -> list[Row]:
-    """Rows of the error table that unbiased normal errors at the bound would have.
+    """Return the rows of the error table that unbiased normal errors at the bound would have.
 
     Parameters
     ----------
@@ -68,6 +68,7 @@ def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndar
         Cramér–Rao bounds of the states, in squared units of the range.
     """
     variance = np.diagonal(covariances, axis1=1, axis2=2)
+    # ⟨|e|⟩ over all states; the variance of |e| is ⟨e²⟩ − ⟨|e|⟩².
     absolute = expected_abs_error(covariances).mean(axis=0)
     statistics = {
         "mean_abs_error": absolute,
@@ -81,22 +82,27 @@ def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndar
 def _in_both_units(
     key: Mapping[str, object], statistics: Mapping[str, np.ndarray], unit: np.ndarray, count: int
 ) -> list[Row]:
+    """Return a row in units of the range and one in SI units for each parameter."""
     rows: list[Row] = []
-    for index, parameter in enumerate(PARAMETERS):
-        for name, scale in (("range", 1.0), (SI_UNITS[index], unit[index])):
-            power = {"variance": 2, "variance_abs": 2}
+    si_units = ("m", "m", "rad", "rad")
+    for index, (parameter, si_unit) in enumerate(zip(PARAMETERS, si_units, strict=True)):
+        for unit_name, scale in (("range", 1.0), (si_unit, unit[index])):
+            # Variances scale with the square of the unit.
             values = {
-                column: float(value[index] * scale ** power.get(column, 1))
+                column: float(value[index] * scale ** (2 if column.startswith("variance") else 1))
                 for column, value in statistics.items()
             }
-            rows.append({**key, "parameter": parameter, **values, "unit": name, "n": count})
+            rows.append({**key, "parameter": parameter, **values, "unit": unit_name, "n": count})
     return rows
 
 
 def correlation_rows(
     key: Mapping[str, object], matrix: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[Row]:
-    """Rows of the correlation table for all pairs of parameters, matrices (4, 4)."""
+    """Return the rows of the correlation table for all pairs of parameters.
+
+    `matrix` (4, 4) has the correlations, `low` and `high` (4, 4) the ends of their intervals.
+    """
     return [
         {
             **key,
@@ -111,18 +117,17 @@ def correlation_rows(
 
 
 def measured_correlations(key: Mapping[str, object], errors: np.ndarray) -> list[Row]:
-    """Correlations of signed errors (n, 4) with 95 % intervals."""
+    """Return correlations of signed errors (n, 4) with 95 % intervals."""
     return correlation_rows(key, *error_correlation(errors))
 
 
 def predicted_correlations(key: Mapping[str, object], covariances: np.ndarray) -> list[Row]:
-    """Correlations that the Fisher matrix predicts, of a state and of all errors together.
+    """Return correlations that the Fisher matrix predicts, for single and for all states.
 
-    Method `cramer_rao` is the mean over states of each state's correlation; its
-    interval holds 95 % of the states. `cramer_rao_pooled` is the correlation of
-    errors drawn with these covariances, which states with large errors dominate;
-    its interval is that of a sample of as many states. The latter is what
-    measured correlations are to be compared with.
+    Method `cramer_rao` is the mean over states of each state's correlation; its interval contains
+    95 % of the states. `cramer_rao_pooled` is the correlation of errors drawn with these
+    covariances, which states with large errors dominate; its interval is that of a sample of as
+    many states. Compare measured correlations with `cramer_rao_pooled`.
 
     Parameters
     ----------
@@ -130,22 +135,27 @@ def predicted_correlations(key: Mapping[str, object], covariances: np.ndarray) -
         test_set and noise_level.
     covariances : ndarray, shape (n, 4, 4)
     """
+    # Correlation C_ij / (σ_i σ_j) of each state.
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    each = covariances / (sigma[:, :, None] * sigma[:, None, :])
-    low, high = np.quantile(each, [0.025, 0.975], axis=0)
-    rows = correlation_rows({**key, "method": "cramer_rao"}, each.mean(axis=0), low, high)
-    mean = covariances.mean(axis=0)
-    scale = np.sqrt(np.diag(mean))
-    pooled = mean / np.outer(scale, scale)
-    half = 1.959964 / np.sqrt(max(len(covariances) - 3, 1))
+    state_correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
+    low, high = np.quantile(state_correlation, [0.025, 0.975], axis=0)
+    mean_correlation = state_correlation.mean(axis=0)
+    rows = correlation_rows({**key, "method": "cramer_rao"}, mean_correlation, low, high)
+    # Correlation of the mean covariance, with Fisher's interval: artanh of a correlation of n
+    # pairs is normal with the standard deviation 1/√(n − 3).
+    mean_covariance = covariances.mean(axis=0)
+    pooled_sigma = np.sqrt(np.diag(mean_covariance))
+    pooled = mean_covariance / np.outer(pooled_sigma, pooled_sigma)
+    half_width = 1.959964 / np.sqrt(max(len(covariances) - 3, 1))
     with np.errstate(divide="ignore"):
         z = np.arctanh(np.clip(pooled, -1.0, 1.0))
     key = {**key, "method": "cramer_rao_pooled"}
-    return rows + correlation_rows(key, pooled, np.tanh(z - half), np.tanh(z + half))
+    low, high = np.tanh(z - half_width), np.tanh(z + half_width)
+    return rows + correlation_rows(key, pooled, low, high)
 
 
 def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
-    """The paper's error table of one noise level with our rows below.
+    """Return the paper's error table of one noise level, followed by the measured rows.
 
     Returns
     -------
@@ -156,16 +166,19 @@ def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
     paper = published("alignment")
     paper = paper[np.isclose(paper.noise_level, level)].assign(source="paper", test_set="")
     paper = paper.rename(columns={"mean_error": "mean"})
-    ours = errors[np.isclose(errors.noise_level, level) & (errors.unit == "range")]
-    ours = ours.assign(source="psfdae", mean=ours.mean_abs_error, variance=ours.variance_abs)
+    measured = errors[np.isclose(errors.noise_level, level) & (errors.unit == "range")]
+    measured = measured.assign(
+        source="psfdae", mean=measured.mean_abs_error, variance=measured.variance_abs
+    )
     columns = ["source", "test_set", "method", "parameter", "mean", "variance"]
-    both = pd.concat([paper[columns], ours[columns]], ignore_index=True)
-    both = both.melt(columns[:4], var_name="quantity", value_name="value")
-    return _wide(both, "parameter", list(PARAMETERS), ["source", "test_set", "method", "quantity"])
+    rows = pd.concat([paper[columns], measured[columns]], ignore_index=True)
+    rows = rows.melt(columns[:4], var_name="quantity", value_name="value")
+    index = ["source", "test_set", "method", "quantity"]
+    return _pivoted(rows, "parameter", list(PARAMETERS), index)
 
 
 def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
-    """The paper's correlation table with our rows below.
+    """Return the paper's correlation table, followed by the measured rows.
 
     Returns
     -------
@@ -173,46 +186,54 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
         Columns source, test_set, noise_level, method and one per pair.
     """
     paper = published("correlation").assign(source="paper", test_set="")
-    ours = correlations.assign(
+    measured = correlations.assign(
         source="psfdae", pair=correlations.parameter_a + "-" + correlations.parameter_b
     )
     columns = ["source", "test_set", "noise_level", "method", "pair", "correlation"]
-    both = pd.concat([paper[columns], ours.loc[ours.pair.isin(CORRELATED), columns]])
-    both = both[both.noise_level > 0].rename(columns={"correlation": "value"})
-    return _wide(both, "pair", list(CORRELATED), ["source", "test_set", "noise_level", "method"])
+    rows = pd.concat([paper[columns], measured.loc[measured.pair.isin(CORRELATED), columns]])
+    rows = rows[rows.noise_level > 0].rename(columns={"correlation": "value"})
+    index = ["source", "test_set", "noise_level", "method"]
+    return _pivoted(rows, "pair", list(CORRELATED), index)
 
 
-def _wide(table: pd.DataFrame, across: str, order: list[str], index: list[str]) -> pd.DataFrame:
-    """One row per index, columns in a given order, methods in the order of the tables."""
+def _pivoted(
+    rows: pd.DataFrame, column: str, column_order: list[str], index: list[str]
+) -> pd.DataFrame:
+    """Return a table with one row per index and a column for each value of `column`.
+
+    Rows are sorted by the index, methods in the order of `ALIGNERS`.
+    """
     methods = list(ALIGNERS)
-    wide = table.pivot(index=index, columns=across, values="value")[order].reset_index()
-    wide.columns.name = None
-    keys = [wide["method"].map(methods.index) if name == "method" else wide[name] for name in index]
-    return wide.iloc[np.lexsort([key.to_numpy() for key in reversed(keys)])].reset_index(drop=True)
+    table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
+    table.columns.name = None
+    rank = table["method"].map(methods.index)
+    keys = [rank if name == "method" else table[name] for name in index]
+    # `lexsort` sorts by its last key first.
+    order = np.lexsort([key.to_numpy() for key in reversed(keys)])
+    return table.iloc[order].reset_index(drop=True)
 
 
 def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
-    """A paper-shaped table as Markdown.
+    """Return a table of `paper_errors` or `paper_correlations` as Markdown.
 
     Parameters
     ----------
     table : DataFrame
     title : str
     digits : dict
-        Number format by the value of the column `quantity`; that of the key ""
-        for tables without it.
+        Number format by the value of the column `quantity`; the key "" is for tables without it.
     """
-    shown = table.copy()
-    kinds = shown["quantity"] if "quantity" in shown else pd.Series("", index=shown.index)
-    numbers = [c for c in shown.columns if c in PARAMETERS or c in CORRELATED]
-    for column in numbers:
-        shown[column] = [
-            "" if pd.isna(value) else format(value, digits[kind])
-            for value, kind in zip(table[column], kinds, strict=True)
+    formatted = table.copy()
+    quantities = table.get("quantity", pd.Series("", index=table.index))
+    for column in (c for c in table.columns if c in PARAMETERS or c in CORRELATED):
+        formatted[column] = [
+            "" if pd.isna(value) else format(value, digits[quantity])
+            for value, quantity in zip(table[column], quantities, strict=True)
         ]
-    printed = {name: each.look.paper[1] for name, each in ALIGNERS.items() if each.look.paper}
-    shown["method"] = [
-        printed[m] if source == "paper" else ALIGNERS[m].look.label
-        for m, source in zip(table["method"], table["source"], strict=True)
+    # The paper's rows have its own names of the methods.
+    paper_labels = {a.name: a.look.paper[1] for a in ALIGNERS.values() if a.look.paper}
+    formatted["method"] = [
+        paper_labels[method] if source == "paper" else ALIGNERS[method].look.label
+        for method, source in zip(table["method"], table["source"], strict=True)
     ]
-    return f"{title}\n\n{shown.to_markdown(index=False, disable_numparse=True)}\n"
+    return f"{title}\n\n{formatted.to_markdown(index=False, disable_numparse=True)}\n"

@@ -1,8 +1,7 @@
-"""Fit of what the paper leaves open to its original-noise rows.
+"""Fit of parameters that the paper does not state to its original-noise rows.
 
-The rows depend on noise and images only, not on any estimator: their MSE gives
-the noise per λ, their SSIM the dynamic range and how much structure a stamp
-has, that is the pixel scale.
+The rows depend on noise and images only, not on any estimator. Their MSE gives the noise per λ.
+Their SSIM gives the dynamic range, and the structure of a stamp, which is the pixel scale.
 """
 
 from __future__ import annotations
@@ -16,9 +15,6 @@ import pandas as pd
 
 from psfdae_paper.evaluation.paper import published
 
-OUTLIER = ("dataset8", 0.002)
-"""The one column whose MSE does not follow λ²; it is left out of every fit."""
-
 
 class OriginalNoise(NamedTuple):
     """An original-noise column of the paper's tables."""
@@ -30,28 +26,29 @@ class OriginalNoise(NamedTuple):
 
     @property
     def fitted(self) -> bool:
-        """Whether it takes part in fits."""
-        return (self.dataset, self.noise_level) != OUTLIER
+        """True if the column is used in fits: all but the one whose MSE does not follow λ²."""
+        return (self.dataset, self.noise_level) != ("dataset8", 0.002)
 
 
 def original_noise_rows() -> list[OriginalNoise]:
-    """The paper's original-noise columns, by dataset and noise level."""
+    """Return the paper's original-noise columns, by dataset and noise level."""
     paper = published("psf")
     rows = paper[paper.method == "original_noise"]
-    wide = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
-    wide = wide.reset_index()
-    columns = (wide[name] for name in OriginalNoise._fields)
+    by_metric = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
+    by_metric = by_metric.reset_index()
+    columns = (by_metric[name] for name in OriginalNoise._fields)
     return [OriginalNoise(*row) for row in zip(*columns, strict=True)]
 
 
 def kappa_of_mse(mse: float, level: float, pixels: int, background: float) -> float:
-    """κ of a noise level whose pixel variance is `mse`, the star's photons included.
+    """Return κ of a noise level whose pixel variance is `mse`, the star's photons included.
 
-    Solves (κλ)² + κλ/(P √B) = MSE, where 1/P is the mean of a normalised image
-    of P pixels.
+    Solves (κλ)² + κλ/(P √B) = MSE for κ, where 1/P is the mean of a normalised image of P pixels
+    and B the background in photons.
     """
-    photon = 1.0 / (pixels * np.sqrt(background))
-    return float((-photon + np.sqrt(photon**2 + 4.0 * mse)) / 2.0 / level)
+    photon_term = 1.0 / (pixels * np.sqrt(background))
+    # Positive root of x² + x/(P √B) − MSE = 0 with x = κλ.
+    return float((-photon_term + np.sqrt(photon_term**2 + 4.0 * mse)) / 2.0 / level)
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,9 @@ class ScaleFit:
     Attributes
     ----------
     data_range : float
+        Dynamic range of the SSIM.
     pixel_scale : dict
-        Experiment → pixel scale in arcsec.
+        Pixel scale in arcsec by experiment.
     rms : float
         RMS of the SSIM residuals of the fitted columns.
     """
@@ -73,7 +71,7 @@ class ScaleFit:
 
 
 def fit_scales(scan: pd.DataFrame) -> ScaleFit:
-    """Least squares over one dynamic range and one pixel scale per experiment.
+    """Fit one dynamic range and one pixel scale per experiment by least squares.
 
     Parameters
     ----------
@@ -83,37 +81,39 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     """
     from scipy.optimize import least_squares
 
-    rows = _fitted(scan)
+    # Interpolated SSIM of each of the paper's columns, and the number of its experiment.
+    rows = _fitted_rows(scan)
     experiments = sorted(scan.experiment.unique())
-    surfaces = [_surface(scan, row) for row in rows]
-    belongs = [
+    surfaces = [_ssim_surface(scan, row) for row in rows]
+    experiment_index = [
         experiments.index(scan.experiment[scan.dataset == row.dataset].iloc[0]) for row in rows
     ]
-    target = np.array([row.ssim for row in rows])
+    published_ssim = np.array([row.ssim for row in rows])
 
-    def residuals(parameters: np.ndarray) -> np.ndarray:
-        data_range, scales = np.exp(parameters[0]), np.exp(parameters[1:])
-        values = [
+    def residuals(logarithms: np.ndarray) -> np.ndarray:
+        data_range, scales = np.exp(logarithms[0]), np.exp(logarithms[1:])
+        ssim = [
             surface(scales[index], data_range)
-            for surface, index in zip(surfaces, belongs, strict=True)
+            for surface, index in zip(surfaces, experiment_index, strict=True)
         ]
-        residual: np.ndarray = np.array(values) - target
+        residual: np.ndarray = np.array(ssim) - published_ssim
         return residual
 
+    # Parameters are logarithms within the scanned ranges; the fit begins in their middle.
     ranges = scan.data_range.agg(["min", "max"])
     bounds = [(ranges["min"], ranges["max"])]
     for experiment in experiments:
         scales = scan.pixel_scale_arcsec[scan.experiment == experiment]
         bounds.append((scales.min(), scales.max()))
     low, high = np.log(np.array(bounds)).T
-    found = least_squares(residuals, 0.5 * (low + high), bounds=(low, high), diff_step=1e-3)
-    scale = {name: float(np.exp(x)) for name, x in zip(experiments, found.x[1:], strict=True)}
-    rms = float(np.sqrt(np.mean(found.fun**2)))
-    return ScaleFit(float(np.exp(found.x[0])), scale, rms)
+    solution = least_squares(residuals, 0.5 * (low + high), bounds=(low, high), diff_step=1e-3)
+    data_range, *pixel_scales = (float(np.exp(logarithm)) for logarithm in solution.x)
+    rms = float(np.sqrt(np.mean(solution.fun**2)))
+    return ScaleFit(data_range, dict(zip(experiments, pixel_scales, strict=True)), rms)
 
 
 def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
-    """How well each scanned pixel scale explains the rows at one dynamic range.
+    """Compare the paper's SSIM with that of each scanned pixel scale at one dynamic range.
 
     Returns
     -------
@@ -122,11 +122,12 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     """
     table = []
     for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
-        rows = _fitted(part)
-        surfaces = [_surface(part, row) for row in rows]
-        target = np.array([row.ssim for row in rows])
+        rows = _fitted_rows(part)
+        surfaces = [_ssim_surface(part, row) for row in rows]
+        published_ssim = np.array([row.ssim for row in rows])
         for scale in sorted(part.pixel_scale_arcsec.unique()):
-            residual = np.array([s(scale, data_range) for s in surfaces]) - target
+            ssim = np.array([surface(scale, data_range) for surface in surfaces])
+            residual = ssim - published_ssim
             table.append(
                 (experiment, r0, scale, np.sqrt((residual**2).mean()), np.abs(residual).max())
             )
@@ -135,18 +136,19 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     )
 
 
-def _fitted(scan: pd.DataFrame) -> list[OriginalNoise]:
-    """The paper's columns that take part in fits and are in a scan."""
+def _fitted_rows(scan: pd.DataFrame) -> list[OriginalNoise]:
+    """Return the paper's columns that are used in fits and are in a scan."""
     datasets = set(scan.dataset)
     return [row for row in original_noise_rows() if row.fitted and row.dataset in datasets]
 
 
-def _surface(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
-    """SSIM of one column as a smooth function of pixel scale and dynamic range."""
+def _ssim_surface(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
+    """Interpolate the SSIM of one column as a function of pixel scale and dynamic range."""
     from scipy.interpolate import RectBivariateSpline
 
     part = scan[(scan.dataset == row.dataset) & np.isclose(scan.noise_level, row.noise_level)]
     grid = part.pivot(index="pixel_scale_arcsec", columns="data_range", values="ssim")
+    # A spline through the scanned points in both logarithms, cubic if there are enough points.
     order = [min(3, size - 1) for size in grid.shape]
     spline = RectBivariateSpline(
         np.log(grid.index), np.log(grid.columns), grid.to_numpy(), kx=order[0], ky=order[1]

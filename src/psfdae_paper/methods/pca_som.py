@@ -68,7 +68,7 @@ class PcaFit:
     psf: np.ndarray
 
     def features(self, images: np.ndarray) -> np.ndarray:
-        """Features of images (n, d, d), shape (n, K).
+        """Project images (n, d, d) on the components, shape (n, K).
 
         Raises
         ------
@@ -84,21 +84,27 @@ class PcaFit:
         return features
 
     def assign(self, images: np.ndarray) -> np.ndarray:
-        """Winning node (eq. 7) of every image, shape (n,); raises as `features`."""
-        # |y − m|² without the term that is the same for all nodes.
+        """Return the nearest node in feature space (eq. 7) of every image, shape (n,).
+
+        Raises ValueError as `features` does.
+        """
+        # |y − m|² = |m|² − 2 y·m + |y|², without |y|², which is the same for all nodes.
         score = (self.nodes**2).sum(axis=1) - 2.0 * self.features(images) @ self.nodes.T
         winner: np.ndarray = score.argmin(axis=1)
         return winner
 
     def predict(self, images: np.ndarray) -> np.ndarray:
-        """PSF of every image, shape (n, d, d); raises as `features`."""
+        """Return the PSF of every image's node, shape (n, d, d).
+
+        Raises ValueError as `features` does.
+        """
         psf: np.ndarray = self.psf[self.assign(images)].reshape(images.shape)
         return psf
 
 
 @dataclass(frozen=True)
 class PcaSom(Method):
-    """The baseline of one noise band.
+    """Fits of the baseline for one noise band.
 
     Attributes
     ----------
@@ -130,17 +136,14 @@ class PcaSom(Method):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Components must be fewer than pixels and stars."""
+        """Raise ValueError if there are more components than pixels or training stars."""
         components, side = config.baseline.components, config.framing.stamp_px
-        if components > side**2:
-            raise ValueError(
-                f"baseline.components = {components}: must be at most framing.stamp_px² = {side**2}"
-            )
-        if components > config.parts.train_stars:
-            raise ValueError(
-                f"baseline.components = {components}: must be at most "
-                f"parts.train_stars = {config.parts.train_stars}"
-            )
+        train_stars = config.parts.train_stars
+        for name, limit in (("framing.stamp_px²", side**2), ("parts.train_stars", train_stars)):
+            if components > limit:
+                raise ValueError(
+                    f"baseline.components = {components}: must be at most {name} = {limit}"
+                )
 
     @classmethod
     def fit(cls, data: TrainingSet, baseline: Baseline) -> PcaSom:
@@ -151,12 +154,13 @@ class PcaSom(Method):
         FitError
             If there are fewer stars than components.
         """
-        without = "" if data.validation.size else " validation"
+        # Fits with and without validation stars draw their noise from different streams.
+        validation = "" if data.validation.size else " validation"
         if baseline.components > data.train.size:
             raise FitError(
                 f"baseline.components = {baseline.components}: must be at most "
                 f"{data.train.size}, the number of training stars"
-                f"{' without those that validate' if without else ''}"
+                f"{' that are not used for validation' if validation else ''}"
             )
         settings = baseline.model_dump(exclude={"threads", "per_level"})
         seed = int(stream(data.seed, "baseline", "map").integers(2**31))
@@ -165,54 +169,75 @@ class PcaSom(Method):
             level,
             tuple(
                 fit_pca_som(noisy, **settings, seed=seed)
-                for noisy in _noisy(data, level, f"baseline{without}")
+                for noisy in _noisy(data, level, f"baseline{validation}")
             ),
         )
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the arrays of all fits with their resolved configuration."""
+        # Arrays of equal shapes are stacked. Fits may differ in the number of nodes: theirs are
+        # joined, and `owner` tells the fit of each node.
         values = {
-            name: joined([getattr(fit, name) for fit in self.fits])
-            for names, joined in (
+            name: join([getattr(fit, name) for fit in self.fits])
+            for names, join in (
                 (("mean", "components"), np.stack),
                 (("nodes", "psf"), np.concatenate),
             )
             for name in names
         }
         values["level"] = self.level
-        values["owner"] = np.repeat(
-            np.arange(len(self.fits)), [len(fit.nodes) for fit in self.fits]
-        )
-        columns = {name: Column(values[name], *said) for name, said in self.stored().items()}
+        node_count = [len(fit.nodes) for fit in self.fits]
+        values["owner"] = np.repeat(np.arange(len(self.fits)), node_count)
+        columns = {
+            name: Column(values[name], *unit_and_meaning)
+            for name, unit_and_meaning in self.stored().items()
+        }
         write_product(place, self.name, columns, described)
 
     @classmethod
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """The fits from their arrays."""
-        own = [arrays["owner"] == i for i in range(len(arrays["level"]))]
-        each = zip(arrays["mean"], arrays["components"], own, strict=True)
+        """Make the fits from the arrays that `save` has written."""
+        node_masks = [arrays["owner"] == i for i in range(len(arrays["level"]))]
+        stored_fits = zip(arrays["mean"], arrays["components"], node_masks, strict=True)
         return cls(
             arrays["level"],
-            tuple(PcaFit(m, c, arrays["nodes"][o], arrays["psf"][o]) for m, c, o in each),
+            tuple(
+                PcaFit(mean, components, arrays["nodes"][mask], arrays["psf"][mask])
+                for mean, components, mask in stored_fits
+            ),
         )
 
     def predict(self, images: np.ndarray, level: float | np.ndarray) -> np.ndarray:
-        """PSF of every image, shape (n, d, d), by the fit of the nearest λ on a logarithmic scale.
+        """Predict the PSF of every image by the fit of the nearest λ on a logarithmic scale.
 
-        Raises as `PcaFit.features`.
+        Parameters
+        ----------
+        images : ndarray, shape (n, d, d)
+        level : float or ndarray, shape (n,)
+            Noise level λ.
+
+        Returns
+        -------
+        ndarray, shape (n, d, d)
+
+        Raises
+        ------
+        ValueError
+            If an image has a pixel that is not finite.
         """
-        between = np.sqrt(self.level[1:] * self.level[:-1])
-        nearest = np.broadcast_to(np.searchsorted(between, level), len(images))
-        found = np.empty(images.shape)
+        # Geometric means of neighbouring levels separate the ranges of the fits.
+        borders = np.sqrt(self.level[1:] * self.level[:-1])
+        nearest = np.broadcast_to(np.searchsorted(borders, level), len(images))
+        psf = np.empty(images.shape)
         for i in np.unique(nearest):
-            found[nearest == i] = self.fits[i].predict(images[nearest == i])
-        return found
+            psf[nearest == i] = self.fits[i].predict(images[nearest == i])
+        return psf
 
 
 def _noisy(data: TrainingSet, levels: np.ndarray, name: str) -> Iterator[np.ndarray]:
-    """Images of the training stars for each fit; level 0 mixes all."""
+    """Draw noisy images of the training stars for each fit; level 0 mixes all levels."""
     for level in levels:
         if level:
             rng = stream(data.seed, "noise", name, f"{level:.6g}")
@@ -264,21 +289,34 @@ def fit_pca_som(
     mean, axes = principal_axes(flat, components)
     features = flat @ axes.T - mean @ axes.T
     nodes = self_organised(features, (rows, columns), epochs, sigma, learning_rate, seed)
-    full = PcaFit(mean, axes, nodes, np.empty((len(nodes), flat.shape[1])))
-    winner = full.assign(images)
+    # Cluster of each star, and the mean image of each cluster that has stars.
+    whole_map = PcaFit(mean, axes, nodes, np.empty((len(nodes), flat.shape[1])))
+    winner = whole_map.assign(images)
     count = np.bincount(winner, minlength=len(nodes))
     total = np.zeros((len(nodes), flat.shape[1]))
     np.add.at(total, winner, flat)
-    won = count > 0
-    return PcaFit(mean, axes, nodes[won], total[won] / count[won, None])
+    has_stars = count > 0
+    return PcaFit(mean, axes, nodes[has_stars], total[has_stars] / count[has_stars, None])
 
 
 def principal_axes(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of rows (n, P), and the leading eigenvectors (count, P) of their covariance.
+    """Compute the mean of rows, and the leading eigenvectors of their covariance.
 
-    The sign of an eigenvector is free: its largest element is positive.
+    Parameters
+    ----------
+    x : ndarray, shape (n, P)
+    count : int
+        Number of eigenvectors.
+
+    Returns
+    -------
+    mean : ndarray, shape (P,)
+    axes : ndarray, shape (count, P)
+        From the largest eigenvalue on. The sign of an eigenvector is arbitrary: here its
+        largest element is positive.
     """
     mean = x.mean(axis=0)
+    # n times the covariance; `eigh` sorts eigenvalues in ascending order.
     axes = np.linalg.eigh(x.T @ x - len(x) * np.outer(mean, mean))[1][:, : -count - 1 : -1].T
     largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
     return mean, axes * np.sign(largest)
@@ -292,33 +330,41 @@ def self_organised(
     learning_rate: float,
     seed: int,
 ) -> np.ndarray:
-    """Nodes (M, K) of the map of features (n, K); parameters as of `fit_pca_som`.
+    """Train a self-organising map on features (n, K); parameters as for `fit_pca_som`.
 
-    They are MiniSom's to the last bit, in less time: what a node's victory does to all
-    others changes from epoch to epoch only, and the way from the nodes to a star finds the winner
-    and is what they go.
+    The nodes are MiniSom's to the last bit, in less time. Two things are computed only once: the
+    neighbourhood function of each winner, which changes from epoch to epoch only, and the
+    differences between a star and the nodes, which determine both the winner and the update.
+
+    Returns
+    -------
+    ndarray, shape (M, K)
     """
     from minisom import MiniSom
 
     class Map(MiniSom):  # type: ignore[misc]  # it has no types
         def winner(self, x: np.ndarray) -> int:
-            np.subtract(x, nodes, out=way)
-            return int(np.vecdot(way, way).argmin())
+            # Nearest node (eq. 7).
+            np.subtract(x, nodes, out=difference)
+            return int(np.vecdot(difference, difference).argmin())
 
         def update(self, x: np.ndarray, win: int, t: int, max_iteration: int) -> None:
-            np.add(nodes, np.multiply(way, pull(t)[win], out=way), out=nodes)
+            # m ← m + η h (y − m) with the neighbourhood function h of the winner.
+            np.multiply(difference, rates(t)[win], out=difference)
+            np.add(nodes, difference, out=nodes)
 
     @cache
-    def pull(epoch: int) -> list[np.ndarray]:
-        """Part of the way that all nodes go if one wins, (M, 1), of each that may."""
-        fall = 1.0 + epoch / (epochs / 2)
-        places = np.ndindex(shape)
-        near = [som.neighborhood(place, sigma / fall) for place in places]
-        return [(each * (learning_rate / fall)).reshape(-1, 1) for each in near]
+    def rates(epoch: int) -> list[np.ndarray]:
+        """Return η h, the rates of all nodes (M, 1), for each possible winner."""
+        # MiniSom's asymptotic decay of learning rate and radius.
+        decay = 1.0 + epoch / (epochs / 2)
+        neighbourhoods = [som.neighborhood(node, sigma / decay) for node in np.ndindex(shape)]
+        return [(h * (learning_rate / decay)).reshape(-1, 1) for h in neighbourhoods]
 
     som = Map(*shape, features.shape[1], sigma=sigma, learning_rate=learning_rate, random_seed=seed)
     som.random_weights_init(features)
+    # A view of the map's weights, so that MiniSom's training changes what is returned.
     nodes: np.ndarray = som.get_weights().reshape(-1, features.shape[1])
-    way = np.empty_like(nodes)
+    difference = np.empty_like(nodes)
     som.train(features, epochs, random_order=True, use_epochs=True)
     return nodes

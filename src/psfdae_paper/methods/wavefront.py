@@ -1,11 +1,11 @@
 """The telescope's optics as an estimator: wavefronts that explain a star, and their mean PSF.
 
-It is given what the simulation knows: the telescope, the law of its random aberrations, and flux,
-sky and noise level of the star. Modes of the posterior of the star's Seidel coefficients, of its
-field and of where its stamp lies are found as for the error bounds
-(`psfdae_paper.bounds.sampling`), and importance samples around them give the mean, unless enough
-stars of a simulated bank are similar. A star that no mode explains gets the PSF of the Gaussian
-mixture.
+Given are the telescope, the distribution of its random aberrations, and flux, sky and noise level
+of the star. The unknowns are the star's Seidel coefficients, its field and the position of its
+stamp. Where enough stars of a simulated bank are similar to the star, they give the posterior
+mean. Elsewhere the modes of the posterior are searched as for the error bounds
+(`psfdae_paper.bounds.sampling`), and importance samples around them give the mean. A star that no
+mode explains gets the PSF of the Gaussian mixture.
 """
 
 from __future__ import annotations
@@ -27,29 +27,28 @@ if TYPE_CHECKING:
     from psfdae_paper.configuration.schema import Config
 
 BANK_STARS = 32000
-"""Of a fit; the target `wavefront` has the bank of the error bounds."""
+"""Stars that a fit simulates for its bank; the target `wavefront` has that of the error bounds."""
 
-DRAWS = 100
-"""Importance samples of a star."""
-
-PARTS = 8
-"""Of the bank, the first of which tells whether all of it would be enough."""
+DRAWS_PER_STAR = 100
+"""Importance samples of each star."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wavefront(Method):
-    """What is known of the telescope and its stars.
+    """Estimator that fits the telescope's wavefront to each star.
 
     Attributes
     ----------
     bank : Bank
+        Simulated stars with random aberrations.
     seidel : ndarray, shape (M, 5)
         Coefficients of the bank's stars in waves.
     model : StampModel
+        Stamps as a function of coefficients, field and position.
     static : ndarray, shape (F, J, d, d)
-        Static PSFs at all centring errors.
+        Static PSFs of the F fields at all J centring errors.
     data : TrainingSet
-        From which stars that no mode explains get the Gaussian mixture.
+        Training stars of the Gaussian mixture, for stars that no mode explains.
     """
 
     look = Look("optics of the telescope", "#e69f00", "*", drawn=False)
@@ -66,7 +65,7 @@ class Wavefront(Method):
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Self:
-        """Simulate the bank.
+        """Simulate a bank of stars of the training stars' telescope.
 
         Raises
         ------
@@ -81,33 +80,40 @@ class Wavefront(Method):
         if simulated.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, simulated)
-        drawn = fresh_stars(config, "optics", BANK_STARS)
-        return cls.with_bank({name: c.values for name, c in drawn.items()}, config, data)
+        columns = fresh_stars(config, "optics", BANK_STARS)
+        bank = {name: column.values for name, column in columns.items()}
+        return cls.with_bank(bank, config, data)
 
     @classmethod
-    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Config, data: TrainingSet) -> Self:
-        """The method with the columns of a bank of stars, as `fresh_stars` draws them."""
+    def with_bank(
+        cls, bank_columns: Mapping[str, np.ndarray], config: Config, data: TrainingSet
+    ) -> Self:
+        """Make the method from the columns of a bank of stars, as `fresh_stars` draws them."""
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
 
-        sizes = config.grid.points, config.framing.jitter_px
-        bank = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
-        return cls(bank, drawn["seidel"], stamp_model(config), static_psfs(config), data)
+        framed, field, peak = (bank_columns[name] for name in ("framed", "field_index", "peak"))
+        bank = Bank(framed, field, peak, config.grid.points, config.framing.jitter_px)
+        return cls(bank, bank_columns["seidel"], stamp_model(config), static_psfs(config), data)
 
     @cached_property
     def mixture(self) -> GaussianMixture:
-        """For stars that no mode explains."""
-        fitted: GaussianMixture = self.fallback.fit(self.data, Gmm())
-        return fitted
+        """Gaussian mixture for stars that no mode explains; fitted at its first use."""
+        mixture: GaussianMixture = self.fallback.fit(self.data, Gmm())
+        return mixture
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
-        """PSFs of images of one noise level λ, shape (n, d, d), in the field of `position`."""
-        level = float(np.asarray(level))
-        return self.estimated(*self.posterior(noisy, level, position), noisy, level, position)
+        """Estimate the PSFs of images (n, d, d) of one noise level λ.
 
-    def estimated(
+        `position` (n, 2) are the grid indices of their fields, if the method is given them.
+        """
+        level = float(np.asarray(level))
+        posterior = self.posterior(noisy, level, position)
+        return self.estimate_from_posterior(*posterior, noisy, level, position)
+
+    def estimate_from_posterior(
         self,
         sums: PosteriorSums,
         explained: np.ndarray,
@@ -115,40 +121,58 @@ class Wavefront(Method):
         level: float,
         position: np.ndarray | None = None,
     ) -> Estimate:
-        """What a `posterior` says of the reference: the same one serves both."""
+        """Return mean and standard deviation of the reference under a posterior.
+
+        One posterior serves both references: realisations and templates.
+
+        Parameters
+        ----------
+        sums, explained : as `posterior` returns them
+        noisy : ndarray, shape (n, d, d)
+        level : float
+            Noise level λ.
+        position : ndarray, shape (n, 2), optional
+            Grid indices of the stars' fields.
+        """
         mean, variance = sums.mean_image, sums.variance
         if self.data.reference == "template":
             mean, variance = sums.template(self.static)
         psf, sigma = mean.reshape(noisy.shape), np.sqrt(variance).reshape(noisy.shape)
-        lost = ~explained
-        if lost.any():
-            where = None if position is None else position[lost]
-            other = self.mixture.estimate(noisy[lost], level, where)
-            psf[lost], sigma[lost] = other.psf, other.sigma
+        # Stars without a mode get the estimate of the Gaussian mixture.
+        unexplained = ~explained
+        if unexplained.any():
+            fields = None if position is None else position[unexplained]
+            fallback = self.mixture.estimate(noisy[unexplained], level, fields)
+            psf[unexplained], sigma[unexplained] = fallback.psf, fallback.sigma
         return Estimate(psf, sigma, explained=explained)
 
     def modes(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
     ) -> tuple[Modes, np.ndarray]:
-        """Wavefronts that explain images, and numbers of the stars that none explains.
+        """Search the wavefronts that explain images.
 
-        Of every mode: field, place of the stamp, standardised coefficients
-        (`StampModel.coefficients`) with the Cholesky factor of their covariance, and evidence.
+        Returns
+        -------
+        modes : Modes
+            Field, position of the stamp, standardised coefficients (`StampModel.coefficients`)
+            with the Cholesky factor of their covariance, and evidence of every mode.
+        unexplained : ndarray of int
+            Numbers of the stars without a mode.
         """
         from psfdae_paper.bounds.sampling import search
 
-        own = self._fields(position)
+        star_field = self._fields(position)
         problem = (self.bank, self.seidel, noisy, self.likelihood(level), self.model)
-        return search(*problem, own, anywhere=own is None)
+        return search(*problem, star_field, anywhere=star_field is None)
 
     def likelihood(self, level: float) -> Likelihood:
-        """Of photons at a noise level λ."""
+        """Return the likelihood of photon counts at a noise level λ."""
         from psfdae_paper.bounds.posterior import Likelihood
 
-        return Likelihood.of(self.data.noise, level, self._middle)
+        return Likelihood.of(self.data.noise, level, self._mean_stamp)
 
     @cached_property
-    def _middle(self) -> np.ndarray:
+    def _mean_stamp(self) -> np.ndarray:
         """Mean of the bank's stamps, (1, d, d): the same for all noise levels."""
         mean: np.ndarray = self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
         return mean
@@ -156,39 +180,58 @@ class Wavefront(Method):
     def posterior(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
     ) -> tuple[PosteriorSums, np.ndarray]:
-        """Weighed samples of images (n, d, d) of one noise level λ, and whether they explain each.
+        """Compute weighted samples of the posterior of images (n, d, d) of one noise level λ.
 
         Where noise is high, enough stars of the bank are similar to an image. The others get
         importance samples around their modes.
+
+        Returns
+        -------
+        sums : PosteriorSums
+        explained : ndarray of bool, shape (n,)
+            True where a sample of positive weight and, if it was searched, a mode exists.
         """
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
         from psfdae_paper.bounds.sampling import PROPOSALS, SEARCH, sampled_sums
 
-        sums = self._over_bank(noisy, level, self._fields(position))
+        sums = self._sums_over_bank(noisy, level, self._fields(position))
         explained = np.ones(len(noisy), bool)
-        few = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
-        rounds = [round(share * DRAWS) for share in PROPOSALS.rounds]
-        for start in range(0, len(few), SEARCH.stars_at_once):
-            block = few[start : start + SEARCH.stars_at_once]
-            where = None if position is None else position[block]
-            modes, missed = self.modes(noisy[block], level, where)
+        # Stars whose effective number of similar bank stars is too small.
+        unresolved = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
+        rounds = [round(share * DRAWS_PER_STAR) for share in PROPOSALS.rounds]
+        for start in range(0, len(unresolved), SEARCH.stars_at_once):
+            block = unresolved[start : start + SEARCH.stars_at_once]
+            fields = None if position is None else position[block]
+            modes, unexplained = self.modes(noisy[block], level, fields)
+            # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
             problem = (modes, noisy[block], np.full(len(block), -1), self.likelihood(level))
-            found = sampled_sums(*problem, self.model, rounds, rngs).free_helped
-            sums.put(block, found)
-            explained[block[missed]] = False
+            samples = sampled_sums(*problem, self.model, rounds, rngs).free_helped
+            sums.put(block, samples)
+            explained[block[unexplained]] = False
         return sums, explained & (sums.total > 0)
 
     def _fields(self, position: np.ndarray | None) -> np.ndarray | None:
-        """Numbers of the fields of stars, (n,), if the method is given them."""
+        """Return the numbers of the stars' fields, (n,), if the method is given them."""
         if not self.needs.position or position is None:
             return None
         fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
         return fields
 
-    def _over_bank(self, noisy: np.ndarray, level: float, own: np.ndarray | None) -> PosteriorSums:
-        """Sums over a part of the bank; over all of it where that promises to be enough."""
+    def _sums_over_bank(
+        self, noisy: np.ndarray, level: float, star_field: np.ndarray | None
+    ) -> PosteriorSums:
+        """Sum over an eighth of the bank, and over all of it where that promises to be enough.
+
+        Parameters
+        ----------
+        noisy : ndarray, shape (n, d, d)
+        level : float
+            Noise level λ.
+        star_field : ndarray of int, shape (n,), optional
+            Number of each star's field, if the method is given it.
+        """
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
         from psfdae_paper.bounds.posterior import (
             PosteriorSums,
@@ -198,19 +241,22 @@ class Wavefront(Method):
         )
 
         likelihood, fields, shifts = self.likelihood(level), *self.static.shape[:2]
-        whole = PosteriorSums.empty(len(noisy), noisy[0].size, fields, shifts)
+        sums = PosteriorSums.empty(len(noisy), noisy[0].size, fields, shifts)
 
-        def weighed(stars: np.ndarray, drawn: np.ndarray) -> PosteriorSums:
-            given = None if own is None else own[stars]
-            return posterior_sums(self.bank.take(drawn), noisy[stars], likelihood, own_field=given)
+        def weigh(stars: np.ndarray, bank_stars: np.ndarray) -> PosteriorSums:
+            field = None if star_field is None else star_field[stars]
+            bank = self.bank.take(bank_stars)
+            return posterior_sums(bank, noisy[stars], likelihood, own_field=field)
 
-        for group, drawn in companions(len(noisy), own, self.bank):
-            size = len(drawn) // PARTS
-            part = weighed(group, drawn[:size])
-            whole.put(group, part)
-            samples = part.effective_size
-            rich = (samples < ENOUGH_ESS) & (PARTS * samples >= ENOUGH_ESS)
-            if rich.any():
-                rest = weighed(group[rich], drawn[size:])
-                whole.put(group[rich], merge([part.take(rich), rest]))
-        return whole
+        for stars, bank_stars in companions(len(noisy), star_field, self.bank):
+            eighth = len(bank_stars) // 8
+            first_sums = weigh(stars, bank_stars[:eighth])
+            sums.put(stars, first_sums)
+            # The effective sample size grows in proportion to the bank: all of it is worth its
+            # time for stars that have too few samples now, and would have enough of 8 times.
+            size = first_sums.effective_size
+            promising = (size < ENOUGH_ESS) & (8 * size >= ENOUGH_ESS)
+            if promising.any():
+                further_sums = weigh(stars[promising], bank_stars[eighth:])
+                sums.put(stars[promising], merge([first_sums.take(promising), further_sums]))
+        return sums

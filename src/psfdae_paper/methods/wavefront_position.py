@@ -12,7 +12,7 @@ from psfdae_paper.methods.wavefront import Wavefront
 
 @dataclass(frozen=True, eq=False)
 class PlacedWavefront(Wavefront):
-    """As `Wavefront`, in a field that is given."""
+    """Estimator `Wavefront` for stars whose field is given."""
 
     look = Look("optics of the telescope", "#b8860b", "p", drawn=False)
     needs = Needs(level=True, position=True)

@@ -1,8 +1,8 @@
 """Stages of scene 3: the quadratic model, sets of states with their stamps, key figures.
 
-Noise is drawn where it is used, as in the other scenes. The clean stamps of the
-grid are what the networks are trained on; with other noise they are a test set,
-too, beside the set of uniform states.
+Products have noise-free stamps; noise is drawn by the stages that need it. The stamps of the grid
+are the training set of the networks; with other noise they are one of the two test sets. The other
+one is the set of uniform states.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae_paper.configuration.alignment import CHOICE, OF_STATES, STATE_STAMPS, STATES
+from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS, STATE_GROUPS, WAVEFRONT_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 
@@ -49,13 +49,13 @@ def model(
     """Fit the quadratic model to few ray-traced states, verify it on the grid."""
     limit_threads(1)
     tracer, design = _tracer(config), design_states()
-    fitted = fit_quadratic(design, tracer(design))
+    quadratic = fit_quadratic(design, tracer(design))
     grid = grid_states(config.alignment.grid_levels)
     tolerance = config.alignment.model_tolerance_waves
-    residual = verify(fitted, grid, tracer(grid), tolerance)
+    residual = verify(quadratic, grid, tracer(grid), tolerance)
     columns = {
         "coefficients": Column(
-            fitted.coefficients,
+            quadratic.coefficients,
             "wave",
             "[field, term, Zernike]; terms 1, 4 numbers of the state, 10 products",
         ),
@@ -66,17 +66,31 @@ def model(
 
 
 def read_model(
-    path: Path, wanted: Mapping[str, Any] | Group, whose: object = "the configuration"
+    path: Path, expected_config: Mapping[str, Any] | Group, owner: object = "the configuration"
 ) -> QuadraticModel:
-    """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
+    """Read the quadratic model of a product.
+
+    Parameters
+    ----------
+    path : Path
+    expected_config : mapping or Group
+        Configuration with which the telescope and states of the product must agree.
+    owner : object
+        Name of that configuration's file, for error messages.
+
+    Raises
+    ------
+    ProductError
+        If the product is missing or damaged, or does not agree.
+    """
     product = read_product(path, "alignment_model", ("coefficients",))
-    require(path, product.config, STATES, wanted, whose)
+    require(path, product.config, WAVEFRONT_KEYS, expected_config, owner)
     return QuadraticModel(product["coefficients"])
 
 
 @command(
     "alignment states",
-    reads=OF_STATES,
+    reads=STATE_GROUPS,
     choice=CHOICE,
 )
 def states(
@@ -89,18 +103,19 @@ def states(
     ] = None,
 ) -> None:
     """Simulate the noise-free stamps of a set of states."""
-    limit_threads(1)  # batches run side by side, optics.threads of them
+    limit_threads(1)  # optics.threads batches run in parallel
     alignment = config.alignment
-    fitted = None if model is None else read_model(model, config)
+    quadratic = None if model is None else read_model(model, config)
     if kind == "grid":
-        chosen = grid_states(alignment.grid_levels)
+        state_set = grid_states(alignment.grid_levels)
     else:
         count = alignment.test_states if kind == "uniform" else alignment.train_states
-        chosen = uniform_states(count, stream(config.seed, "alignment", "states", kind))
-    zernikes = fitted(chosen) if fitted else _tracer(config)(chosen)
+        state_set = uniform_states(count, stream(config.seed, "alignment", "states", kind))
+    # Wavefronts by the quadratic model, or by rays; then stamps of all fields.
+    zernikes = quadratic(state_set) if quadratic else _tracer(config)(state_set)
     stamps, energy = AlignmentStamps(config.telescope, config.optics, alignment)(zernikes)
     columns = {
-        "states": Column(chosen, "range", "decentre x, y and tilt x, y of the secondary"),
+        "states": Column(state_set, "range", "decentre x, y and tilt x, y of the secondary"),
         "stamps": Column(
             stamps.astype(np.float32, copy=False),
             "1",
@@ -114,10 +129,12 @@ def states(
 
 
 def _tracer(config: Config) -> ZernikeTracer:
+    """Return the ray trace of the configured telescope."""
     return zernike_tracer(config.telescope, config.prescription, config.alignment)
 
 
 def _geometry(config: Config) -> dict[str, Column]:
+    """Return the columns that explain the axes of arrays: fields, Noll indices and ranges."""
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
@@ -139,17 +156,19 @@ def telescope(
     """Tabulate key figures of telescope, model and stamps."""
     import pandas as pd
 
-    fitted = read_product(model, "alignment_model")
+    quadratic = read_product(model, "alignment_model")
     sets = {
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
-    require(model, fitted.config, STATES, config)
+    require(model, quadratic.config, WAVEFRONT_KEYS, config)
     for product in sets.values():
-        require(product.path, product.config, STATE_STAMPS, config)
-    coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
-    # How well the states are separated, and the aligned telescope's defocus.
+        require(product.path, product.config, STAMP_KEYS, config)
+    coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
+    # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:
+    # its condition number says how well states can be separated.
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
+    # Defocus (Noll 4) of the aligned telescope in each field; the first field is the centre.
     defocus = coefficients[:, 0, noll == 4][:, 0]
     pixel = config.telescope.pixel
     rows = [

@@ -1,9 +1,9 @@
 """Stages of scene 3 that train its networks, estimate the states of test sets, bound the errors.
 
-The networks differ in what they are trained on: the paper's CNN on clean stamps of the grid
-(used as "original" and as "dae"), ours on noisy stamps of many states, and on the DAE's
-output for noisy stamps of many states. The noise of a test set depends on seed, set
-and λ only, so all methods see the same stamps and their differences are paired.
+The networks differ in their training set. The paper's CNN is trained on noise-free stamps of the
+grid (it is used as "original" and as "dae"). Those that are not in the paper are trained on noisy
+stamps of many states, or on the DAE's output for such stamps. The noise of a test set depends on
+seed, set and λ only, so all methods get the same stamps and their differences are paired.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ from psfdae_paper.configuration.aligners import (
     TRAINED,
     WEIGHTS,
     Aligner,
-    of_set,
+    methods_of_set,
 )
 from psfdae_paper.configuration.alignment import (
     CHOICE,
     NETWORKS,
-    STATE_STAMPS,
+    STAMP_KEYS,
     NetworkTrain,
 )
 from psfdae_paper.configuration.command import command
@@ -64,23 +64,16 @@ from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_m
 if TYPE_CHECKING:
     from psfdae_paper.alignment.networks import TrainingStates
 
-VALIDATION_STATES = 100
-"""States of the large set that choose the DAE's best epoch; it is not trained on them."""
-
 Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
 Trained = Annotated[Folder, "Folder for weights, config and history."]
+DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 
 DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
 """Networks that are trained on the DAE's output."""
 
-PART = 1000
-"""States whose photons are counted at a time."""
-
-CLEAN = 0.0
+NOISE_FREE = 0.0
 """Noise level of the rows without noise."""
 
-OF_DAE = "Folder of `alignment train-dae`."
-DaeFolder = Annotated[Folder, OF_DAE]
 if TYPE_CHECKING:
 
     class NetworkFolders:
@@ -101,28 +94,30 @@ def train_dae(
     out: Trained,
 ) -> None:
     """Train the DAE on the stamps of the grid."""
-    on, validating = (
+    grid_product, large_product = (
         read_product(path, "alignment_states", ("states", "stamps")) for path in (grid, train)
     )
-    require(train, validating.config, STATE_STAMPS, on.config, grid)
-    fit, validation = _flat(on["stamps"]), _flat(validating["stamps"][:VALIDATION_STATES])
-    images = np.concatenate([fit, validation])
+    require(train, large_product.config, STAMP_KEYS, grid_product.config, grid)
+    # 100 states of the large set choose the best epoch; the DAE is not trained on them.
+    training = _single_stamps(grid_product["stamps"])
+    validation = _single_stamps(large_product["stamps"][:100])
+    images = np.concatenate([training, validation])
     data = TrainingSet(
         images=images,
         references=images,
-        fit=np.arange(len(fit)),
-        validation=np.arange(len(fit), len(images)),
+        fit=np.arange(len(training)),
+        validation=np.arange(len(training), len(images)),
         levels=np.asarray(config.noise.levels),
         noise=noise_model(config),
         seed=config.seed,
         checkpoint=checkpoint,
     )
-    store(Dae.fit(data, config.dae, config.dae_train), out, config.model_dump(), on)
+    store(Dae.fit(data, config.dae, config.dae_train), out, config.model_dump(), grid_product)
     checkpoint.unlink(missing_ok=True)
 
 
 def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
-    """Config groups of the training of one network, or of all."""
+    """Return the configuration groups of the training of one network, or of all."""
     kinds = [kind] if kind else TRAINED
     noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
     dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
@@ -140,7 +135,9 @@ def train_network(
     states: Annotated[File, "Product of `alignment states`: the grid or the large set."],
     checkpoint: Checkpoint,
     out: Trained,
-    dae: Annotated[DaeFolder | None, f"{OF_DAE} For {DENOISED} only."] = None,
+    dae: Annotated[
+        DaeFolder | None, f"Folder of `alignment train-dae`. For {DENOISED} only."
+    ] = None,
 ) -> None:
     """Train a network that estimates states of misalignment."""
     from psfdae.networks.training import fingerprint, progress, train
@@ -157,14 +154,15 @@ def train_network(
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_product(states, "alignment_states", ("states", "stamps"))
     if dae:
-        require_origin(dae, STATE_STAMPS, product)
+        require_origin(dae, STAMP_KEYS, product)
     data = TrainingStates(product["states"], product["stamps"])
     if ALIGNERS[kind].noisy:
         data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
     if dae and data.noise:
         data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
-        product.arrays.clear()  # only what it says of itself is still needed
+        product.arrays.clear()  # only the product's configuration is still needed
     limit_threads(settings.threads)
+    # Settings that describe the network to those who load it.
     fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
     described |= {"network": settings.network, "mirrors": settings.mirrors}
@@ -174,53 +172,63 @@ def train_network(
         return training_of(network, data, settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
-        done = train(
-            begin, checkpoint, fingerprint(described | deciding(config), data.stamps), report
-        )
-    save_weights(out / WEIGHTS, done.result, described)
+        identity = fingerprint(described | deciding(config), data.stamps)
+        training = train(begin, checkpoint, identity, report)
+    save_weights(out / WEIGHTS, training.result, described)
     write_origin(out, product)
-    write_text(out / HISTORY, as_csv(done.history))
+    write_text(out / HISTORY, as_csv(training.history))
     write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)
 
 
 def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> TrainingStates:
-    """States with the DAE's output for a few draws of their noise, each state at one level."""
+    """Return states with the DAE's output for a few draws of their noise.
+
+    Each state has one noise level. The stamps of the result have the shape (draws, n, F, d, d).
+    """
     assert data.noise is not None
     rng = stream(config.seed, "cnn", "noise", kind)
     count = getattr(config, f"train_{kind}").noise_draws
     level = mixed_levels(data.noise.levels, len(data.states), rng)
-    many = np.empty((count, *data.stamps.shape), np.float32)
-    for draw in many:
-        for start in range(0, len(level), PART):
-            part = slice(start, start + PART)
+    denoised = np.empty((count, *data.stamps.shape), np.float32)
+    for draw in denoised:
+        # 1000 states at a time limit the memory.
+        for start in range(0, len(level), 1000):
+            part = slice(start, start + 1000)
             noisy = data.noise.noise.draw(data.stamps[part], level[part], rng)
-            draw[part] = dae.predict(_flat(noisy)).reshape(noisy.shape)
-    return replace(data, stamps=many, noise=None)
+            draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
+    return replace(data, stamps=denoised, noise=None)
 
 
 def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
-    """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
+    """Apply a trained DAE to stamps (n, F, d, d); it neither clips nor renormalises them."""
     network = Dae.load(dae, evaluation=config.evaluation)
-    return network.predict(_flat(stamps)).reshape(stamps.shape)
+    return network.predict(_single_stamps(stamps)).reshape(stamps.shape)
 
 
-def _flat(stamps: np.ndarray) -> np.ndarray:
+def _single_stamps(stamps: np.ndarray) -> np.ndarray:
+    """Return the stamps of all states and fields (..., d, d) as one list, (n, d, d)."""
     return stamps.reshape(-1, *stamps.shape[-2:])
 
 
 def noisy_test_states(
     config: Config, stamps: np.ndarray, test_set: str, level: float
 ) -> np.ndarray:
-    """Stamps of a test set at one λ, shape (n, F, d, d), float32; unchanged for λ = 0."""
-    if level == CLEAN:
+    """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0."""
+    if level == NOISE_FREE:
         return stamps
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
     return noise_model(config).draw(stamps, level, rng)
 
 
 def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np.ndarray]:
-    """The trained network of a folder, from stamps (n, F, d, d) to states (n, 4)."""
+    """Load the trained network of a folder, from stamps (n, F, d, d) to states (n, 4).
+
+    Raises
+    ------
+    ProductError
+        If its configuration is missing, or has a wrong key.
+    """
     import torch
 
     from psfdae.settings import validate
@@ -231,33 +239,35 @@ def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np
     path = folder / CONFIG
     described = read_yaml(path)
     fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
-    kind = from_tree(path, described, "network", make=_kind)
+    kind = from_tree(path, described, "network", make=_network_kind)
     settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
     model = load_network(settings, fields, side, folder / WEIGHTS)
     mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
 
-def _kind(value: object) -> str:
+def _network_kind(value: object) -> str:
+    """Return the kind of a network; ValueError if there is no such kind."""
     if value not in NETWORKS:
         raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
     return str(value)
 
 
 def _size(value: object) -> int:
+    """Return a size; ValueError if it is no whole number in the possible range."""
     if not isinstance(value, int) or not 1 <= value <= 4096:
         raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
     return value
 
 
 def require_network(folder: Path, states: Product, name: str | None = None) -> None:
-    """Refuse a network that does not belong to states with stamps, or is not the one of a name."""
+    """Raise ProductError if a network has been trained for other stamps, or has another name."""
     _, fields, _, side = states["stamps"].shape
-    said, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
-    require(folder / CONFIG, said, keys, {"fields": fields, "stamp_px": side}, states.path)
-    require_origin(folder, STATE_STAMPS, states)
+    described, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
+    require(folder / CONFIG, described, keys, {"fields": fields, "stamp_px": side}, states.path)
+    require_origin(folder, STAMP_KEYS, states)
     if name:
-        require(folder / CONFIG, said, ("name",), {"name": name}, "the command")
+        require(folder / CONFIG, described, ("name",), {"name": name}, "the command")
 
 
 @command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=CHOICE)
@@ -273,26 +283,27 @@ def estimate(
     """Estimate the states of a test set with every learned method."""
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
-    require_origin(dae, STATE_STAMPS, product)
+    require_origin(dae, STAMP_KEYS, product)
     folders: dict[str, Path] = vars(networks)
     for name, folder in folders.items():
         require_network(folder, product, name)
     predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
-    levels = [CLEAN, *config.noise.levels]
-    found = np.empty((len(levels), len(LEARNED), *product["states"].shape))
+    # The same noisy stamps for all methods, with the time that each takes.
+    levels = [NOISE_FREE, *config.noise.levels]
+    estimates = np.empty((len(levels), len(LEARNED), *product["states"].shape))
     rows = []
     for row, level in enumerate(levels):
         noisy = noisy_test_states(config, product["stamps"], test_set, level)
         for column, method in enumerate(LEARNED):
             started = time.perf_counter()
             stamps = denoise(dae, config, noisy) if method.denoised else noisy
-            found[row, column] = predict[method.network](stamps)
+            estimates[row, column] = predict[method.network](stamps)
             seconds = time.perf_counter() - started
             rows.append((test_set, level, method.name, seconds, len(stamps)))
     columns = {
         "states": Column(product["states"], "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "estimates": Column(found, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
+        "estimates": Column(estimates, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
     }
     described = {**config.model_dump(), "test_set": test_set}
     write_product(out, "alignment_estimates", columns, described)
@@ -300,10 +311,12 @@ def estimate(
 
 
 def _names(methods: list[Aligner]) -> str:
+    """Return the names of methods in the order of an array's axis."""
     return ", ".join(method.name for method in methods)
 
 
 def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]]) -> None:
+    """Write the table of run times."""
     import pandas as pd
 
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
@@ -333,44 +346,53 @@ def fit(
     from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
 
     limit_threads(1)
-    product, many = (
+    product, large_product = (
         read_product(path, "alignment_states", ("states", "stamps", "noll"))
         for path in (states, train)
     )
-    for given in (product, many):
-        require(given.path, given.config, STATE_STAMPS, config)
+    for states_product in (product, large_product):
+        require(states_product.path, states_product.config, STAMP_KEYS, config)
     wavefronts = read_model(model, product.config, states)
     require_network(network, product)
     predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows, methods = [], of_set(FITTED, test_set)
+    rows, methods = [], methods_of_set(FITTED, test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
     columns = {"states": Column(product["states"], "range", "true states")}
+    # The emulator interpolates stamps between those of the large set; the network's estimate is
+    # the start of the first fit.
     started = time.perf_counter()
-    emulator = StampEmulator(wavefronts, operator(), many["states"], many["stamps"], config.fit)
+    emulator = StampEmulator(
+        wavefronts, operator(), large_product["states"], large_product["stamps"], config.fit
+    )
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
-        own = operator(movable=method.free)
-        optics = partial(stamps_and_slopes, wavefronts, own, emulator=emulator)
+        stamp_operator = operator(movable=method.unknown_flux)
+        optics = partial(stamps_and_slopes, wavefronts, stamp_operator, emulator=emulator)
         exact = Likelihood(optics, noise_model(config), level)
-        # The emulator knows stars in their place only.
-        near = exact if method.free else replace(exact, stamps=emulator)
-        first = fit_states(near, stamps, parameters_of(wavefronts, own, start), config.fit)
-        # In focus, a state and its twin have nearly the same stamps.
-        others = twin_states(wavefronts, first.parameters, product["noll"])
-        best, twins = refit_twins(near, stamps, first, others, config.fit)
-        found = best if near is exact else fit_states(exact, stamps, best.parameters, config.fit)
-        last = found.evaluations * (near is not exact)
+        # The emulator can compute stars at their given position only.
+        fast = exact if method.unknown_flux else replace(exact, stamps=emulator)
+        parameters = parameters_of(wavefronts, stamp_operator, start)
+        first_fit = fit_states(fast, stamps, parameters, config.fit)
+        # In focus, a state and its twin have nearly the same stamps: the better one of both fits.
+        twins = twin_states(wavefronts, first_fit.parameters, product["noll"])
+        best_fit, twin_tried = refit_twins(fast, stamps, first_fit, twins, config.fit)
+        # The last steps use the exact optics.
+        final_fit = best_fit
+        if fast is not exact:
+            final_fit = fit_states(exact, stamps, best_fit.parameters, config.fit)
+        last_evaluations = final_fit.evaluations * (fast is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
-        start = found.parameters[:, :4]  # where the next one starts: it has more to find
-        fits["estimates"].append(found.parameters[:, :4])
-        fits["deviance"].append(-2.0 * found.height)
-        fits["evaluations"].append(np.array([best.evaluations, last]))
-        fits["converged"].append(found.converged)
-        fits["twin_tried"].append(twins)
-        fits["twin_won"].append(best.parameters[:, 0] != first.parameters[:, 0])
+        # The next method, which has more parameters, starts from this estimate.
+        start = final_fit.parameters[:, :4]
+        fits["estimates"].append(final_fit.parameters[:, :4])
+        fits["deviance"].append(-2.0 * final_fit.height)
+        fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
+        fits["converged"].append(final_fit.converged)
+        fits["twin_tried"].append(twin_tried)
+        fits["twin_won"].append(best_fit.parameters[:, 0] != first_fit.parameters[:, 0])
     about = {
         "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
         "deviance": "twice the log-likelihood missing to a perfect fit",
@@ -400,13 +422,13 @@ def bound(
 
     limit_threads(1)
     product = read_product(states, "alignment_states", ("states",))
-    require(states, product.config, STATE_STAMPS, config)
+    require(states, product.config, STAMP_KEYS, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    methods = of_set(BOUNDS, test_set)
-    free = [method.free for method in methods]
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(free))
-    covariances = bound_covariances(wavefronts, operator, noise, levels, truth, free)
+    methods = methods_of_set(BOUNDS, test_set)
+    unknown_flux = [method.unknown_flux for method in methods]
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(unknown_flux))
+    covariances = bound_covariances(wavefronts, operator, noise, levels, truth, unknown_flux)
     about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
     columns = {
         "states": Column(truth, "range", "true states"),

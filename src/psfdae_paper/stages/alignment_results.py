@@ -26,9 +26,9 @@ from psfdae_paper.configuration.aligners import (
     FITTED,
     LEARNED,
     Aligner,
-    of_set,
+    methods_of_set,
 )
-from psfdae_paper.configuration.alignment import CHOICE, STATE_STAMPS
+from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import StatesFile
@@ -42,20 +42,17 @@ Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fi
 Bounds = Annotated[tuple[File, ...], "Product of `alignment bound`.", {"flag": "--bound"}]
 ErrorTable = Annotated[File, "CSV of `alignment tables`."]
 
-POSITIONS = np.linspace(-1.5, 1.5, 61)
+MULTIPLES = np.linspace(-1.5, 1.5, 61)
 """Multiples of the state in the twin figure; −1 is the twin."""
 
-SHOWN_STATES = 2
-TWIN_TILT = (0.20, 0.25)
-"""Tilts x, y of the state of the twin figure; its decentre cancels the constant coma."""
-
-DRAWN = [method.name for method in ESTIMATORS if not method.free]
+FIGURE_METHODS = [method.name for method in ESTIMATORS if not method.unknown_flux]
+"""Methods whose estimates and errors are drawn."""
 
 Png = Annotated[File, "PNG."]
 
 
 class Key(TypedDict):
-    """Whose errors, and on what."""
+    """Test set, noise level and method of some errors."""
 
     test_set: str
     noise_level: float
@@ -65,7 +62,7 @@ class Key(TypedDict):
 def read_errors(
     estimates: Sequence[Path], fits: Sequence[Path]
 ) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Key, true states and estimates, (n, 4) each."""
+    """Yield key, true states and estimates, (n, 4) each, of every method and noise level."""
     for path in estimates:
         product = read_product(path, "alignment_estimates")
         truth, test_set = product["states"], product.config["test_set"]
@@ -78,50 +75,55 @@ def read_errors(
         product = read_product(path, "alignment_fit", ("states", "estimates"))
         test_set = product.config["test_set"]
         level = product.config["level"]
-        for method, found in zip(of_set(FITTED, test_set), product["estimates"], strict=True):
+        methods = methods_of_set(FITTED, test_set)
+        for method, states in zip(methods, product["estimates"], strict=True):
             key = Key(test_set=test_set, noise_level=level, method=method.name)
-            yield key, product["states"], found
+            yield key, product["states"], states
 
 
 def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Key, true states (n, 4) and covariances (n, 4, 4)."""
+    """Yield key, true states (n, 4) and covariances (n, 4, 4) of every bound and noise level."""
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
         test_set = product.config["test_set"]
-        for method, levels in zip(of_set(BOUNDS, test_set), product["covariances"], strict=True):
-            for level, covariances in zip(product["levels"], levels, strict=True):
+        methods = methods_of_set(BOUNDS, test_set)
+        for method, by_level in zip(methods, product["covariances"], strict=True):
+            for level, covariances in zip(product["levels"], by_level, strict=True):
                 key = Key(test_set=test_set, noise_level=float(level), method=method.name)
                 yield key, product["states"], covariances
-
-
-SAME_TEST = ("noise.kappa", "noise.background_photons", *STATE_STAMPS)
-"""What products of one test agree in; estimates and fits in the seed of the noise, too."""
 
 
 def require_one_test(
     estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
 ) -> None:
     """Refuse estimates, fits and bounds that are not of the same telescope, noise and states."""
+    same_keys = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
     earlier: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
         for path in paths:
             product = read_product(path, f"alignment_{kind}", ("states",))
-            for other in earlier:
-                keys = SAME_TEST if kind == "bound" else ("seed", *SAME_TEST)
-                require(path, product.config, keys, other.config, other.path)
-                _require_states(product, other)
+            # Bounds have no noise that is drawn, and so no seed.
+            keys = same_keys if kind == "bound" else ("seed", *same_keys)
+            for reference in earlier:
+                require(path, product.config, keys, reference.config, reference.path)
+                if product.config["test_set"] == reference.config["test_set"]:
+                    _require_states(product, reference)
             earlier.append(product)
 
 
-def _require_states(product: Product, other: Product) -> None:
-    ours, theirs = product["states"], other["states"]
-    if product.config["test_set"] != other.config["test_set"] or np.array_equal(ours, theirs):
+def _require_states(product: Product, reference: Product) -> None:
+    """Raise ProductError if two products of one test set have different true states."""
+    states, expected = product["states"], reference["states"]
+    if np.array_equal(states, expected):
         return
-    what, here, there = "number of states", len(ours), len(theirs)
-    if here == there:
-        row = int((ours != theirs).any(axis=1).argmax())
-        what, here, there = f"state {row}", ours[row].tolist(), theirs[row].tolist()
-    raise ProductError(f"{product.path}: {what} = {here}, but {other.path} has {there}")
+    difference = f"number of states = {len(states)}, but {reference.path} has {len(expected)}"
+    if len(states) == len(expected):
+        row = int((states != expected).any(axis=1).argmax())
+        difference = (
+            f"state {row} = {states[row].tolist()}, "
+            f"but {reference.path} has {expected[row].tolist()}"
+        )
+    raise ProductError(f"{product.path}: {difference}")
 
 
 @command("alignment tables")
@@ -141,23 +143,24 @@ def tables(
     require_one_test(estimates, fits, bounds)
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
-        made = read_product(path, "alignment_bound", ()).config
-        require(path, made, STATE_STAMPS, product.config, states)
+        bound_config = read_product(path, "alignment_bound", ()).config
+        require(path, bound_config, STAMP_KEYS, product.config, states)
     unit = product["unit"]
-    found: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
+    # Measured errors, then those that unbiased estimates at the bound would have.
+    rows_by_table: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
     for key, truth, estimate in read_errors(estimates, fits):
-        found[errors] += rows.error_rows(key, estimate - truth, unit)
+        rows_by_table[errors] += rows.error_rows(key, estimate - truth, unit)
         if key["method"] != "constant":
-            found[correlation] += rows.measured_correlations(key, estimate - truth)
+            rows_by_table[correlation] += rows.measured_correlations(key, estimate - truth)
     for key, _, covariances in read_bounds(bounds):
-        found[errors] += rows.bound_rows(key, covariances, unit)
+        rows_by_table[errors] += rows.bound_rows(key, covariances, unit)
         if key["method"] == "cramer_rao":
-            found[correlation] += rows.predicted_correlations(key, covariances)
-    order = list(ALIGNERS)
-    for path, table in found.items():
-        frame = pd.DataFrame(table).sort_values(
+            rows_by_table[correlation] += rows.predicted_correlations(key, covariances)
+    method_order = list(ALIGNERS)
+    for path, table_rows in rows_by_table.items():
+        frame = pd.DataFrame(table_rows).sort_values(
             ["test_set", "noise_level", "method"],
-            key=lambda c: c.map(order.index) if c.name == "method" else c,
+            key=lambda c: c.map(method_order.index) if c.name == "method" else c,
             kind="stable",
         )
         write_csv(path, frame)
@@ -169,7 +172,7 @@ def paper_tables(
     correlation: ErrorTable,
     out: Annotated[Folder, "Folder for CSV and Markdown files."],
 ) -> None:
-    """Set the paper's tables beside ours."""
+    """Set measured errors beside the paper's tables."""
     from psfdae_paper.evaluation import alignment_tables as rows
     from psfdae_paper.evaluation.paper import published
 
@@ -179,13 +182,13 @@ def paper_tables(
         text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
         write_text(path.with_suffix(".md"), text)
 
-    ours = read_table(errors)
+    measured = read_table(errors)
     for level in sorted(published("alignment").noise_level.unique()):
-        if not np.isclose(ours.noise_level, level).any():
+        if not np.isclose(measured.noise_level, level).any():
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
-        write(f"{level:g}", rows.paper_errors(ours, level), title, digits)
+        write(f"{level:g}", rows.paper_errors(measured, level), title, digits)
     table = rows.paper_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
@@ -198,7 +201,7 @@ def time_table(
     ],
     out: Annotated[File, "CSV with the cost of an estimate and of the trainings."],
 ) -> None:
-    """Tabulate what the methods cost."""
+    """Tabulate the run times of the methods."""
     import pandas as pd
 
     named = (text.partition("=") for text in histories)
@@ -208,9 +211,10 @@ def time_table(
     rows = []
     for method in ESTIMATORS:
         seconds, states = total.loc[method.name].to_numpy()
-        # With the trainings of all networks that the method needs.
-        trained = sum(training[name] for name in (method.network, "dae" * method.denoised) if name)
-        rows.append((method.name, seconds / states, int(states), trained))
+        # The trainings of all networks that the method needs.
+        networks = [method.network, *(["dae"] if method.denoised else [])]
+        training_seconds = sum(training[name] for name in networks)
+        rows.append((method.name, seconds / states, int(states), training_seconds))
     columns = ["method", "seconds_per_state", "states", "training_seconds"]
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
@@ -221,14 +225,15 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     from psfdae_paper.evaluation.alignment_figures import stamp_rows
 
     product = read_product(states, "alignment_states", ("states", "stamps"))
-    require_origin(dae, STATE_STAMPS, product)
-    rows = [("noise-free", product["stamps"][:SHOWN_STATES])]
+    require_origin(dae, STAMP_KEYS, product)
+    # The first two states, with the noise that they have in the test set.
+    rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
-        noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:SHOWN_STATES]
+        noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:2]
         rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(dae, config, noisy))]
     titles = [
         "decentre ({:+.2f}, {:+.2f}), tilt ({:+.2f}, {:+.2f}) of the range".format(*state)
-        for state in product["states"][:SHOWN_STATES]
+        for state in product["states"][:2]
     ]
     write_png(stamp_rows(rows, titles), out)
 
@@ -245,12 +250,12 @@ def predicted(
     from psfdae_paper.evaluation.alignment_figures import predicted_against_true
 
     require_one_test([estimates], fits, [])
-    found: dict[str, dict[float, np.ndarray]] = {method: {} for method in DRAWN}
+    by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
     truth = np.empty(0)
     for key, truth, states in read_errors([estimates], fits):  # noqa: B007
-        if key["method"] in found and key["noise_level"] > 0:
-            found[key["method"]][key["noise_level"]] = states
-    write_png(predicted_against_true(truth, found), out)
+        if key["method"] in by_method and key["noise_level"] > 0:
+            by_method[key["method"]][key["noise_level"]] = states
+    write_png(predicted_against_true(truth, by_method), out)
 
 
 @command("alignment figure errors")
@@ -261,7 +266,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     require_one_test(estimates, fits, bounds)
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, states in read_errors(estimates, fits):
-        if key["method"] in DRAWN and key["noise_level"] > 0:
+        if key["method"] in FIGURE_METHODS and key["noise_level"] > 0:
             error = np.abs(states - truth).mean(axis=1)
             curves[key["noise_level"]][key["method"]] = (size_of(truth), error)
     count = 0
@@ -280,41 +285,42 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 )
 def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus."""
-    # The line leads through the state, the aligned telescope and the twin: tilts with the
-    # decentres that cancel their field-constant coma.
+    # Multiples of a state form a line through the state, the aligned telescope and the twin. The
+    # decentre of the state cancels the field-constant coma of its tilt.
     import pandas as pd
 
     from psfdae_paper.evaluation.alignment_figures import twin_ambiguity
 
     limit_threads(1)
-    rows, shown, state = [], [], np.empty(0)
+    rows, stamp_rows, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
-        state, line = _stamps_along(config, defocus)
-        own = line[np.argmin(np.abs(POSITIONS - 1.0))].astype(np.float64)
-        opposite = line[np.argmin(np.abs(POSITIONS + 1.0))]
-        where = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
-        shown += [(f"state\n{where}", own), (f"twin\n{where}", opposite)]
+        state, line_stamps = _stamps_of_multiples(config, defocus)
+        state_stamps = line_stamps[np.argmin(np.abs(MULTIPLES - 1.0))].astype(np.float64)
+        twin_stamps = line_stamps[np.argmin(np.abs(MULTIPLES + 1.0))]
+        focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
+        stamp_rows += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
+        # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
         for level in config.noise.levels:
-            variance = noise_model(config).variance(own, level)
-            chi2 = ((line - own) ** 2 / variance).sum(axis=(1, 2, 3))
+            variance = noise_model(config).variance(state_stamps, level)
+            chi2 = ((line_stamps - state_stamps) ** 2 / variance).sum(axis=(1, 2, 3))
             rows += [
-                (level, 1e3 * defocus, position, value)
-                for position, value in zip(POSITIONS, chi2, strict=True)
+                (level, 1e3 * defocus, multiple, value)
+                for multiple, value in zip(MULTIPLES, chi2, strict=True)
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(twin_ambiguity(curves, shown, state), out)
+    write_png(twin_ambiguity(curves, stamp_rows, state), out)
 
 
-def _stamps_along(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """A state and the ray-traced stamps of its multiples, with the CCD at a defocus."""
-    moved = config.alignment.model_copy(update={"defocus_m": defocus_m})
-    tracer = zernike_tracer(config.telescope, config.prescription, moved)
-    operator = AlignmentStamps(config.telescope, config.optics, moved)
+def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a state, and the ray-traced stamps of its multiples with the CCD at a defocus."""
+    settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
+    tracer = zernike_tracer(config.telescope, config.prescription, settings)
+    operator = AlignmentStamps(config.telescope, config.optics, settings)
     model = fit_quadratic(design_states(), tracer(design_states()))
-    tilt = np.array([TWIN_TILT])
+    tilt = np.array([(0.20, 0.25)])  # x, y in units of the range
     state = np.concatenate([coma_free_decentre(model, tilt, operator.noll), tilt], axis=1)[0]
-    return state, operator(tracer(POSITIONS[:, None] * state))[0]
+    return state, operator(tracer(MULTIPLES[:, None] * state))[0]
 
 
 @command("alignment figure correlation")
@@ -324,24 +330,27 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     from psfdae_paper.evaluation.alignment_tables import PARAMETERS
     from psfdae_paper.evaluation.paper import published
 
-    def titled(method: Aligner, rows: pd.DataFrame, whose: str = "") -> tuple[str, np.ndarray]:
+    def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
+        """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
         matrix = np.full((4, 4), np.nan)
-        own = rows[rows.method == method.name]
-        for pair, value in zip(own.pair, own.correlation, strict=True):
+        pairs = rows[rows.method == method.name]
+        for pair, value in zip(pairs.pair, pairs.correlation, strict=True):
             a, b = (PARAMETERS.index(name) for name in pair.split("-"))
             matrix[a, b] = matrix[b, a] = value
-        return f"{whose}{method.short}, λ = {level:g}", matrix
+        return f"{source}{method.short}, λ = {level:g}", matrix
 
-    ours, paper = read_table(correlation), published("correlation")
-    ours = ours[(ours.test_set == "uniform") & (ours.noise_level > 0)]
-    ours = ours.assign(pair=ours.parameter_a + "-" + ours.parameter_b)
-    shown = [method for method in ALIGNERS.values() if method.short]
-    published_too, more = [m for m in shown if m.look.paper], [m for m in shown if not m.look.paper]
+    measured, paper = read_table(correlation), published("correlation")
+    measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
+    measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)
+    methods = [method for method in ALIGNERS.values() if method.short]
+    in_paper = [method for method in methods if method.look.paper]
+    not_in_paper = [method for method in methods if not method.look.paper]
     panels = []
-    for level in np.unique(ours.noise_level):
-        rows = ours[ours.noise_level == level]
-        known = paper[np.isclose(paper.noise_level, level)]
-        first = [titled(method, known, "paper, ") for method in published_too]
-        first += [titled(method, rows) for method in published_too]
-        panels += [first, [titled(method, rows) for method in more]]
+    for level in np.unique(measured.noise_level):
+        rows = measured[measured.noise_level == level]
+        paper_rows = paper[np.isclose(paper.noise_level, level)]
+        # Methods of the paper, as published and measured, above the other ones.
+        upper = [panel(method, paper_rows, "paper, ") for method in in_paper]
+        upper += [panel(method, rows) for method in in_paper]
+        panels += [upper, [panel(method, rows) for method in not_in_paper]]
     write_png(correlation_matrices(panels), out)

@@ -1,4 +1,8 @@
-"""Stages `bank`, `bounds`, `efficiency`, `paper-rows`: the best estimates, and others beside."""
+"""Stages `bank`, `bounds`, `optics`, `efficiency`, `paper-rows`: bounds of the error of estimates.
+
+They simulate stars, bound the error of any estimate of the test stars, and compare the errors of
+methods with these bounds.
+"""
 
 from __future__ import annotations
 
@@ -41,14 +45,10 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.comparison import CELL
 
 if TYPE_CHECKING:
     from psfdae_paper.methods.wavefront import Wavefront
-
-KNOWING_THE_OPTICS = ("wavefront", "wavefront_position")
-
-COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
-"""What one column of the paper's tables is: methods are compared inside it."""
 
 
 @command("bank", reads=(*SIMULATION, "bounds"))
@@ -57,7 +57,7 @@ def bank(
     out: Annotated[File, "HDF5 product with fresh stars, framed so that they can be mirrored."],
 ) -> None:
     """Simulate the bank of fresh stars behind the posterior mean."""
-    limit_threads(1)  # batches run side by side
+    limit_threads(1)  # batches run in parallel
     parts = [
         fresh_stars(config, name, count, config.bounds.threads)
         for name, count in (
@@ -101,19 +101,21 @@ def bounds(
         raise ProductError(f"{stars}: the stars have random aberrations, a bank is needed")
     else:
         add_floor(config, product, tables)
-        drawn = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
-        require(bank, drawn.config, STARS, product.config, stars)
-        sizes = (drawn.config["grid"]["points"], drawn.config["framing"]["jitter_px"])
-        everything = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
-        count, fields = drawn.config["bounds"]["bank_stars"], everything.points**2
+        bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
+        require(bank, bank_product.config, STARS, product.config, stars)
+        framed_stars, field, peak = (bank_product[k] for k in ("framed", "field_index", "peak"))
+        settings = bank_product.config
+        sizes = (settings["grid"]["points"], settings["framing"]["jitter_px"])
+        # Only the bound that is given the field uses the stars after the first `bank_stars`.
+        large_bank = Bank(framed_stars, field, peak, *sizes)
+        count, fields = settings["bounds"]["bank_stars"], large_bank.points**2
         if count < fields:
             raise ProductError(
                 f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
                 "a star for every field"
             )
-        add_means(
-            config, everything.take(np.arange(count)), everything, drawn, product, static, tables
-        )
+        small_bank = large_bank.take(np.arange(count))
+        add_means(config, small_bank, large_bank, bank_product, product, static, tables)
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -128,34 +130,36 @@ def optics(
     per_star: Annotated[File, "Parquet with every star."],
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure the methods that know the telescope, on the test stars that are bounded."""
+    """Measure the methods that are given the telescope, on the test stars that are bounded."""
     import pandas as pd
 
     limit_threads(1)
     product = read_product(stars, "stars")
     require(stars, product.config, STARS, config)
-    drawn = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
-    require(bank, drawn.config, STARS, product.config, stars)
+    bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
+    require(bank, bank_product.config, STARS, product.config, stars)
     bounded = bounded_stars(config, product)
     position = field_positions(product)[bounded.star]
     summary, stars_table = [], []
-    for kind in (cast("type[Wavefront]", method(name)) for name in KNOWING_THE_OPTICS):
-        data = {r: training_set(config, kind, product, SPLIT, r) for r in bounded.truth}
-        first = kind.with_bank(drawn.arrays, config, next(iter(data.values())))
-        fitted = {reference: replace(first, data=own) for reference, own in data.items()}
+    for name in ("wavefront", "wavefront_position"):
+        method_class = cast("type[Wavefront]", method(name))
+        data = {r: training_set(config, method_class, product, SPLIT, r) for r in bounded.truth}
+        # The posterior does not depend on the reference: it is computed once for all references.
+        first = method_class.with_bank(bank_product.arrays, config, next(iter(data.values())))
+        estimators = {reference: replace(first, data=data[reference]) for reference in data}
         for level, noisy in bounded.noisy.items():
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)
-            for reference, estimator in fitted.items():
-                found = estimator.estimated(*posterior, noisy, level, position)
+            for reference, estimator in estimators.items():
+                estimate = estimator.estimate_from_posterior(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
-                metrics = quality(found, truth, config.evaluation.data_range)
+                metrics = quality(estimate, truth, config.evaluation.data_range)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
-                row |= {"reference": reference, "method": kind.name, "noise_level": level}
+                row |= {"reference": reference, "method": name, "noise_level": level}
                 summary += summarised(row, metrics, bounded.field)
-                each = {"star": bounded.star, "field": bounded.field}
-                stars_table.append(pd.DataFrame({**row, **each, **metrics}))
-            print(f"{kind.name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
+                star_columns = {"star": bounded.star, "field": bounded.field}
+                stars_table.append(pd.DataFrame({**row, **star_columns, **metrics}))
+            print(f"{name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
@@ -171,8 +175,9 @@ def collect_bounds(
     for path, frame in zip(parts, frames, strict=True):
         if list(frame.columns) != list(frames[0].columns):
             raise ProductError(f"{path}: columns {list(frame.columns)}, unlike {parts[0]}")
-    filled = [frame for frame in frames if len(frame)] or frames[:1]
-    write_csv(out, pd.concat(filled, ignore_index=True))
+    # Empty tables would change the types of columns.
+    nonempty = [frame for frame in frames if len(frame)] or frames[:1]
+    write_csv(out, pd.concat(nonempty, ignore_index=True))
 
 
 @command("efficiency")
@@ -197,59 +202,58 @@ def efficiency(
     """
     import pandas as pd
 
+    # Keys of the posterior means that are tight.
     limits = pd.concat([read_table(path) for path in bounds], ignore_index=True)
-    sure = limits.method.isin(POSTERIOR_MEANS) & (limits.metric == "mse") & (limits.tight == "yes")
-    of_tight = limits[sure]
-    levels = map("{:.6g}".format, of_tight.noise_level)
-    tight = {*zip(of_tight.dataset, of_tight.reference, of_tight.method, levels, strict=True)}
-    best = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
-    wanted = [*COLUMN_OF_TABLE, "method", "star", "field", "mse"]
-    methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in parts])
-    # The posterior mean over a bank is an estimator and must respect the floor.
-    means = best[best.method.isin(POSTERIOR_MEANS)][wanted]
+    is_mean_mse = limits.method.isin(POSTERIOR_MEANS) & (limits.metric == "mse")
+    tight_rows = limits[is_mean_mse & (limits.tight == "yes")]
+    levels = map("{:.6g}".format, tight_rows.noise_level)
+    tight = {*zip(tight_rows.dataset, tight_rows.reference, tight_rows.method, levels, strict=True)}
+    # Errors of methods by star, in groups that are columns of the paper's tables. The posterior
+    # mean over a bank is an estimator, too, and must respect the floor.
+    bound_stars = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
+    columns = [*CELL, "method", "star", "field", "mse"]
+    methods = pd.concat([pd.read_parquet(path, columns=columns) for path in parts])
+    means = bound_stars[bound_stars.method.isin(POSTERIOR_MEANS)][columns]
     methods = pd.concat([methods, means], ignore_index=True)
-    by_column = dict(list(methods.groupby(COLUMN_OF_TABLE, sort=False)))
+    by_cell = dict(list(methods.groupby(CELL, sort=False)))
     rows: list[dict[str, object]] = []
-    for key, bounded in best.groupby(COLUMN_OF_TABLE, sort=False):
-        found = by_column[key]
-        if found.method.isin(POSTERIOR_MEANS).all():
+    for key, bounded in bound_stars.groupby(CELL, sort=False):
+        errors = by_cell[key]
+        if errors.method.isin(POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
-        rows += compared(dict(zip(COLUMN_OF_TABLE, key, strict=True)), found, bounded, tight)
+        rows += compared(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
     write_csv(out, pd.DataFrame(rows, columns=EFFICIENCY_COLUMNS))
 
 
 @command("paper-rows")
-def beside_the_paper(
+def paper_rows_table(
     bounds: Annotated[File, "CSV of the bounds of all datasets."],
     efficiency: Annotated[File, "CSV of the stage efficiency."],
-    out: Annotated[File, "CSV: the paper's errors, ours and the least possible ones."],
+    out: Annotated[File, "CSV: the paper's errors, measured errors and the least possible ones."],
 ) -> None:
-    """Set the paper's errors beside the posterior mean of our scenes, reference realisation.
+    """Set the paper's errors beside the posterior mean of the simulated scenes.
 
-    Ours and the bound are means over the bounded stars; `stderr` is that of the bound. The
-    paper's error is `below what this scene allows` if it is below a tight bound as in the stage
-    efficiency. A bound that is not tight is above the least possible error: an error below it
-    proves nothing.
+    The reference is the realisation. Measured errors and the bound are means over the bounded
+    stars; `stderr` is that of the bound. The paper's error is `below what this scene allows` if it
+    is below a tight bound as in the stage efficiency. A bound that is not tight is above the least
+    possible error: an error below it proves nothing.
     """
     from psfdae_paper.evaluation.paper import paper_rows, published
 
-    column = ["dataset", "noise_level"]
+    key = ["dataset", "noise_level"]
     paper = published("psf").query("metric == 'mse'").replace({"method": paper_rows()})
-    ours = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
+    measured = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
     limits = read_table(bounds).query(
         "method == 'bayes' and reference == 'realisation' and metric == 'mse'"
     )
-    table = paper[[*column, "method", "value"]].rename(columns={"value": "mse_paper"})
-    table = table.merge(ours[[*column, "method", "mse"]], on=[*column, "method"])
+    table = paper[[*key, "method", "value"]].rename(columns={"value": "mse_paper"})
+    table = table.merge(measured[[*key, "method", "mse"]], on=[*key, "method"])
     table = table.merge(
-        limits[[*column, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}),
-        on=column,
+        limits[[*key, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}), on=key
     )
     difference = table.mse_paper - table.mse_bound
-    found = [
-        Comparison(*each)
-        for each in zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
-    ]
-    table["paper_over_bound"] = [1 / each.efficiency for each in found]
-    table["verdict"] = list(map(paper_verdict, found, table.tight == "yes"))
+    values = zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
+    comparisons = [Comparison(*row) for row in values]
+    table["paper_over_bound"] = [1 / comparison.efficiency for comparison in comparisons]
+    table["verdict"] = list(map(paper_verdict, comparisons, table.tight == "yes"))
     write_csv(out, table[PAPER_COLUMNS])

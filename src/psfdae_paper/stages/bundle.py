@@ -1,4 +1,4 @@
-"""Stages `bundle` and `ship`: a fitted method in one file, for use."""
+"""Stages `bundle` and `ship`: a fitted method as one file, which astronomers apply to images."""
 
 from __future__ import annotations
 
@@ -29,14 +29,8 @@ from psfdae_paper.stages.evaluate import Models
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
 
-LARGEST_SHIPPED = 5_000_000
-"""Bytes of the bundle that comes with the package, at most."""
-
-LICENCE = "MIT"
-"""Of the shipped bundle, as of the package: its stars are simulated."""
-
-WELL_COVERED = (0.63, 0.73)
-"""Coverage of `error68` that a shipped bundle must have at every noise level."""
+MAX_SHIPPED_BYTES = 5_000_000
+"""Largest size of the bundle that comes with the package."""
 
 
 @command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
@@ -59,48 +53,56 @@ def bundle(
     out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
     """Pack a trained network with its errors and all that it takes to apply it."""
-    # The configuration inside the product "stars" says what kind of stamps they are.
     limit_threads(config.evaluation.threads)
-    given = {key: place for key, place in vars(models).items() if place is not None}
-    if len(given) != 1:
+    fits_by_name = {key: place for key, place in vars(models).items() if place is not None}
+    if len(fits_by_name) != 1:
         options = " or ".join(f"--{key.replace('_', '-')}" for key in vars(models))
         raise BundleError(f"one model makes a bundle: {options}")
-    ((key, place),) = given.items()
-    kind = method(key)
-    trained = _trained(kind, place, config, split)
-    restored = trained.get("reference") or reference or "realisation"
-    product = read_stars(stars, restored)
+    ((method_name, place),) = fits_by_name.items()
+    method_class = method(method_name)
+    fit_config = _fit_config(method_class, place, config, split)
+    # The product "stars" has the telescope, camera and framing of the stamps in its configuration.
+    target = fit_config.get("reference") or reference or "realisation"
+    product = read_stars(stars, target)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
-    fitted = kind.load(place, restored, config.evaluation)
-    said = name or out.name.removesuffix(SUFFIX), licence
-    model = packing.model_of(fitted, product, restored, config, trained, *said, largest_mb)
+    fitted = method_class.load(place, target, config.evaluation)
+    labels = name or out.name.removesuffix(SUFFIX), licence
+    model = packing.model_of(fitted, product, target, config, fit_config, *labels, largest_mb)
     model.save(out)
 
 
-def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
-    """Configuration of a fit, if it is that of the stage."""
-    for path in fits.own_files(kind, place):
+def _fit_config(
+    method_class: type[Method], place: Path, config: Config, split: str | None
+) -> dict[str, Any]:
+    """Return the configuration of a fit; BundleError if it is not that of the stage."""
+    for path in fits.own_files(method_class, place):
         if not path.is_file():
-            raise BundleError(f"{path}: no such file; psfdae fit {kind.name} writes it")
-    path, trained = place / CONFIG if place.is_dir() else place, kind.described(place)
-    lacking = {*SEEN_BY_TRAINING, *kind.groups, "split"} - set(trained)
-    lacking |= {"reference"} - set(trained) if fits.storage_of(kind).per_reference else set()
-    if lacking:
-        raise BundleError(f"{path}: key {min(lacking)!r} is missing")
-    asked = config.model_dump(include={*SEEN_BY_TRAINING}) | {"split": split or trained["split"]}
-    _refuse_mismatch({key: trained[key] for key in asked}, asked, path)
-    return trained
+            raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
+    path = place / CONFIG if place.is_dir() else place
+    fit_config = method_class.described(place)
+    required = {*SEEN_BY_TRAINING, *method_class.groups, "split"}
+    required |= {"reference"} if fits.storage_of(method_class).per_reference else set()
+    if missing := required - set(fit_config):
+        raise BundleError(f"{path}: key {min(missing)!r} is missing")
+    stage_config = config.model_dump(include={*SEEN_BY_TRAINING})
+    stage_config |= {"split": split or fit_config["split"]}
+    _refuse_mismatch({key: fit_config[key] for key in stage_config}, stage_config, path)
+    return fit_config
 
 
-def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path) -> None:
-    found, wanted = ([word.strip("+") for word in as_overrides(t)] for t in (trained, asked))
-    differing = sorted({*found} - {*wanted}) or sorted({*wanted} - {*found})
+def _refuse_mismatch(trained: dict[str, Any], configured: dict[str, Any], path: Path) -> None:
+    """Raise BundleError that names the first setting in which two configurations differ."""
+    trained_words, configured_words = (
+        [word.strip("+") for word in as_overrides(tree)] for tree in (trained, configured)
+    )
+    differing = sorted({*trained_words} - {*configured_words})
+    differing = differing or sorted({*configured_words} - {*trained_words})
     if differing:
         key = differing[0].split("=")[0]
-        other = next((word for word in wanted if word.startswith(f"{key}=")), f"no {key}")
+        same_key = (word for word in configured_words if word.startswith(f"{key}="))
         raise BundleError(
             f"{path}: the network was trained with {differing[0]}, "
-            f"but the bundle is asked for with {other}"
+            f"but the configuration of the bundle has {next(same_key, f'no {key}')}"
         )
 
 
@@ -111,7 +113,7 @@ def ship(
     stars: Annotated[File, "Product of the stage stars that they were trained on."],
     out: Annotated[Folder, "Folder of the package's bundles."],
 ) -> None:
-    """Make that bundle which errs least on validation stars the package's own.
+    """Make the bundle with the smallest error on validation stars the package's bundle.
 
     Flux and sky of these stars are estimated, and every noise level counts alike.
     """
@@ -119,37 +121,43 @@ def ship(
     for path in bundle:
         errors[path] = _validation_error(read_bundle(path), product, config)
         print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
-    best = min(errors, key=errors.__getitem__)
-    packed = read_bundle(best)
-    low, high = WELL_COVERED
+    source = min(errors, key=errors.__getitem__)
+    packed = read_bundle(source)
+    # The stated 68 % errors must contain 68 ± 5 % of the errors at every noise level.
+    low, high = 0.63, 0.73
     for row in packed.info.metrics:
         if not low <= row.get("coverage68", 0.0) <= high:
             raise BundleError(
-                f"{best}: at noise level {row.get('noise_level', 0.0):g} error68 holds "
+                f"{source}: at noise level {row.get('noise_level', 0.0):g} error68 contains "
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
-    info = packed.info.model_copy(update={"name": SHIPPED, "licence": LICENCE})
-    if best.stat().st_size > LARGEST_SHIPPED:
-        raise BundleError(f"{best}: {best.stat().st_size} bytes, at most {LARGEST_SHIPPED}")
+    # Its stars are simulated: it has the licence of the package.
+    info = packed.info.model_copy(update={"name": SHIPPED, "licence": "MIT"})
+    size = source.stat().st_size
+    if size > MAX_SHIPPED_BYTES:
+        raise BundleError(f"{source}: {size} bytes, at most {MAX_SHIPPED_BYTES}")
     shipped = out / f"{SHIPPED}{SUFFIX}"
     write_bundle(replace(packed, info=info), shipped)
     print(shipped)
 
 
 def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
-    """Geometric mean over the noise levels of the MSE of PSFs of flux 1."""
-    kind = method(bundle.info.method)
-    data = training_set(config, kind, stars, "random", "realisation")
-    if not kind.needs.validation:
-        apart = fit_apart(kind, data, np.arange(len(data.images)), config)
+    """Return the MSE of PSFs of flux 1, as a geometric mean over the noise levels."""
+    method_class = method(bundle.info.method)
+    data = training_set(config, method_class, stars, "random", "realisation")
+    # A method that needs no validation stars was fitted to them, too: fit it without them.
+    if not method_class.needs.validation:
+        independent_fit = fit_apart(method_class, data, np.arange(len(data.images)), config)
         size = sum(array.nbytes for array in bundle.weights.values())
-        weights, _ = packing.packed(apart, bundle.info.stamp_px, bundle.info.noise_min, size)
+        info = bundle.info
+        weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
         bundle = replace(bundle, weights=weights)
     model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
-    logs = []
+    log_errors = []
     for level in data.levels:
         rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)
         stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
-        found = model.predict(stamps, gain=1.0)
-        logs.append(np.log(np.nanmean(np.square(found.psf / found.flux[:, None, None] - truth))))
-    return float(np.exp(np.mean(logs)))
+        prediction = model.predict(stamps, gain=1.0)
+        normalised_psf = prediction.psf / prediction.flux[:, None, None]
+        log_errors.append(np.log(np.nanmean(np.square(normalised_psf - truth))))
+    return float(np.exp(np.mean(log_errors)))

@@ -1,4 +1,4 @@
-"""Stages `scan` and `calibrate`: what the paper leaves open, fitted to its own rows."""
+"""Stages `scan` and `calibrate`: parameters that the paper does not state, fitted to its tables."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ def scan(
     dataset: Annotated[str, "A dataset that the paper tabulates."],
     out: Annotated[File, "CSV with the SSIM over scale, r0 and dynamic range."],
 ) -> None:
-    """Scan what the paper leaves open against its original-noise rows.
+    """Scan parameters that the paper does not state against its original-noise rows.
 
-    The noise of each column is scaled to the MSE that the paper prints, so that only
-    image structure and dynamic range are left to explain the SSIM.
+    The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
+    only on image structure and dynamic range.
     """
     import pandas as pd
 
-    limit_threads(1)  # batches run side by side
+    limit_threads(1)  # batches run in parallel
     rows = [row for row in original_noise_rows() if row.dataset == dataset]
-    scanned = [float("nan")]
+    r0_values = [float("nan")]
     if isinstance(config.wavefront, VonKarman):
-        # The configured r0 is always scanned: its fit is set beside the configured scale.
-        scanned = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
+        # The configured r0 is always scanned: its fit is compared with the configured scale.
+        r0_values = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
     table = []
-    for r0 in scanned:
+    for r0 in r0_values:
         source = _source(config, r0)
         for scale in config.calibration.pixel_scales_arcsec:
             images = _images(config, source, scale)
             for row in rows:
                 noisy = _at_published_mse(images, row, config)
                 ranges = config.calibration.data_ranges
-                similar = np.atleast_2d(ssim(noisy, images, *ranges))
+                similarity = np.atleast_2d(ssim(noisy, images, *ranges))
                 table += [
                     {
                         "experiment": config.scene.experiment,
@@ -72,45 +72,51 @@ def scan(
                         "data_range": data_range,
                         "ssim": values.mean(),
                     }
-                    for data_range, values in zip(ranges, similar, strict=True)
+                    for data_range, values in zip(ranges, similarity, strict=True)
                 ]
     write_csv(out, pd.DataFrame(table))
 
 
-class _Kept:
-    """Turbulent wavefronts whose OPD is formed once for each grid, not for each pixel scale."""
+class _CachedWavefronts:
+    """Turbulent wavefronts whose OPD is computed once per grid, not once per pixel scale."""
 
     def __init__(self, source: WavefrontSource) -> None:
-        self.source, self.slopes = source, source.slopes
+        self.source = source
+        self.slopes = source.slopes
         self._opd: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
         return len(self.source)
 
     def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        """As of the source; double precision, which few stars need, is not kept."""
+        """Return the OPD of wavefronts like the source; double precision is not cached.
+
+        Only few stars need double precision.
+        """
         if dtype != np.float32:
             return self.source.opd(index, pupil, dtype)
         if pupil.axis.size not in self._opd:
-            every = np.arange(len(self))
-            self._opd[pupil.axis.size] = self.source.opd(every, pupil, dtype)
+            all_wavefronts = np.arange(len(self))
+            self._opd[pupil.axis.size] = self.source.opd(all_wavefronts, pupil, dtype)
         opd: np.ndarray = self._opd[pupil.axis.size][index]
         return opd
 
 
 def _source(config: Config, r0: float) -> WavefrontSource:
-    """Wavefronts of the scanned stars, or of all fields behind turbulence, if it has this r0."""
+    """Return wavefronts of the scanned stars, or of all fields behind turbulence of this r0."""
     if not isinstance(config.wavefront, VonKarman):
         count, fields = config.calibration.stars, config.grid.points**2
         return star_wavefronts(
             config, assign_fields(count, fields, stream(config.seed, "scan", "field"))
         )
     wavefront = config.wavefront.model_copy(update={"r0_m": r0})
-    return _Kept(template_wavefronts(config.model_copy(update={"wavefront": wavefront})))
+    return _CachedWavefronts(
+        template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
+    )
 
 
 def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray:
-    """Noise-free, framed, normalised stars at another pixel scale."""
+    """Return noise-free, framed, normalised stars at another pixel scale (arcsec)."""
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
     propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
@@ -118,6 +124,7 @@ def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray
 
 
 def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
+    """Add noise to images, scaled so that its MSE is that of a column of the paper."""
     level, background = row.noise_level, config.noise.background_photons
     kappa = kappa_of_mse(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
@@ -141,27 +148,30 @@ def calibrate(
     columns = pd.DataFrame(
         [_column(row, products[row.dataset], config) for row in original_noise_rows()]
     )
-    scanned = scan_table.r0_m
-    by_r0 = {
-        r0: fit_scales(scan_table[scanned.isna() | (scanned == r0)])
-        for r0 in sorted(scanned.dropna().unique())
+    # A joint fit of both scenes for each r0 of scene 2; scene 1 has none (NaN).
+    r0_column = scan_table.r0_m
+    fit_by_r0 = {
+        r0: fit_scales(scan_table[r0_column.isna() | (r0_column == r0)])
+        for r0 in sorted(r0_column.dropna().unique())
     }
-    fit = by_r0[min(by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
+    fit = fit_by_r0[min(fit_by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
     # Least squares of log MSE: every column counts alike.
-    used = columns[columns.fitted]
-    kappa = float(np.exp(np.log(used.kappa).mean()))
-    rms = float(np.sqrt(((used.ssim_at_published_mse - used.ssim_paper) ** 2).mean()))
+    fitted_columns = columns[columns.fitted]
+    kappa = float(np.exp(np.log(fitted_columns.kappa).mean()))
+    ssim_residual = fitted_columns.ssim_at_published_mse - fitted_columns.ssim_paper
+    rms = float(np.sqrt((ssim_residual**2).mean()))
     table = [
         ("kappa", kappa, config.noise.kappa, "1"),
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
         ("pixel_scale_scene1", fit.pixel_scale["scene1"], configured["scene1"], "arcsec"),
         ("pixel_scale_scene2", fit.pixel_scale["scene2"], configured["scene2"], "arcsec"),
-        ("r0_scene2", min(by_r0, key=lambda r0: by_r0[r0].rms), configured["r0_m"], "m"),
+        ("r0_scene2", min(fit_by_r0, key=lambda r0: fit_by_r0[r0].rms), configured["r0_m"], "m"),
         ("ssim_residual_rms", fit.rms, rms, "1"),
     ]
+    # Different r0 with other pixel scales explain the paper's rows nearly as well.
     degeneracy = [
-        (r0, other.pixel_scale["scene2"], other.data_range, other.rms)
-        for r0, other in by_r0.items()
+        (r0, r0_fit.pixel_scale["scene2"], r0_fit.data_range, r0_fit.rms)
+        for r0, r0_fit in fit_by_r0.items()
     ]
     frames = {
         "fit.csv": pd.DataFrame(table, columns=["quantity", "fitted", "configured", "unit"]),
@@ -176,7 +186,7 @@ def calibrate(
 
 
 def _configured(stars: dict[str, Path]) -> dict[str, float]:
-    """Pixel scales and r0 that the star products were simulated with."""
+    """Return the pixel scales and the r0 with which the stars were simulated."""
     values: dict[str, float] = {}
     scenes: dict[str, Product] = {}
     for path in stars.values():
@@ -191,14 +201,14 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
 
 
 def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]:
-    """One original-noise column: the paper's values and ours, at κλ and at its own MSE."""
+    """Return one original-noise column: published and simulated, at κλ and at its own MSE."""
     images = read_product(path, "stars", ("realisation",))["realisation"]
     background = config.noise.background_photons
     rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")
     noise = NoiseModel(config.noise.kappa, background)
-    ours = noise.draw(images, row.noise_level, rng)
-    matched = _at_published_mse(images, row, config)
-    data_range, error = config.evaluation.data_range, mse(ours, images).mean()
+    noisy = noise.draw(images, row.noise_level, rng)
+    noisy_at_published_mse = _at_published_mse(images, row, config)
+    data_range, error = config.evaluation.data_range, mse(noisy, images).mean()
     return {
         "dataset": row.dataset,
         "noise_level": row.noise_level,
@@ -208,6 +218,6 @@ def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]
         "mse": error,
         "mse_ratio": error / row.mse,
         "ssim_paper": row.ssim,
-        "ssim_at_published_mse": ssim(matched, images, data_range).mean(),
-        "ssim_at_kappa": ssim(ours, images, data_range).mean(),
+        "ssim_at_published_mse": ssim(noisy_at_published_mse, images, data_range).mean(),
+        "ssim_at_kappa": ssim(noisy, images, data_range).mean(),
     }

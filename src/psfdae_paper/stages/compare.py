@@ -1,4 +1,4 @@
-"""Stage `compare`: finished networks or tables of errors side by side, as Markdown."""
+"""Stage `compare`: differences between finished networks or tables of errors, as Markdown."""
 
 from __future__ import annotations
 
@@ -26,12 +26,24 @@ TABLE = "tables/psf_metrics.csv"
 
 
 class ComparisonError(Error, ValueError):
-    """What was named cannot be compared."""
+    """The runs or folders that were named cannot be compared."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A trained network and what was measured on it."""
+    """A trained network with its settings and errors.
+
+    Attributes
+    ----------
+    name : str
+        Folder of the network.
+    config : dict
+        Flattened configuration.
+    history : DataFrame
+        Training and validation errors by epoch.
+    errors : DataFrame
+        Errors per star.
+    """
 
     name: str
     config: dict[str, str]
@@ -55,11 +67,10 @@ def compare(
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
     if all(map(_tables, runs)) and not all(map(_networks, runs)):
-        first, *others = runs
-        blocks = [describe_tables(first, other) for other in others]
+        blocks = [describe_tables(runs[0], folder) for folder in runs[1:]]
     else:
-        groups = ([read_run(*found) for found in group] for group in _groups(runs))
-        blocks = [describe(first, other) for first, *others in groups for other in others]
+        groups = ([read_run(*paths) for paths in group] for group in _groups(runs))
+        blocks = [describe(group[0], run) for group in groups for run in group[1:]]
     text = "\n\n".join(blocks) + "\n"
     if out is not None:
         write_text(out, text)
@@ -67,49 +78,52 @@ def compare(
 
 
 def _networks(folder: Path) -> set[Path]:
-    """Folders of trained networks below a folder of results."""
-    kinds = (kind.name for kind in registered() if kind.storage and CONFIG in kind.storage.files)
-    paths = (path for name in kinds for path in folder.glob(f"{name}/*/*/{CONFIG}"))
+    """Return the folders of trained networks, relative to a folder of results."""
+    names = (m.name for m in registered() if m.storage and CONFIG in m.storage.files)
+    paths = (path for name in names for path in folder.glob(f"{name}/*/*/{CONFIG}"))
     return {path.parent.relative_to(folder) for path in paths}
 
 
 def _tables(folder: Path) -> list[Path]:
-    """Tables of mean errors: of each evaluation of a run, or the joined one of a record."""
+    """Return the tables of mean errors: one per evaluation of a run, or that of a record."""
     joined = [path for path in [folder / TABLE] if path.is_file()]
     return sorted(folder.glob("evaluation/*/*.csv")) or joined
 
 
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
-    """(Folder of the network, table of its errors) of the runs that belong together."""
+    """Return the runs to compare with each other: folder of the network, table of its errors."""
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
-    places = []
-    for folder in folders:
-        if not (found := _networks(folder)):
+    networks = [_networks(folder) for folder in folders]
+    for folder, names in zip(folders, networks, strict=True):
+        if not names:
             raise ComparisonError(
                 f"{folder}: no {CONFIG}, no METHOD/DATASET/RUN/{CONFIG} and no {TABLE} in it, "
                 "hence neither a trained network nor a folder of results"
             )
-        places.append(found)
-    common = sorted(set.intersection(*places))
+    common = sorted(set.intersection(*networks))
     if not common:
         raise ComparisonError(f"{', '.join(map(str, folders))}: no network in common")
-    return [[(folder / at, errors_of(folder / at)) for folder in folders] for at in common]
+    return [[(folder / name, errors_of(folder / name)) for folder in folders] for name in common]
 
 
 def errors_of(folder: Path) -> Path:
-    """Table of errors per star: beside the network, or where the workflow puts it."""
-    beside = folder / "evaluation.parquet"
-    if beside.is_file():
-        return beside
-    whole = folder.resolve()
-    if len(whole.parents) < 3:
+    """Return the path of the errors per star of a network.
+
+    The table is in the folder of the network, as for points of a sweep, or in the folder of
+    evaluations of the workflow.
+    """
+    table = folder / "evaluation.parquet"
+    if table.is_file():
+        return table
+    absolute = folder.resolve()
+    if len(absolute.parents) < 3:
         raise ComparisonError(f"{folder}: no evaluation.parquet in it")
-    return whole.parents[2] / "evaluation" / whole.parent.name / f"{whole.name}.parquet"
+    return absolute.parents[2] / "evaluation" / absolute.parent.name / f"{absolute.name}.parquet"
 
 
 def read_run(folder: Path, errors: Path) -> Run:
-    """Read a network's settings, curve and errors per star; raises ProductError."""
+    """Read a network's settings, training history and errors per star; raises ProductError."""
     import pandas as pd
 
     config = read_yaml(folder / CONFIG)
@@ -125,7 +139,7 @@ def read_run(folder: Path, errors: Path) -> Run:
 
 
 def describe(first: Run, second: Run) -> str:
-    """Markdown with the differences between two runs."""
+    """Return the differences between two runs as Markdown."""
     from psfdae_paper.evaluation.comparison import (
         SIGNIFICANT,
         compare_errors,
@@ -139,8 +153,8 @@ def describe(first: Run, second: Run) -> str:
     errors = compare_errors(first.errors, second.errors, seed_scatter())
     paired = same_noisy_stars(first.errors, second.errors)
     references = {run.config.get("reference", "") for run in (first, second)}
-    warning = "The runs have different references: not the same question.\n\n"
-    how = "star by star on the same noisy images" if paired else "as independent samples"
+    warning = "The runs have different references: their errors are not comparable.\n\n"
+    pairing = "star by star on the same noisy images" if paired else "as independent samples"
     return "\n\n".join(
         [
             f"# {first.name} (A) and {second.name} (B)",
@@ -148,14 +162,14 @@ def describe(first: Run, second: Run) -> str:
             _table(config_differences(first.config, second.config), ["setting", "A", "B"]),
             "## Training",
             _table([(key, curves[0][key], curves[1][key]) for key in curves[0]], ["", "A", "B"]),
-            f"## Errors, {how}",
+            f"## Errors, {pairing}",
             ("" if len(references) == 1 else warning)
-            + f"B − A ± standard error clustered by field ± scatter between seeds; {SIGNIFICANT:g} "
-            "times both together make B better or worse. Where the second was not measured "
-            "(`snakemake seeds`), it is missing, and the first alone decides.",
+            + "B − A ± standard error clustered by field ± scatter between seeds. B is better or "
+            f"worse if the difference is {SIGNIFICANT:g} times both together. Where the scatter "
+            "was not measured (`snakemake seeds`), it is missing, and the standard error decides.",
             _table(
                 [
-                    (*row[:5], _change(row), row.sigmas, row.verdict)
+                    (*row[:5], _difference(row), row.sigmas, row.verdict)
                     for row in errors.itertuples(index=False)
                 ],
                 ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"],
@@ -164,27 +178,28 @@ def describe(first: Run, second: Run) -> str:
     )
 
 
-def _change(row: Any) -> str:
-    of_seeds = "" if row.seed_stderr != row.seed_stderr else f" ± {row.seed_stderr:.2g}"
-    return f"{row.difference:+.3g} ± {row.stderr:.2g}{of_seeds}"
+def _difference(row: Any) -> str:
+    """Return a difference with its standard error and, unless it is NaN, the seeds' scatter."""
+    seed_scatter = "" if row.seed_stderr != row.seed_stderr else f" ± {row.seed_stderr:.2g}"
+    return f"{row.difference:+.3g} ± {row.stderr:.2g}{seed_scatter}"
 
 
 def read_errors(folder: Path) -> pd.DataFrame:
-    """Mean errors of all methods in a folder of results; raises ProductError."""
+    """Read the mean errors of all methods in a folder of results; raises ProductError."""
     import pandas as pd
 
     from psfdae_paper.evaluation.comparison import CELL
 
-    wanted = [*CELL, "method", "metric", "value", "stderr"]
-    parts = {path: read_table(path) for path in _tables(folder)}
-    for path, part in parts.items():
-        if lacking := [name for name in wanted if name not in part]:
-            raise ProductError(f"{path}: column {lacking[0]!r} is missing")
-    return pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
+    columns = [*CELL, "method", "metric", "value", "stderr"]
+    tables = {path: read_table(path) for path in _tables(folder)}
+    for path, table in tables.items():
+        if missing := [name for name in columns if name not in table]:
+            raise ProductError(f"{path}: column {missing[0]!r} is missing")
+    return pd.concat([table[columns] for table in tables.values()], ignore_index=True)
 
 
 def describe_tables(first: Path, second: Path) -> str:
-    """Markdown: which mean errors of two runs are equal, and which differ by more than seeds do."""
+    """Return as Markdown the mean errors of two runs that differ by more than seeds do."""
     from psfdae_paper.evaluation.comparison import (
         NEGLIGIBLE,
         PAPER_ORDER,
@@ -193,11 +208,11 @@ def describe_tables(first: Path, second: Path) -> str:
         seed_scatter,
     )
 
-    both = read_errors(first), read_errors(second)
-    rows, order = compare_tables(*both, seed_scatter())
+    first_errors, second_errors = read_errors(first), read_errors(second)
+    rows, order = compare_tables(first_errors, second_errors, seed_scatter())
     looks = [method(name).look for name in PAPER_ORDER]
     names = " < ".join(look.paper[1] for look in looks if look.paper)
-    said = {
+    verdict_texts = {
         "equal": "are equal to the last digit",
         "rounding": f"differ by less than {NEGLIGIBLE:g} of the standard error of the test stars, "
         "as by the rounding of another kind of processor",
@@ -207,11 +222,13 @@ def describe_tables(first: Path, second: Path) -> str:
         "not measured": "differ, but their scatter between seeds was not measured",
     }
     lines = [f"# {first} (A) and {second} (B)", ""]
-    lines += [f"{len(rows)} mean errors are in both (A has {len(both[0])}, B {len(both[1])})."]
-    for verdict, text in said.items():
-        found = rows[rows.verdict == verdict]
-        lines += [f"- {len(found)} {text}"]
-        lines += [f"  - {name}" for name in _named(found)] * (verdict in ("beyond", "not measured"))
+    counts = f"A has {len(first_errors)}, B {len(second_errors)}"
+    lines += [f"{len(rows)} mean errors are in both ({counts})."]
+    for verdict, text in verdict_texts.items():
+        verdict_rows = rows[rows.verdict == verdict]
+        lines += [f"- {len(verdict_rows)} {text}"]
+        if verdict in ("beyond", "not measured"):
+            lines += [f"  - {line}" for line in _row_lines(verdict_rows)]
     lines += [
         f"- The paper's order by MSE, {names}, holds in {order['first'].sum()} of {len(order)} "
         f"columns of A and in {order['second'].sum()} of B; {order.exchanged.sum()} have two of "
@@ -221,25 +238,26 @@ def describe_tables(first: Path, second: Path) -> str:
     return "\n".join(lines)
 
 
-def _named(rows: pd.DataFrame) -> list[str]:
-    """Rows of a table of errors by dataset, split and reference, in words."""
+def _row_lines(rows: pd.DataFrame) -> list[str]:
+    """Return a line of text for each dataset, split and reference of a table of errors."""
     lines = []
     for key, cell in rows.groupby(["dataset", "split", "reference"], sort=False):
         metrics: dict[str, list[str]] = {}
         for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
             levels = ", ".join(f"{level:g}" for level in part.noise_level)
             metrics.setdefault(f"{name} at λ = {levels}", []).append(str(metric))
-        found = (f"{name} ({', '.join(of)})" for name, of in metrics.items())
-        lines.append(f"{_cell(key)}: {'; '.join(found)}")
+        texts = (f"{name} ({', '.join(names)})" for name, names in metrics.items())
+        lines.append(f"{_cell(key)}: {'; '.join(texts)}")
     return lines
 
 
 def _cell(key: Sequence[Any]) -> str:
-    """Dataset, split, reference and, if given, noise level in words."""
+    """Return dataset, split, reference and, if given, noise level as text."""
     return ", ".join([*key[:3], *(f"λ = {level:g}" for level in key[3:])])
 
 
 def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
+    """Return a Markdown table, or "None." if there are no rows."""
     from tabulate import tabulate
 
     if not rows:

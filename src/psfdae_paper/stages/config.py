@@ -1,4 +1,4 @@
-"""Stages `config` and `alignment config`: what the configuration says, checked and resolved."""
+"""Stages `config` and `alignment config`: the configuration, checked and resolved."""
 
 from __future__ import annotations
 
@@ -22,24 +22,26 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
     from psfdae_paper.configuration.compose import load, load_stage
 
     if only is None:
-        checked = load(overrides)
+        settings = load(overrides)
     else:
+        # "alignment model", "alignment_model" and "alignment-model" name the same stage.
         names = {_key(name): name for name in found()}
         reader = None
         if _key(only) in names:
             reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
         if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
-        groups = Groups(reader.of({}), reader.choice)
-        checked = load_stage(groups.of({}), groups.chosen(overrides))
-    click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
+        groups = Groups(reader.names({}), reader.choice)
+        settings = load_stage(groups.names({}), groups.with_choice(overrides))
+    click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
 
 
 @command("alignment config")
 def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
     """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
-    config(overrides if only else Groups((), CHOICE).chosen(overrides), only)
+    config(overrides if only else Groups((), CHOICE).with_choice(overrides), only)
 
 
 def _key(name: str) -> str:
+    """Return a command's name with underscores."""
     return name.replace(" ", "_").replace("-", "_")

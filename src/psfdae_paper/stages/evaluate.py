@@ -33,28 +33,31 @@ if TYPE_CHECKING:
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
-    *dict.fromkeys(g for kind in registered() if kind.storage is None for g in kind.groups),
+    *dict.fromkeys(group for m in registered() if m.storage is None for group in m.groups),
 )
-"""Groups of the configuration on which the measurements depend, models being given."""
+"""Groups of the configuration on which the measurements depend, if stored models are given.
+
+Methods that store no model are fitted by the stage, and their settings are among these groups.
+"""
 
 if TYPE_CHECKING:
 
     class Models:
-        """Options with the model of each method that leaves one, by its name."""
+        """Options with the model of each method that stores one, by its name."""
 else:
     Models = make_dataclass(
         "Models",
         [
             (
-                kind.name,
+                method_class.name,
                 Annotated[
-                    (Folder if kind.storage.files else File) | None,
-                    kind.storage.about or f"What `psfdae fit {kind.name}` leaves.",
+                    (Folder if method_class.storage.files else File) | None,
+                    method_class.storage.about or f"Result of `psfdae fit {method_class.name}`.",
                 ],
                 None,
             )
-            for kind in registered()
-            if kind.storage
+            for method_class in registered()
+            if method_class.storage
         ],
     )
 
@@ -83,11 +86,11 @@ def evaluate(
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
+        # The same noisy images for all methods: their errors are compared star by star.
         noisy = noisy_test_images(config, product, test, level)
         for name, estimator in methods.items():
-            metrics = quality(
-                estimator.estimate(noisy, level, position), truth, config.evaluation.data_range
-            )
+            estimate = estimator.estimate(noisy, level, position)
+            metrics = quality(estimate, truth, config.evaluation.data_range)
             row = {**key, "method": name, "noise_level": level}
             summary += summarised(row, metrics, field)
             stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
@@ -103,42 +106,58 @@ def estimators(
     reference: str,
     only_drawn: bool = False,
 ) -> dict[str, Method]:
-    """The methods of a configuration by name, ready for the test stars of a split.
+    """Load or fit the methods of a configuration, for the test stars of a split.
 
     Parameters
     ----------
-    config : stage config (seed, noise, parts, evaluation, methods)
-    stars : product "stars"
-    models : file or folder of each method that leaves one
-    split, reference : of the test stars
-    only_drawn : whether only those are wanted that figures of stars show
+    config : Config
+        Stage configuration (seed, noise, parts, evaluation, methods).
+    stars : Product
+        Product "stars".
+    models : mapping
+        File or folder of each method that stores a model.
+    split, reference : str
+        Split and reference of the test stars.
+    only_drawn : bool
+        Return only the methods that are in figures of stars.
+
+    Returns
+    -------
+    dict
+        Fitted method by name.
 
     Raises
     ------
     ConfigError
         If a model is not given.
     ProductError
-        If one is damaged, or does not belong to the stars.
+        If a model is damaged, or does not belong to the stars.
     """
-    kinds = [kind for kind in map(method, config.methods) if kind.look.drawn or not only_drawn]
+    classes = [m for m in map(method, config.methods) if m.look.drawn or not only_drawn]
+    # Check all models before any method is loaded or fitted.
     places: dict[str, Path] = {}
-    for kind in kinds:
-        if kind.storage:
-            place = models.get(kind.name)
+    for method_class in classes:
+        name = method_class.name
+        if method_class.storage:
+            place = models.get(name)
             if place is None:
-                raise ConfigError(f"--{kind.name.replace('_', '-')} is missing: it is in methods")
-            fits.require(kind, place, stars, config, split, reference)
-            places[kind.name] = place
-    return {
-        kind.name: kind.load(places[kind.name], reference, config.evaluation)
-        if kind.storage
-        else kind.fit(training_set(config, kind, stars, split, reference), **kind.settings(config))
-        for kind in kinds
-    }
+                raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
+            fits.require(method_class, place, stars, config, split, reference)
+            places[name] = place
+    fitted: dict[str, Method] = {}
+    for method_class in classes:
+        if method_class.storage:
+            place = places[method_class.name]
+            fitted[method_class.name] = method_class.load(place, reference, config.evaluation)
+        else:
+            data = training_set(config, method_class, stars, split, reference)
+            fitted[method_class.name] = method_class.fit(data, **method_class.settings(config))
+    return fitted
 
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
 COLUMNS += ["value", "stderr", "n"]
+"""Columns of the table of an evaluation."""
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]
@@ -158,7 +177,7 @@ def held_out(
     per_star: Annotated[tuple[File, ...], {"argument": True}],
     out: Annotated[File, "CSV: held-out over seen fields, on the stars that both splits test."],
 ) -> None:
-    """Compare fields that a training has not seen with those that it has, star by star.
+    """Compare errors in held-out fields with those in training fields, star by star.
 
     PER_STAR are the evaluations' Parquet files of both splits.
     """
@@ -166,8 +185,8 @@ def held_out(
 
     from psfdae_paper.evaluation.comparison import HELD_OUT_COLUMNS, held_out_ratios
 
-    wanted = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
-    parts = [pd.read_parquet(path, columns=wanted) for path in per_star]
+    columns = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    parts = [pd.read_parquet(path, columns=columns) for path in per_star]
     write_csv(out, held_out_ratios(pd.concat(parts)))
 
 
@@ -179,7 +198,7 @@ def paper_tables(
         tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
     ],
 ) -> None:
-    """Write the paper's tables, ours beside the paper's."""
+    """Write the paper's tables, with measured errors beside the published ones."""
     from psfdae_paper.evaluation.paper import as_markdown, paper_table
 
     measured = read_evaluations(evaluations)

@@ -1,4 +1,4 @@
-"""Stages `figure ...`: from data products and tables to one PNG each."""
+"""Stages `figure ...`: PNG figures of data products and tables."""
 
 from __future__ import annotations
 
@@ -31,11 +31,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from psfdae.figures import StripRow
-
-STRIP_STARS, HEADLINE_STARS = 8, 5
-"""Columns of a restoration strip, and of the headline."""
-
-HEADLINE_REFERENCE = "realisation"
 
 Stars = Annotated[File, "Product of the stage stars."]
 Templates = Annotated[File, "Product of the stage templates."]
@@ -90,12 +85,13 @@ def figure_strip(
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    # Eight test stars, spread over the field, with their field angles as titles.
     test = split_stars(product, "random", config).test
     field = field_of(product)[product["field_index"][test]]
-    picks = spread_stars(field, STRIP_STARS)
-    rows = strip_rows(config, product, test, picks, reference, methods, levels)
+    selected = spread_stars(field, 8)
+    rows = strip_rows(config, product, test, selected, reference, methods, levels)
     angle, unit = in_field_unit(field)
-    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[picks]]
+    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[selected]]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
         f"restored and measured {REFERENCES[reference]}"
@@ -121,20 +117,20 @@ def figure_headline(
     from psfdae_paper.evaluation.curves import headline
 
     limit_threads(config.evaluation.threads)
-    product = read_stars(stars, HEADLINE_REFERENCE)
-    given = (vars(models), "random", HEADLINE_REFERENCE)
-    methods = estimators(config, product, *given, only_drawn=True)
+    reference = "realisation"
+    product = read_stars(stars, reference)
+    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    # Five test stars, spread over the field: restored, and below them the truth.
     test = split_stars(product, "random", config).test
-    picks = spread_stars(field_of(product)[product["field_index"][test]], HEADLINE_STARS)
-    truth, *restored = strip_rows(
-        config, product, test, picks, HEADLINE_REFERENCE, methods, [level]
-    )
+    selected = spread_stars(field_of(product)[product["field_index"][test]], 5)
+    truth, *restored = strip_rows(config, product, test, selected, reference, methods, [level])
+    looks = [estimator.look for estimator in methods.values()]
     rows = [
-        replace(row, label=kind.look.label if kind.look.restores else f"{kind.look.label} star")
-        for row, kind in zip(restored, methods.values(), strict=True)
+        replace(row, label=look.label if look.restores else f"{look.label} star")
+        for row, look in zip(restored, looks, strict=True)
     ]
     rows.append(replace(truth, label="truth"))
-    errors, limits = (rows_of(p, dataset, HEADLINE_REFERENCE) for p in (efficiency, bounds))
+    errors, limits = (rows_of(path, dataset, reference) for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
     write_png(headline(rows, list(methods.values()), errors, limits, titles), out)
@@ -179,14 +175,14 @@ def figure_errors(
 
 
 def without_margin(templates: Product) -> np.ndarray:
-    """Static PSFs as they look in the middle of a stamp, shape (F, d, d)."""
+    """Return static PSFs as they are in stamps without centring error, shape (F, d, d)."""
     margin = templates.config["framing"]["jitter_px"]
     side = templates["psf"].shape[-1] - margin
     return templates["psf"][:, margin:side, margin:side]
 
 
 def field_of(stars: Product) -> np.ndarray:
-    """Field angle (x, y) of every field point in radians, shape (F, 2)."""
+    """Return the field angle (x, y) of every field point in radians, shape (F, 2)."""
     from psfdae_paper.stars.fields import square_grid
 
     grid = stars.config["grid"]
@@ -198,29 +194,32 @@ def strip_rows(
     config: Config,
     product: Product,
     test: np.ndarray,
-    picks: np.ndarray,
+    selected: np.ndarray,
     reference: str,
     methods: Mapping[str, Method],
     levels: Sequence[float],
 ) -> list[StripRow]:
-    """Rows of a restoration strip: the reference, then the methods by noise level.
+    """Make the rows of a restoration strip: the reference, then the methods by noise level.
 
-    `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
+    `config` is that of the stage `evaluate`; `test` are the test stars, and `selected` the
+    indices of those in the figure.
     """
     from psfdae.figures import StripRow
     from psfdae.metrics import mse
 
-    truth, position = product[reference][test][picks], field_positions(product)[test][picks]
+    truth = product[reference][test][selected]
+    position = field_positions(product)[test][selected]
     rows = [StripRow("reference", truth)]
     if reference == "template":
-        noise_free = product["realisation"][test][picks]
+        noise_free = product["realisation"][test][selected]
         rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
     for level in levels:
-        noisy = noisy_test_images(config, product, test[picks], level)
-        for kind in methods.values():
-            images = kind.restore(noisy, level, position)
-            label = f"{kind.look.label}\nλ = {level:g}"
-            rows.append(StripRow(label, images, mse(images, truth), not kind.look.restores))
+        noisy = noisy_test_images(config, product, test[selected], level)
+        for estimator in methods.values():
+            look, images = estimator.look, estimator.restore(noisy, level, position)
+            label = f"{look.label}\nλ = {level:g}"
+            # Images that are not restored have their own colour scale: noise exceeds the PSF.
+            rows.append(StripRow(label, images, mse(images, truth), not look.restores))
     return rows
 
 
@@ -263,7 +262,10 @@ def figure_bank_growth(
 
 
 def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
-    """Rows of a dataset, and of a reference if one is given; raises ProductError without any."""
+    """Read the rows of a dataset, and of a reference if one is given.
+
+    ProductError if there are none.
+    """
     table = read_table(path)
     rows = table[table.dataset == dataset]
     if reference is not None:

@@ -1,4 +1,4 @@
-"""Stage `fit`: a method for one dataset and split, and for a reference if it has one each."""
+"""Stage `fit`: fit of a method to one dataset and split, for one reference or for both."""
 
 from __future__ import annotations
 
@@ -42,16 +42,21 @@ def fit(
     out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
 ) -> None:
     """Fit METHOD, a name of the list `methods` in config.yaml."""
-    kind = method(name)
-    limit_threads(kind.threads(config))
-    product = read_stars(stars, fits.learnt(kind, reference))
-    kept = checkpoint or fits.beside(kind, out, "checkpoint.pt")
-    data = training_set(config, kind, product, split, reference, checkpoint=kept)
+    method_class = method(name)
+    limit_threads(method_class.threads(config))
+    product = read_stars(stars, fits.learnt(method_class, reference))
+    checkpoint_path = checkpoint or fits.beside(method_class, out, "checkpoint.pt")
+    data = training_set(config, method_class, product, split, reference, checkpoint=checkpoint_path)
+    # Warm start: a fit to templates begins with the result of one to the realisations.
     if start is not None:
-        if reference != "template" or not (issubclass(kind, GoesOn) and kind.continues(config)):
-            raise click.UsageError("--start: nothing that goes on from a fit is fitted")
-        fits.require(kind, start, product, config, split, "realisation")
-        data = replace(data, start=kind.load(start))
-    described = fits.described_by(kind, config.model_dump(), split, reference)
-    fits.store(kind.fit(data, **kind.settings(config)), out, described, product)
-    kept.unlink(missing_ok=True)
+        can_start = issubclass(method_class, GoesOn) and method_class.continues(config)
+        if reference != "template" or not can_start:
+            raise click.UsageError(
+                "--start: only fits to templates by a method with a warm start take it"
+            )
+        fits.require(method_class, start, product, config, split, "realisation")
+        data = replace(data, start=method_class.load(start))
+    described = fits.described_by(method_class, config.model_dump(), split, reference)
+    fitted = method_class.fit(data, **method_class.settings(config))
+    fits.store(fitted, out, described, product)
+    checkpoint_path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A point of a sweep over a method."""
+"""Training and measurement of one point of a sweep over a method's settings."""
 
 from __future__ import annotations
 
@@ -19,53 +19,56 @@ from psfdae_paper.sweeps.measured import Measured, Task, fit_in, measure_images
 
 
 def files_of(name: str) -> tuple[str, ...]:
-    """Names of the files of a point's fit."""
+    """Return the names of the files of a point's fit."""
     return tuple(path.name for path in fits.outputs(method(name), fit_in(method(name), Path())))
 
 
 def run(config: Config, task: Task, name: str) -> Measured:
     """Fit as the stage `fit` does, and measure.
 
-    If that fit takes the validation stars, too, the model that is validated is fitted
-    once more without them.
+    A method that also fits validation stars is fitted once more without them, for the errors on
+    validation stars.
 
     Parameters
     ----------
-    config : groups of the method, and evaluation
+    config : Config
+        Groups of the method, and `evaluation`.
     task : Task
     name : str
-        Of the method.
+        Name of the method.
 
     Raises
     ------
     FitError
-        If it cannot be fitted.
+        If the method cannot be fitted.
     """
-    kind = method(name)
-    own = part(groups_of(name), config)
-    stars, place = task.data["stars"], fit_in(kind, task.folder)
-    limit_threads(kind.threads(own))
-    validated = None
-    if not kind.needs.validation:
-        product = read_stars(stars, fits.learnt(kind, task.reference))
-        data = training_set(own, kind, product, task.split, task.reference)
-        validated = kind.fit(data.without_validation(), **kind.settings(own))
+    method_class = method(name)
+    settings = part(groups_of(name), config)
+    stars, place = task.data["stars"], fit_in(method_class, task.folder)
+    limit_threads(method_class.threads(settings))
+    validation_fit = None
+    if not method_class.needs.validation:
+        product = read_stars(stars, fits.learnt(method_class, task.reference))
+        data = training_set(settings, method_class, product, task.split, task.reference)
+        validation_fit = method_class.fit(
+            data.without_validation(), **method_class.settings(settings)
+        )
     started, started_cpu = time.monotonic(), time.process_time()
-    fit(own, name, stars, task.split, task.reference, checkpoint=task.checkpoint, out=place)
+    fit(settings, name, stars, task.split, task.reference, checkpoint=task.checkpoint, out=place)
     seconds, cpu_seconds = time.monotonic() - started, time.process_time() - started_cpu
     limit_threads(config.evaluation.threads)
-    fitted = kind.load(place, task.reference, config.evaluation)
-    metrics = measure_images(config, task, name, validated or fitted, fitted)
-    described = kind.described(place)
+    fitted = method_class.load(place, task.reference, config.evaluation)
+    metrics = measure_images(config, task, name, validation_fit or fitted, fitted)
+    described = method_class.described(place)
     attempt = described.pop("attempt", 0)
     epochs, stopped = None, False
-    if HISTORY in fits.storage_of(kind).diagnostics:
-        last = read_table(fits.beside(kind, place, HISTORY)).iloc[-1]
-        # Of the training alone, and of all its parts if it was interrupted.
-        seconds, cpu_seconds = float(last["seconds"]), float(last["cpu_seconds"])
-        most = max(getattr(group, "epochs", 0) for group in kind.settings(own).values())
-        epochs = int(last["epoch"])
-        stopped = epochs < most
+    if HISTORY in fits.storage_of(method_class).diagnostics:
+        # The history has the duration of the training, with all its parts if it was interrupted.
+        last_epoch = read_table(fits.beside(method_class, place, HISTORY)).iloc[-1]
+        seconds, cpu_seconds = float(last_epoch["seconds"]), float(last_epoch["cpu_seconds"])
+        groups = method_class.settings(settings).values()
+        epochs = int(last_epoch["epoch"])
+        stopped = epochs < max(getattr(group, "epochs", 0) for group in groups)
     return Measured(
         metrics=metrics,
         described={**read_product(stars, "stars", ()).config, **described},

@@ -1,4 +1,4 @@
-"""A point of a sweep over the networks of scene 3."""
+"""Training and measurement of one point of a sweep over a network of scene 3."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.aligners import WEIGHTS
-from psfdae_paper.configuration.alignment import STATE_STAMPS
+from psfdae_paper.configuration.alignment import STAMP_KEYS
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.alignment_tables import Row, error_rows
@@ -25,12 +25,9 @@ from psfdae_paper.stages.alignment_methods import (
 )
 from psfdae_paper.sweeps.measured import EVALUATION, VALIDATION, Measured, Task, geometric_mean
 
-TEST_SET = "uniform"
-"""Test set of scene 3, whose noise is drawn as in the main workflow."""
-
 
 def files_of(name: str) -> tuple[str, ...]:
-    """Names of the files of a point's training."""
+    """Return the names of the files of a point's training."""
     return (WEIGHTS, CONFIG, HISTORY)
 
 
@@ -39,19 +36,25 @@ def run(config: Config, task: Task, name: str) -> Measured:
 
     Parameters
     ----------
-    config : stage config (seed, noise, cnn, perceptron, train_<name>, evaluation)
+    config : Config
+        Stage configuration (seed, noise, cnn, perceptron, train_<name>, evaluation).
     task : Task
-    name : of the network, original or noise_trained
+    name : str
+        Name of the network, original or noise_trained.
 
-    Raises TrainingError if the training cannot go on, and ProductError if the products
-    are of different telescopes or stamps.
+    Raises
+    ------
+    TrainingError
+        If the training cannot continue.
+    ProductError
+        If the products are of different telescopes or stamps.
     """
     import pandas as pd
 
     trained_on = read_product(task.data["states"], "alignment_states", ())
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
-        require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
+        require(product.path, product.config, STAMP_KEYS, trained_on.config, trained_on.path)
     settings = part(network_groups(name), config)
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
@@ -72,10 +75,11 @@ def run(config: Config, task: Task, name: str) -> Measured:
 
 
 def _rows(config: Config, task: Task, role: str) -> list[Row]:
-    """Rows of the table of errors as the main workflow makes them, of one network."""
+    """Measure one network at all noise levels; return rows like those of the main workflow."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
     predict = network_predictor(task.folder, config)
-    test_set = TEST_SET if role == "test" else role
+    # The test part is the uniform set, with the noise that it has in the main workflow.
+    test_set = "uniform" if role == "test" else role
     rows: list[Row] = []
     for level in task.levels:
         stamps = noisy_test_states(config, product["stamps"], test_set, level)
@@ -85,11 +89,14 @@ def _rows(config: Config, task: Task, role: str) -> list[Row]:
 
 
 def _metrics(role: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Mean absolute error in units of the range: of all parameters, and at each noise level."""
-    levels: dict[float, list[float]] = {}
+    """Return the mean absolute error of all parameters, over all noise levels and at each.
+
+    It is in units of the range.
+    """
+    errors_by_level: dict[float, list[float]] = {}
     for row in rows:
         if row["unit"] == "range":
-            levels.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
-    each = {level: float(np.mean(errors)) for level, errors in levels.items()}
-    metrics = {f"{role}_mae": geometric_mean(list(each.values()))}
-    return metrics | {f"{role}_mae_{level:g}": value for level, value in each.items()}
+            errors_by_level.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
+    mae = {level: float(np.mean(errors)) for level, errors in errors_by_level.items()}
+    metrics = {f"{role}_mae": geometric_mean(list(mae.values()))}
+    return metrics | {f"{role}_mae_{level:g}": value for level, value in mae.items()}

@@ -1,4 +1,4 @@
-"""Stages `runtime` and `reference`: what a run cost, and the run of record."""
+"""Stages `runtime` and `reference`: the cost of a run, and the run of record."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from datetime import date
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from xml.etree import ElementTree
 
 import numpy as np
@@ -37,26 +37,20 @@ VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
 
-TARGETS = (
-    *("benchmark", "bounds", "own_stars", "prediction"),
-    *("scaling", "stability", "training_knee"),
-)
-"""Those targets that a record is made of."""
-
-DECISIVE = ("Snakefile", "config", "src", "workflow")
-"""What decides over the products of a run."""
-
 RECORDED = re.compile(
     r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
     r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
 )
-"""Products that the record holds."""
+"""Names of the products that belong to the record."""
 
 MAY_STAY = re.compile(
     r"(sweeps|paper|figures/benchmark)/.+"
     r"|tables/(benchmark_\w+|scaling_stages|predict_poppy\w*)\.csv"
 )
-"""What takes too long, or a machine without other work, to be made for every record."""
+"""Names of products that may stay from an earlier record.
+
+They take too long, or need a machine without other work, to be made for every record.
+"""
 
 
 @command("runtime")
@@ -66,13 +60,14 @@ def runtime(
 ) -> None:
     """Collect wall time, CPU time and memory of a run's jobs.
 
-    Wall time and memory are Snakemake's; the CPU time of all of a job's processes stands in the
-    last line of its log (`workflow/rules/cpu_time.smk`), which has the name of its benchmark.
+    Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
+    line of its log (`workflow/rules/cpu_time.smk`), which has the name of its benchmark.
     """
     write_csv(out, _costs(results), 6)
 
 
 def _costs(results: Path) -> pd.DataFrame:
+    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job."""
     import pandas as pd
 
     folder = results / "benchmarks"
@@ -87,15 +82,14 @@ def _costs(results: Path) -> pd.DataFrame:
 
 
 def _cost(path: Path, *names: str) -> list[float]:
-    """Columns of a job's last run, NaN where Snakemake has no number.
+    """Return columns of a job's last run, NaN where Snakemake has no number.
 
-    A benchmark file that was damaged costs its numbers, with a line that says so: no job
-    is to be repeated for them.
+    For a damaged benchmark file these are NaN, too, with a message: its job need not be repeated.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-        columns, *_, last = (line.split("\t") for line in lines)
-        job = dict(zip(columns, last, strict=True))
+        columns, *_, last_run = (line.split("\t") for line in lines)
+        job = dict(zip(columns, last_run, strict=True))
         return [float("nan" if job[name] in ("-", "NA") else job[name]) for name in names]
     except (ValueError, KeyError) as error:
         print(f"{path}: damaged ({error}); its cost is left out", file=sys.stderr, flush=True)
@@ -103,11 +97,14 @@ def _cost(path: Path, *names: str) -> list[float]:
 
 
 def _cpu_seconds(log: Path) -> float:
-    """User and system time in the last line of a log, as bash's `times` writes them; else NaN."""
+    """Return user plus system time from the last line of a log, in the format of bash's `times`.
+
+    NaN, with a message, if the log has no such line.
+    """
     try:
-        *_, last = log.read_text(encoding="utf-8").splitlines()
-        minutes = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", last)
-        user, system = (60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in minutes)
+        *_, last_line = log.read_text(encoding="utf-8").splitlines()
+        times = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", last_line)
+        user, system = (60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in times)
         return user + system
     except (OSError, ValueError) as error:
         print(f"{log}: no CPU time ({error}); it is left out", file=sys.stderr, flush=True)
@@ -121,49 +118,56 @@ def reference(
     plans: Annotated[
         tuple[File, ...],
         {"flag": "--plan"},
-        "What `snakemake --summary` says of the files that the record holds.",
+        "Output of `snakemake --summary` for the files of the record.",
     ],
 ) -> None:
     """Replace the committed run of record by a finished run.
 
-    The new record is that of the commit checked out: refused unless code, workflow and settings
-    are as committed and Snakemake finds every file up to date with them, wherever it was made.
-    What takes long (`MAY_STAY`) stays from the record before if it is not; provenance names it
-    with the commit it was recorded at, which has to be in the history, and the commit's date.
+    The new record belongs to the commit that is checked out. It is refused unless code, workflow
+    and settings are as committed, and Snakemake finds every file up to date with them, on whatever
+    machine it was made. Files that take long (`MAY_STAY`) and are not up to date stay from the
+    earlier record; provenance names them with the commit of that record, which must be in the
+    history, and its date.
     """
     from psfdae_paper.configuration.compose import load
 
-    commit = _commit_in_use()
+    commit = _current_commit()
     renewed = _up_to_date(results, plans)
-    last = out / "provenance.json"
-    before = json.loads(last.read_text()) if last.is_file() else {}
-    stays = (path for path in sorted(out.rglob("*")) if path.is_file() and path != last)
-    kept = {
-        name: _since(name, before)
-        for name in (path.relative_to(out).as_posix() for path in stays)
+    # Files of the earlier record that stay, with its commit and date.
+    provenance_path = out / "provenance.json"
+    earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
+    names = (path.relative_to(out).as_posix() for path in sorted(out.rglob("*")) if path.is_file())
+    earlier_record = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
+    retained: dict[str, dict[str, str]] = {
+        name: earlier.get("kept", {}).get(name) or earlier_record
+        for name in names
         if name not in renewed and MAY_STAY.fullmatch(name)
     }
     sources = {name: results / name for name in renewed}
-    sources |= {name: out / name for name in kept}
-    for name, found in kept.items():
-        _require_history(name, found)
+    sources |= {name: out / name for name in retained}
+    for name, record in retained.items():
+        _require_history(name, record)
+    # The new record is complete before it replaces the earlier one.
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
     for name, path in sources.items():
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    described = provenance(results, load()) | {"commit": commit, "kept": kept}
+    described = provenance(results, load()) | {"commit": commit, "kept": retained}
     text = json.dumps(described, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
 
 
-def _commit_in_use() -> str:
-    """The commit checked out; ProductError if code, workflow or settings differ from it."""
+def _current_commit() -> str:
+    """Return the commit that is checked out.
+
+    ProductError if files that decide the products of a run differ from it.
+    """
     try:
-        changed = git("status", "--porcelain", "--", *DECISIVE)
+        changed = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
         commit = git("rev-parse", "HEAD")
     except (OSError, subprocess.CalledProcessError) as error:
         raise ProductError(
@@ -175,47 +179,51 @@ def _commit_in_use() -> str:
 
 
 def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
-    """Files for the record that Snakemake would not make anew; ProductError if others must be."""
-    found: dict[str, str] = {}
+    """Return the files of the record that Snakemake finds up to date.
+
+    ProductError if others, which may not stay from an earlier record, are not.
+    """
+    # Snakemake's plan for every file of the run: "no update", or the reason to make it.
+    plan_by_name: dict[str, str] = {}
     for plan in plans:
         for row in csv.DictReader(plan.read_text(encoding="utf-8").splitlines(), delimiter="\t"):
             path = Path(row["output_file"])
             if path.is_relative_to(results):
-                found[path.relative_to(results).as_posix()] = row["plan"]
-    if "runtime.csv" not in found:
+                plan_by_name[path.relative_to(results).as_posix()] = row["plan"]
+    if "runtime.csv" not in plan_by_name:
         raise ProductError(
-            f"{', '.join(map(str, plans)) or 'no plan'}: says nothing of runtime.csv"
+            f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
-    recorded = {name: plan for name, plan in found.items() if RECORDED.fullmatch(name)}
-    due = {name for name, plan in recorded.items() if plan != "no update"}
-    refused = sorted(name for name in due if not MAY_STAY.fullmatch(name))
+    recorded = {name: plan for name, plan in plan_by_name.items() if RECORDED.fullmatch(name)}
+    outdated = {name for name, plan in recorded.items() if plan != "no update"}
+    refused = sorted(name for name in outdated if not MAY_STAY.fullmatch(name))
     if refused:
         raise ProductError(
             f"{results / refused[0]}: missing, or not what this commit makes (so are"
             f" {len(refused)} files of {len(recorded)}); run the targets of the record first"
         )
-    return [name for name in recorded if name not in due]
+    return [name for name in recorded if name not in outdated]
 
 
-def _since(name: str, before: Mapping[str, Any]) -> dict[str, str]:
-    """Commit and date at which a file of the record before was recorded."""
-    earlier = before.get("kept", {}).get(name)
-    return earlier or {key: before.get(key, "unknown") for key in ("commit", "date")}
-
-
-def _require_history(name: str, found: Mapping[str, str]) -> None:
+def _require_history(name: str, record: Mapping[str, str]) -> None:
+    """Raise ProductError if the commit of a recorded file is not an ancestor of this one."""
     try:
-        git("merge-base", "--is-ancestor", found["commit"], "HEAD")
+        git("merge-base", "--is-ancestor", record["commit"], "HEAD")
     except subprocess.CalledProcessError:
         raise ProductError(
-            f"{name}: of commit {found['commit']:.12}, which is not in the history;"
+            f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
             " make it anew, or remove it from the record"
         ) from None
 
 
 def provenance(results: Path, config: Config) -> dict[str, object]:
-    """Where a run comes from and what it took."""
+    """Describe a run: date, configuration, machine, versions, and its cost."""
     costs = _costs(results)
+    # Targets beyond `make reproduce` that belong to the record.
+    targets = (
+        *("benchmark", "bounds", "own_stars", "prediction"),
+        *("scaling", "stability", "training_knee"),
+    )
     canonical = json.dumps(config.model_dump(), sort_keys=True)
     return {
         "date": date.today().isoformat(),
@@ -233,7 +241,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
         "on_request_s": {
             name: round(_busy_seconds(results / ON_REQUEST / name), 1)
-            for name in TARGETS
+            for name in targets
             if (results / ON_REQUEST / name).is_dir()
         },
         **_installation(),
@@ -245,7 +253,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
 
 def cpu_model() -> str:
-    """Model of the processor as the operating system names it."""
+    """Return the model of the processor as the operating system names it."""
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text().splitlines():
@@ -255,33 +263,38 @@ def cpu_model() -> str:
 
 
 def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
-    """Speed of a float32 matrix product in GFLOP/s, the best of some repeats.
+    """Measure the speed of a float32 matrix product in GFLOP/s, the best of some repeats.
 
-    A yardstick: run times of two machines compare as their yardsticks do.
+    Run times of two machines are expected to be in the inverse ratio of these speeds.
     """
     a = np.ones((size, size), dtype=np.float32)
-    best = float("inf")
+    shortest = float("inf")
     for _ in range(repeats):
         start = time.perf_counter()
         a @ a
-        best = min(best, time.perf_counter() - start)
-    return 2.0 * size**3 / best / 1e9
+        shortest = min(shortest, time.perf_counter() - start)
+    # A product takes 2 n³ operations.
+    return 2.0 * size**3 / shortest / 1e9
 
 
 def _busy_seconds(benchmarks: Path) -> float:
-    """Wall time during which at least one job ran; a later visit adds its own time only."""
+    """Return the wall time during which at least one job ran.
+
+    Pauses between jobs, such as those before a run is resumed, do not count.
+    """
     files = benchmarks.rglob("*.tsv")
     ends = ((p.stat().st_mtime, np.nan_to_num(_cost(p, "s")[0])) for p in files)
     spans = sorted((end - float(seconds), end) for end, seconds in ends)
-    busy, until = 0.0, float("-inf")
+    # Length of the union of all jobs' intervals, which are sorted by their start.
+    busy_seconds, covered_until = 0.0, float("-inf")
     for start, end in spans:
-        busy += max(0.0, end - max(start, until))
-        until = max(until, end)
-    return busy
+        busy_seconds += max(0.0, end - max(start, covered_until))
+        covered_until = max(covered_until, end)
+    return busy_seconds
 
 
 def _installation() -> dict[str, float]:
-    """Time and disk of the environment that `make` created, as its files tell."""
+    """Return time and disk space of the environment that `make` created, from its files."""
     environment = Path(sys.prefix)
     start, end = environment / "pyvenv.cfg", environment / ".complete"
     if not (start.is_file() and end.is_file()):
@@ -291,12 +304,13 @@ def _installation() -> dict[str, float]:
 
 
 def _size_mb(folder: Path) -> float:
+    """Return the size of all files of a folder in MB."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return sum(path.stat().st_size for path in files) / 1e6
 
 
 def _test_seconds(report: Path) -> float | None:
-    """Wall time of the last `make test`, from its JUnit report."""
+    """Return the wall time of the last `make test`, from its JUnit report."""
     if not report.is_file():
         return None
     try:

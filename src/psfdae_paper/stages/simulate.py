@@ -1,4 +1,4 @@
-"""Stages `simulate`, `figure telescope`: what a telescope does to a star, all over its field."""
+"""Stages `simulate`, `figure telescope`, `example-field`: PSFs of a telescope, simulated images."""
 
 from __future__ import annotations
 
@@ -24,30 +24,15 @@ from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae_paper.stages.figures import without_margin
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
-from psfdae_paper.stars.example import example_field as simulated
+from psfdae_paper.stars.example import example_field as simulate_field
 from psfdae_paper.stars.framing import normalise_flux
 from psfdae_paper.stars.scenes import template_wavefronts
-
-OWN_DATASET = "_telescope"
-"""The dataset that a telescope of one's own is put into."""
 
 ENOUGH_LIGHT = 0.8
 """Fraction of the light below which a stamp is called too small."""
 
-LARGEST = 4
-"""Stamps up to this many times as wide are tried to find one that is wide enough."""
 
-LEAST_FWHM_PX = 1.5
-"""A narrower PSF looks different in every place of a pixel."""
-
-SKY = 1000.0
-"""Photons per pixel of the sky."""
-
-MARGIN_PX = 8
-"""Sky between stamps."""
-
-
-class FitError(Error, ValueError):
+class StampSizeError(Error, ValueError):
     """The PSFs of a telescope do not fit into their stamps."""
 
 
@@ -60,9 +45,9 @@ def simulate(
         click.FloatRange(min=0, min_open=True, max=1e6),
         "Also write an image with a noisy star per field, image.fits, and stars.csv.",
     ] = None,
-    seed: Annotated[int, click.IntRange(min=0), "Of the image's noise."] = 0,
+    seed: Annotated[int, click.IntRange(min=0), "Seed of the image's noise."] = 0,
     least_energy: Annotated[
-        float, click.FloatRange(0, 1), "Refuse stamps that hold less of the light."
+        float, click.FloatRange(0, 1), "Refuse stamps with less than this part of the light."
     ] = 0.1,
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
@@ -72,24 +57,28 @@ def simulate(
     """
     from psfdae_paper.configuration.compose import load_stage
 
+    # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
-        overrides = (f"dataset={OWN_DATASET}", *overrides)
+        overrides = ("dataset=_telescope", *overrides)
     config = load_stage(STATIC, overrides)
     folder = out or Path(config.telescope.name)
     # No file is written if the PSFs do not fit.
     with atomic_path(folder / "templates.h5") as temporary:
         templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
-        warnings = [*_light(config, fields, least_energy), *_sampling(config, fields)]
+        warnings = [
+            *_stamp_warnings(config, fields, least_energy),
+            *_sampling_warnings(config, fields),
+        ]
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
-    written = ["templates.h5", "psfs.png", "fields.csv"]
+    names = ["templates.h5", "psfs.png", "fields.csv"]
     if fits:
         write_psfs(config, fields, folder / "psfs.fits")
-        written.append("psfs.fits")
+        names.append("psfs.fits")
     if image_snr:
         image, catalogue = folder / "image.fits", folder / "stars.csv"
         write_image(config, fields, image_snr, seed, image, catalogue)
-        written += ["image.fits", "stars.csv"]
+        names += ["image.fits", "stars.csv"]
     for line in warnings:
         print(f"psfdae: {line}", file=sys.stderr)
     telescope = config.telescope
@@ -98,7 +87,7 @@ def simulate(
         f"light inside the stamp {fields.energy.min():.3f} … {fields.energy.max():.3f}, "
         f"FWHM {fields.fwhm_arcsec.min():.3g} … {fields.fwhm_arcsec.max():.3g} arcsec"
     )
-    print(f"{folder}: {', '.join(written)}")
+    print(f"{folder}: {', '.join(names)}")
 
 
 @command("figure telescope")
@@ -127,7 +116,7 @@ def figure_telescope(
 
 
 def measure_fields(product: Product) -> FieldOfPsfs:
-    """Stamps of the product "templates" without their margin, and their shapes."""
+    """Measure the shapes of the stamps of the product "templates", without their margin."""
     psf = without_margin(product)
     shapes = measure_shapes(psf)
     return FieldOfPsfs(
@@ -141,72 +130,81 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     )
 
 
-def _light(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
+def _stamp_warnings(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
+    """Return a warning if stamps contain too little light.
+
+    StampSizeError if a stamp contains less than `least_energy`.
+    """
     energy, side = fields.energy, config.framing.stamp_px
     if not energy.min() < ENOUGH_LIGHT:
         return []
-    worst = int(energy.argmin())
-    x, y = np.rad2deg(fields.field[worst])
-    wide = _wide_enough(config, worst)
+    worst_field = int(energy.argmin())
+    x, y = np.rad2deg(fields.field[worst_field])
+    # Stamps up to four times as wide are tried.
+    sufficient_px = _sufficient_stamp_px(config, worst_field, 4 * side)
     advice = (
-        f"framing.stamp_px={wide} would hold {ENOUGH_LIGHT:.0%} of it everywhere"
-        if wide
-        else f"no stamp up to {LARGEST * side} px holds {ENOUGH_LIGHT:.0%} of it everywhere"
+        f"framing.stamp_px={sufficient_px} contains {ENOUGH_LIGHT:.0%} everywhere"
+        if sufficient_px
+        else f"no stamp up to {4 * side} px contains {ENOUGH_LIGHT:.0%} everywhere"
     )
-    found = (
+    message = (
         f"{int((energy < ENOUGH_LIGHT).sum())} of {energy.size} fields have less than "
         f"{ENOUGH_LIGHT:.0%} of their light inside {side} × {side} px, the least "
-        f"{energy[worst]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
+        f"{energy[worst_field]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
     )
     if energy.min() < least_energy:
-        raise FitError(f"telescope = {config.telescope.name}: {found} (--least-energy)")
-    return [found]
+        raise StampSizeError(f"telescope = {config.telescope.name}: {message} (--least-energy)")
+    return [message]
 
 
-def _wide_enough(config: Config, worst: int) -> int | None:
-    """Least even stamp that holds enough light of the field that needs the widest one."""
+def _sufficient_stamp_px(config: Config, worst_field: int, max_px: int) -> int | None:
+    """Return the smallest even stamp with enough light of the field that needs the largest one.
+
+    None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
+    """
     from psfdae.optics.pupil import SamplingError
     from psfdae_paper.stars.framing import FramingError, Propagation
 
-    side = LARGEST * config.framing.stamp_px
-    framing = config.framing.model_copy(update={"stamp_px": side})
+    framing = config.framing.model_copy(update={"stamp_px": max_px})
     source = template_wavefronts(config)
     try:
         propagation = Propagation(
             source, config.telescope, config.optics, framing, framing.search_px
         )
-        field = np.array([worst])
-        stamp = propagation.framed(side, stars=field)[0][0]
+        stamp = propagation.framed(max_px, stars=np.array([worst_field]))[0][0]
     except (SamplingError, FramingError):
         return None
-    for size in range(config.framing.stamp_px + 2, side + 1, 2):
-        cut = slice((side - size) // 2, (side + size) // 2)
-        if stamp[cut, cut].sum() >= ENOUGH_LIGHT:
+    for size in range(config.framing.stamp_px + 2, max_px + 1, 2):
+        centre = slice((max_px - size) // 2, (max_px + size) // 2)
+        if stamp[centre, centre].sum() >= ENOUGH_LIGHT:
             return size
     return None
 
 
-def _sampling(config: Config, fields: FieldOfPsfs) -> list[str]:
-    width = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
-    if width >= LEAST_FWHM_PX:
+def _sampling_warnings(config: Config, fields: FieldOfPsfs) -> list[str]:
+    """Return a warning if the PSFs are undersampled: below 1.5 pixels wide."""
+    fwhm_px = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
+    if fwhm_px >= 1.5:
         return []
     return [
-        f"the PSFs are {width:.2f} px wide (median FWHM, the pixel included): undersampled, what "
-        "a star looks like depends on its place in the pixel more than on the optics"
+        f"the PSFs are {fwhm_px:.2f} px wide (median FWHM with the pixel): undersampled; the image "
+        "of a star depends more on its position in the pixel than on the optics"
     ]
 
 
 def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
-    """Write the static PSFs as a cube, with a table of where they are.
+    """Write the static PSFs as a FITS cube, with a table of their fields.
 
-    The primary HDU holds the fraction of the light on each pixel, (F, d, d), the
-    table FIELDS one row per PSF. Both carry no date: the same PSFs, the same bytes.
+    The primary HDU has the fraction of the light on each pixel, (F, d, d); the table FIELDS has
+    one row per PSF. Neither has a date, so that the same PSFs give the same bytes.
 
     Parameters
     ----------
-    config : stage config of `templates`
+    config : Config
+        Stage configuration of `templates`.
     fields : FieldOfPsfs
-    path : path of the FITS file
+    path : Path
+        FITS file.
     """
     from astropy.io import fits
 
@@ -242,27 +240,29 @@ def write_image(
 ) -> None:
     """Write an image with one noisy star per field, and its catalogue.
 
-    The stars are moved together, so that little sky lies between them; their order
-    on the detector is that of the field, and the catalogue has their field angles. Their
-    flux is F = snr √(B A), with the sky B and the noise-equivalent area A of the mean PSF (King
-    1983, PASP 95, 163): the S/N of a matched filter that is limited by the sky.
+    The stars are close together, with 8 px of sky between their stamps. Their order on the
+    detector is that of the field, and the catalogue has their field angles. Their flux is
+    F = snr √(B A), with the sky B and the noise-equivalent area A of the mean PSF (King 1983,
+    PASP 95, 163): the S/N of a matched filter that is limited by the sky.
 
     Parameters
     ----------
-    config : stage config of `templates`
+    config : Config
+        Stage configuration of `templates`.
     fields : FieldOfPsfs
     snr : float
         > 0.
     seed : int
-    path, catalogue : FITS image and CSV
+    path, catalogue : Path
+        FITS image and CSV file.
     """
     stamps, _ = normalise_flux(fields.psf.astype(np.float64))
-    side = stamps.shape[-1]
-    flux = snr * np.sqrt(SKY * noise_equivalent_px(stamps.mean(axis=0)))
-    pitch = side + MARGIN_PX
+    sky = 1000.0  # photons per pixel
+    flux = snr * np.sqrt(sky * noise_equivalent_px(stamps.mean(axis=0)))
+    pitch = stamps.shape[-1] + 8
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
-    expected = np.full((int(rows) * pitch, int(columns) * pitch), SKY)
+    expected = np.full((int(rows) * pitch, int(columns) * pitch), sky)
     add_stamps(expected, flux * stamps, x, y)
     rng = stream(seed, "simulated image", config.telescope.name)
     write_field(
@@ -290,20 +290,20 @@ def example_field(
     *,
     out: Annotated[File, "FITS image."],
 ) -> None:
-    """Simulate an image of a star field with its star list, to try things on."""
+    """Simulate an image of a star field with its star list, as an example."""
     check_outputs((out,), (catalogue,))
-    asked = {"side_px": side, "bright": bright, "faint": faint}
-    write_example(out, catalogue, seed, **{k: v for k, v in asked.items() if v is not None})
+    options = {"side_px": side, "bright": bright, "faint": faint}
+    write_example(out, catalogue, seed, **{k: v for k, v in options.items() if v is not None})
 
 
-def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> ExampleField:
-    """Write an image and its star list; `recipe` are attributes of `FieldRecipe`.
+def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> ExampleField:
+    """Write a simulated image and its star list; `attributes` are those of `FieldRecipe`.
 
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
     """
-    made = FieldRecipe(**recipe)  # type: ignore[arg-type]  # no pair of numbers among them
-    field = simulated(made, seed)
+    recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them
+    field = simulate_field(recipe, seed)
     x, y = field.centroid.T
     write_field(
         out,
@@ -311,8 +311,8 @@ def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> Examp
         field.image.astype(np.float32),
         x,
         y,
-        pixel_scale_arcsec=made.pixel_scale_arcsec,
-        GAIN=made.gain,
-        SATURATE=float(made.saturation),
+        pixel_scale_arcsec=recipe.pixel_scale_arcsec,
+        GAIN=recipe.gain,
+        SATURATE=float(recipe.saturation),
     )
     return field

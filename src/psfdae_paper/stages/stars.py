@@ -17,12 +17,13 @@ from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, square_grid
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
-from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
+from psfdae_paper.stars.scenes import aberration_columns, star_wavefronts, template_wavefronts
 
-ABOUT_PEAK = "brightest pixel (row, column) from the chief ray"
+PEAK_MEANING = "brightest pixel (row, column) from the chief ray"
+"""Description of the column `peak` in products."""
 
 STARS_AT_A_TIME = 1024
-"""Stars that are propagated before they are written; memory does not grow beyond them."""
+"""Stars that are propagated before they are written; they limit the memory."""
 
 
 @command("templates", reads=STATIC)
@@ -31,20 +32,21 @@ def templates(
     out: Annotated[File, "HDF5 product with the static PSF of every field point."],
 ) -> None:
     """Propagate the static PSF of every field point."""
-    limit_threads(1)  # batches run side by side
+    limit_threads(1)  # batches run in parallel
+    # PSFs have a margin, from which stamps with any centring error are cut.
     framing = config.framing
     source = template_wavefronts(config)
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
     side = framing.stamp_px + 2 * framing.jitter_px
     psf, peak = propagation.framed(side)
-    inner = slice(framing.jitter_px, side - framing.jitter_px)
+    stamp = slice(framing.jitter_px, side - framing.jitter_px)
     index, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
     columns = {
         "psf": Column(
             psf.astype(np.float32), "1", "pixel flux as a fraction of the light, jitter margin"
         ),
-        "energy": Column(psf[:, inner, inner].sum(axis=(1, 2)), "1", "light inside the stamp"),
-        "peak": Column(peak, "pixel", ABOUT_PEAK),
+        "energy": Column(psf[:, stamp, stamp].sum(axis=(1, 2)), "1", "light inside the stamp"),
+        "peak": Column(peak, "pixel", PEAK_MEANING),
         "grid": Column(index, "1", "grid index (ix, iy) of the field"),
         "field": Column(np.deg2rad(angle_deg), "rad", "field angle (x, y)"),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
@@ -61,13 +63,13 @@ def stars(
     """Simulate noise-free stars with random aberrations."""
     # A realisation has static and random aberrations, a template static ones only. Both are
     # framed on their own brightest pixel, moved by the same jitter and normalised by the flux
-    # inside the stamp (eq. 8). With `framing.subpixel` the pixel grid of a realisation lies
-    # anywhere within ± half a pixel of the template's. All random numbers are drawn first,
-    # about 100 bytes per star; images are made and written `STARS_AT_A_TIME`.
-    fixed = read_product(templates, "templates", ("psf", "grid"))
-    belonging.require(templates, fixed.config, belonging.STATIC, config)
+    # inside the stamp (eq. 8). With `framing.subpixel` the pixel grid of a realisation is
+    # displaced by up to half a pixel from the template's. All random numbers are drawn first,
+    # about 100 bytes per star; then images are made and written, `STARS_AT_A_TIME`.
+    static = read_product(templates, "templates", ("psf", "grid"))
+    belonging.require(templates, static.config, belonging.STATIC, config)
     framing, name, count = config.framing, config.stars.name, config.stars.count
-    star_field = assign_fields(count, len(fixed["psf"]), stream(config.seed, "field", name))
+    star_field = assign_fields(count, len(static["psf"]), stream(config.seed, "field", name))
     jitter = draw_jitter(count, framing.jitter_px, stream(config.seed, "jitter", name))
     phase = np.zeros((count, 2))
     if framing.subpixel:
@@ -76,13 +78,14 @@ def stars(
     columns: dict[str, Column | Empty] = {
         "template": Empty(shape, np.float32, "1", "static PSF, sum 1"),
         "field_index": Column(star_field, "1", "field of the star"),
-        "grid": Column(fixed["grid"], "1", "grid index (ix, iy) of every field"),
+        "grid": Column(static["grid"], "1", "grid index (ix, iy) of every field"),
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
     }
     energy = Empty((count,), np.float64, "1", "light inside the stamp")
+    # Without random aberrations, realisations are the templates.
     propagation = None
     if config.stars.aberration_fraction > 0:
-        limit_threads(1)  # batches run side by side
+        limit_threads(1)  # batches run in parallel
         source = star_wavefronts(config, star_field)
         propagation = Propagation(
             source, config.telescope, config.optics, framing, config.stars.search_px
@@ -90,8 +93,8 @@ def stars(
         columns |= {
             "realisation": Empty(shape, np.float32, "1", "noise-free image, sum 1"),
             "energy": energy,
-            "peak": Empty((count, 2), np.int64, "pixel", ABOUT_PEAK),
-            **drawn_columns(source),
+            "peak": Empty((count, 2), np.int64, "pixel", PEAK_MEANING),
+            **aberration_columns(source),
             "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
         }
         if framing.subpixel:
@@ -101,12 +104,12 @@ def stars(
     with stream_product(out, "stars", columns, config.model_dump()) as data:
         for start in range(0, count, STARS_AT_A_TIME):
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
-            framed = fixed["psf"][star_field[part]].astype(np.float64)
+            framed = static["psf"][star_field[part]].astype(np.float64)
             cropped = crop_jittered(framed, jitter[part], framing.jitter_px)
-            made = dict(zip(("template", "energy"), normalise_flux(cropped), strict=True))
+            arrays = dict(zip(("template", "energy"), normalise_flux(cropped), strict=True))
             if propagation is not None:
                 stamps, peak = propagation.framed(framing.stamp_px, jitter[part], part, phase[part])
-                made["realisation"], made["energy"] = normalise_flux(stamps)
-                made["peak"] = peak
-            for column, values in made.items():
+                arrays["realisation"], arrays["energy"] = normalise_flux(stamps)
+                arrays["peak"] = peak
+            for column, values in arrays.items():
                 data[column][start : start + STARS_AT_A_TIME] = values

@@ -20,7 +20,7 @@ from psfdae.settings import Reference, SplitKind, validate
 from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import decisive, load_stage
+from psfdae_paper.configuration.compose import decisive_settings, load_stage
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value, models, point_groups
 from psfdae_paper.sweeps.measured import (
@@ -38,14 +38,11 @@ from psfdae_paper.sweeps.measured import (
 from psfdae_paper.sweeps.points import changes, with_values
 
 ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
-
-ROLES = {"stars"}
-NETWORK_ROLES = {"states", "validation", "test"}
-"""Products that points of a method need, and those of a network of scene 3."""
+"""Module of the adaptive search; it is imported only if it is used, because it needs Optuna."""
 
 
 def module_of(model: str) -> str:
-    """Module that trains and measures a model."""
+    """Return the name of the module that trains and measures a model."""
     return f"psfdae_paper.stages.{'network' if model in SWEPT else 'method'}_point"
 
 
@@ -56,16 +53,16 @@ class Trial:
     Attributes
     ----------
     slot : int
-        Its number.
+        Number of the trial.
     search : dict
         space, seed, startup, metric and direction of the sweep.
-    known : sequence of str
-        Names of the points that it learns from.
+    earlier_points : sequence of str
+        Names of the points from whose results it learns.
     """
 
     slot: int
     search: Mapping[str, Any]
-    known: Sequence[str]
+    earlier_points: Sequence[str]
 
 
 class JsonType(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 takes none
@@ -76,7 +73,7 @@ class JsonType(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 ta
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> dict[str, Any]:
-        """Parse; a wrong text is a usage error."""
+        """Return the object of a JSON text; any other text is a usage error."""
         if isinstance(value, dict):
             return value
         try:
@@ -97,9 +94,9 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
     """List the points of a sweep as tab-separated text, without running it."""
     from psfdae_paper.sweeps.points import plan_sweep
 
-    for each in plan_sweep(name, overrides).points.values():
-        values: Mapping[str, object] = each.values or {"trial": each.slot}
-        print("\t".join([each.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
+    for entry in plan_sweep(name, overrides).points.values():
+        values: Mapping[str, object] = entry.values or {"trial": entry.slot}
+        print("\t".join([entry.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
 
 
 @command("sweep point")
@@ -129,15 +126,15 @@ def sweep_point(
     """Train one point of a sweep and measure it."""
     if (slot is None) != (search is None):
         raise click.UsageError("--slot and --search go together")
-    network = model in SWEPT
-    roles = NETWORK_ROLES if network else ROLES
+    is_network = model in SWEPT
+    roles = {"states", "validation", "test"} if is_network else {"stars"}
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {model} needs {', '.join(sorted(roles))}")
     trial = None
     if slot is not None and search is not None:
         trial = Trial(slot, search, known)
     task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
-    config = load_stage(point_groups(model), (*(CHOICE if network else ()), *overrides))
+    config = load_stage(point_groups(model), (*(CHOICE if is_network else ()), *overrides))
     point(config, model, values or {}, keys or {}, task, trial, source)
 
 
@@ -158,40 +155,51 @@ def point(
 
     Parameters
     ----------
-    config : groups that a point of the model reads
-    model : method, or network of scene 3
-    values : value of every axis; those of a trial are asked for here
-    keys : configuration keys that differ from the dataset's
+    config : Config
+        Groups that a point of the model reads.
+    model : str
+        Name of a method, or of a network of scene 3.
+    values : mapping
+        Value of every axis; those of a trial are proposed here.
+    keys : mapping
+        Configuration keys that differ from the dataset's.
     task : Task
-    trial : Trial, of an adaptive sweep
-    source : hash of the code that the point consists of
+    trial : Trial, optional
+        Trial of an adaptive sweep.
+    source : str
+        Hash of the code of which the point consists.
 
     Raises
     ------
     ProductError
         If an input is missing or damaged.
     ConfigError
-        If a trial asks for values that the configuration does not allow.
+        If a trial proposes values that the configuration does not allow.
     """
     module = import_module(module_of(model))
     files = module.files_of(model)
+    # A trial gets its values from the results of earlier trials.
     if trial is not None:
-        space, values = _asked(trial, task.folder)
-        asked = changes(space, values)
-        config, keys = _with(config, asked), {**keys, **asked}
+        space, values = _proposed_values(trial, task.folder)
+        trial_keys = changes(space, values)
+        # The configuration with these values is checked again.
+        tree = with_values(config.model_dump(), trial_keys)
+        config, keys = validate(type(config), tree), {**keys, **trial_keys}
+    # A result is reused if code, configuration and data are the same.
     content = [
         source,
         model,
-        decisive(config.model_dump()),
+        decisive_settings(config.model_dump()),
         dict(values),
         dict(keys),
         task.described(),
     ]
     fingerprint = checksum(content)
-    result = _finished(task.folder, fingerprint, files)
+    result = _finished_result(task.folder, fingerprint, files)
     if result is None:
-        for stale in (*files, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
-            (task.folder / stale).unlink(missing_ok=True)
+        # No file of another training may stay beside the new ones.
+        for name in (*files, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
+            (task.folder / name).unlink(missing_ok=True)
         result = {
             "point": task.folder.name,
             "slot": trial.slot if trial else None,
@@ -208,31 +216,34 @@ def point(
     write_text(task.folder / RESULT, as_json(result))
 
 
-def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
-    """The result of an earlier run of the same point, if it is whole."""
+def _finished_result(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
+    """Return the result of an earlier run of the same point if all of its files are there."""
     try:
         result = read_result(folder / FINISHED)
     except ProductError:
         return None
-    needed = [COST] if result["status"] == "failed" else [COST, *files]
+    required = [COST] if result["status"] == "failed" else [COST, *files]
     if result.get("fingerprint") != fingerprint:
         return None
-    if not all((folder / name).is_file() for name in needed):
+    if not all((folder / name).is_file() for name in required):
         return None
     print("finished before with the same code, configuration and data; kept", flush=True)
     return result
 
 
 def as_json(result: Mapping[str, Any]) -> str:
-    """A result as text with its checksum."""
+    """Return a result as JSON text with its checksum."""
     return json.dumps({**result, CHECKSUM: checksum(result)}, indent=1) + "\n"
 
 
 def _outcome(module: ModuleType, config: Config, task: Task, model: str) -> dict[str, object]:
-    """Status, metrics and configuration of a point; its cost goes to a file of its own."""
+    """Train and measure a point; return status, metrics and configuration.
+
+    The cost, which differs between runs, is written to a file of its own.
+    """
     started, started_cpu = time.monotonic(), time.process_time()
     try:
-        done: Measured = module.run(config, task, model)
+        measured: Measured = module.run(config, task, model)
     except FitError as error:
         reason = str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
@@ -247,31 +258,29 @@ def _outcome(module: ModuleType, config: Config, task: Task, model: str) -> dict
             "metrics": {},
             "config": config.model_dump(),
         }
-    _write_cost(task.folder, done.seconds, done.cpu_seconds)
+    _write_cost(task.folder, measured.seconds, measured.cpu_seconds)
     return {
-        "status": "stopped" if done.stopped else "finished",
+        "status": "stopped" if measured.stopped else "finished",
         "reason": "",
-        "epochs": done.epochs,
-        "attempt": done.attempt,
-        "metrics": done.metrics,
-        "config": done.described,
+        "epochs": measured.epochs,
+        "attempt": measured.attempt,
+        "metrics": measured.metrics,
+        "config": measured.described,
     }
 
 
 def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
+    """Write the duration of a training."""
     cost = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
     write_text(folder / COST, json.dumps(cost) + "\n")
 
 
-def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Axis], dict[str, Value]]:
-    """Axes of the space, and the values that the search proposes for a trial."""
+def _proposed_values(trial: Trial, folder: Path) -> tuple[dict[str, Axis], dict[str, Value]]:
+    """Return the axes of the space, and the values that the search proposes for a trial."""
     space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
-    known = [read_result(folder.parent / other / RESULT) for other in trial.known]
+    earlier_results = [
+        read_result(folder.parent / point / RESULT) for point in trial.earlier_points
+    ]
     adaptive = import_module(ADAPTIVE_MODULE)
-    values: dict[str, Value] = adaptive.ask(space, trial.search, trial.slot, known)
+    values: dict[str, Value] = adaptive.ask(space, trial.search, trial.slot, earlier_results)
     return space, values
-
-
-def _with(config: Config, keys: Mapping[str, Value]) -> Config:
-    """The stage's configuration with other values, checked again."""
-    return validate(type(config), with_values(config.model_dump(), keys))

@@ -1,4 +1,4 @@
-"""Stages `sweep summary`, `sweep figure` and `best`: what the points of a sweep have found."""
+"""Stages `sweep summary`, `sweep figure` and `best`: tables and figures of a sweep's points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
 from psfdae_paper.sweeps.points import SweepError
 
-SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
+BEST_POINT = "best.yaml"
+"""File with the overrides of the best point of a sweep."""
 
 
 @command("sweep summary")
@@ -45,7 +46,7 @@ def best(
 def summary(
     name: str,
     definition: Mapping[str, Any],
-    given: Sequence[str],
+    overrides: Sequence[str],
     points: Sequence[Path],
     out: Path,
 ) -> None:
@@ -53,13 +54,17 @@ def summary(
 
     Parameters
     ----------
-    name : of the sweep
-    definition : config group `Sweep`
-    given : the workflow's overrides that all points share, its preset first
-    points : `result.json` of every point, in the order of the table
-    out : folder that receives `summary.csv` (point, a column per axis, status, reason,
-        epochs, attempt, best, metrics), `cost.csv` (seconds of each training), `best.yaml`
-        and `sweep.yaml`
+    name : str
+        Name of the sweep.
+    definition : mapping
+        Configuration group `Sweep`.
+    overrides : sequence of str
+        Overrides of the workflow that all points share, its preset first.
+    points : sequence of Path
+        `result.json` of every point, in the order of the table.
+    out : Path
+        Folder for `summary.csv` (point, a column per axis, status, reason, epochs, attempt, best,
+        metrics), `cost.csv` (seconds of each training), `best.yaml` and `sweep.yaml`.
 
     Raises
     ------
@@ -72,39 +77,44 @@ def summary(
     import yaml
 
     results = [read_result(path) for path in points]
-    chosen = choose(results, definition["metric"], definition["direction"])
-    if chosen is None:
+    best_result = choose(results, definition["metric"], definition["direction"])
+    if best_result is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
-    rows = [_row(result, definition["space"], result is chosen) for result in results]
-    write_csv(out / SUMMARY, pd.DataFrame(rows))
+    rows = [_row(result, definition["space"], result is best_result) for result in results]
+    write_csv(out / "summary.csv", pd.DataFrame(rows))
     costs = [
         {"point": result["point"], **read_cost(path.parent)}
         for result, path in zip(results, points, strict=True)
     ]
-    write_text(out / COSTS, pd.DataFrame(costs).to_csv(index=False))
-    described = {"sweep": name, "given": list(given), **definition}
+    write_text(out / "cost.csv", pd.DataFrame(costs).to_csv(index=False))
+    described = {"sweep": name, "given": list(overrides), **definition}
     # Unsorted: the order of the axes is that of the figures.
-    write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
-    write_text(out / BEST, _best_yaml(name, definition, given, chosen))
+    write_text(out / "sweep.yaml", yaml.safe_dump(described, sort_keys=False))
+    write_text(out / BEST_POINT, _best_yaml(name, definition, overrides, best_result))
 
 
 def choose(
     results: Sequence[Mapping[str, Any]], metric: str, direction: str
 ) -> Mapping[str, Any] | None:
-    """The result with the best validation metric, the first of equals; None if all failed."""
+    """Return the result with the best validation metric, the first of equals.
+
+    None if all points failed.
+    """
     sign = 1.0 if direction == "minimize" else -1.0
     with_metric = [result for result in results if metric in result["metrics"]]
     return min(with_metric, key=lambda result: sign * result["metrics"][metric], default=None)
 
 
 def best_overrides(results: Path, name: str) -> list[str]:
-    """Hydra overrides of the best point of a sweep.
+    """Return the Hydra overrides of the best point of a sweep.
 
     Parameters
     ----------
-    results : folder that the workflow writes to
-    name : of the sweep
+    results : Path
+        Folder that the workflow writes to.
+    name : str
+        Name of the sweep.
 
     Raises
     ------
@@ -113,7 +123,7 @@ def best_overrides(results: Path, name: str) -> list[str]:
     """
     from psfdae.reading import read_yaml
 
-    path = results / "sweeps" / name / BEST
+    path = results / "sweeps" / name / BEST_POINT
     if not path.is_file():
         raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
     overrides = read_yaml(path).get("overrides")
@@ -122,31 +132,33 @@ def best_overrides(results: Path, name: str) -> list[str]:
     return [str(override) for override in overrides]
 
 
-def _row(result: Mapping[str, Any], axes: Iterable[str], best: bool) -> dict[str, object]:
+def _row(result: Mapping[str, Any], axes: Iterable[str], is_best: bool) -> dict[str, object]:
+    """Return the row of a point in the summary; lists are JSON."""
     values = {name: result["values"][name] for name in axes}
     values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
     outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
-    chosen = {"best": "yes" if best else "no"}
-    return {"point": result["point"], **values, **outcome, **chosen, **result["metrics"]}
+    outcome["best"] = "yes" if is_best else "no"
+    return {"point": result["point"], **values, **outcome, **result["metrics"]}
 
 
 def _best_yaml(
-    name: str, definition: Mapping[str, Any], given: Sequence[str], best: Mapping[str, Any]
+    name: str, definition: Mapping[str, Any], overrides: Sequence[str], result: Mapping[str, Any]
 ) -> str:
-    """The best point as overrides, those of the workflow before its own."""
+    """Return the best point as overrides, those of the workflow before those of the point."""
     from psfdae.settings import as_overrides
 
-    own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
+    preset = "preset="
+    point_overrides = [word.removeprefix("++") for word in as_overrides(result["keys"])]
     tree = {
         "sweep": name,
-        "point": best["point"],
-        "preset": next((g.partition("=")[2] for g in given if g.startswith("preset=")), ""),
-        "overrides": [*(g for g in given if not g.startswith("preset=")), *own],
+        "point": result["point"],
+        "preset": next((w.removeprefix(preset) for w in overrides if w.startswith(preset)), ""),
+        "overrides": [*(w for w in overrides if not w.startswith(preset)), *point_overrides],
         "dataset": definition.get("dataset") or definition["model"],
-        "split": best["split"],
-        "reference": best["reference"],
+        "split": result["split"],
+        "reference": result["reference"],
         "metric": definition["metric"],
-        "metrics": {key: float(f"{value:.8g}") for key, value in best["metrics"].items()},
+        "metrics": {key: float(f"{value:.8g}") for key, value in result["metrics"].items()},
     }
     return as_yaml(tree)
 
@@ -170,6 +182,6 @@ def sweep_figure(
         "response": sweep_figures.response_curves,
     }[kind]
     axes = list(described["space"])
-    text = dict.fromkeys(axes, str)
-    drawn = draw(read_table(table, dtype=text), described, axes, logarithmic)
-    write_png(drawn, out)
+    # Axes as text: they may be numbers or names of options.
+    points = read_table(table, dtype=dict.fromkeys(axes, str))
+    write_png(draw(points, described, axes, logarithmic), out)

@@ -1,4 +1,4 @@
-"""A simulated exposure of a star field, its truth known, and small files to try things on.
+"""A simulated exposure of a star field with its truth, and small image files with catalogues.
 
 The optics are a slow telescope with Seidel aberrations that grow towards the edge
 of the field; a Moffat profile (Moffat 1969, A&A 3, 455) stands for seeing and
@@ -23,15 +23,13 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
 
-OVERSAMPLING = 3  # sub-pixels per axis; seeing leaves nothing beyond their Nyquist frequency
-RENDER_PX = 32  # side of the square into which a star is drawn
-MAX_SIGNAL = 65535  # largest number of a 16-bit camera
-BATCH = 32  # stars that are propagated at a time
+RENDER_PX = 32
+"""Side in pixels of the square into which a star is drawn."""
 
 
 @dataclass(frozen=True)
 class FieldRecipe:
-    """What the exposure shows."""
+    """Telescope, camera, sky and stars of a simulated exposure."""
 
     side_px: int = 1500
     bright: int = 300  # stars, uniform in the logarithm of their signal to noise
@@ -55,7 +53,7 @@ class FieldRecipe:
 
 @dataclass(frozen=True)
 class ExampleField:
-    """An exposure with its truth."""
+    """A simulated exposure with the true place, flux and PSF of its n stars."""
 
     image: np.ndarray  # counts, uint16
     position: np.ndarray  # (n, 2), x, y of the chief ray, 0-based pixel centres
@@ -67,34 +65,40 @@ class ExampleField:
 
 def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     """Simulate an exposure; the same recipe and seed give the same pixels."""
+    # Stars anywhere in the image, but not so near to its edge that their stamps leave it.
     rng = stream(seed, "example field")
     counts = (recipe.bright, recipe.faint, recipe.saturated, recipe.blended)
     kind = np.repeat(["bright", "faint", "saturated", "blended"], counts)
     margin = RENDER_PX / 2
     position = rng.uniform(margin, recipe.side_px - margin, size=(kind.size, 2))
-    # Companions are 4 to 7 px away.
+    # A companion of each blended star, 4 to 7 px from it, in a random direction.
     distance = rng.uniform(4.0, 7.0, size=recipe.blended)
     angle = rng.uniform(0.0, 2.0 * np.pi, size=recipe.blended)
-    away = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    everyone = np.concatenate([position, position[kind == "blended"] + away])
-    psf = star_images(recipe, everyone)
+    separation = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    source_position = np.concatenate([position, position[kind == "blended"] + separation])
+    # Light of all stars in electrons; companions have a third of the flux.
+    psf = star_images(recipe, source_position)
     flux = _fluxes(recipe, kind, rng)
-    light = np.zeros((recipe.side_px,) * 2)
-    each = np.concatenate([flux, flux[kind == "blended"] / 3.0])
-    add_stamps(light, each[:, None, None] * psf, *everyone.T)
+    starlight = np.zeros((recipe.side_px,) * 2)
+    source_flux = np.concatenate([flux, flux[kind == "blended"] / 3.0])
+    add_stamps(starlight, source_flux[:, None, None] * psf, *source_position.T)
+    # Camera: a sky that rises from left to right, photon noise, read noise, whole counts, and
+    # clipping at the saturation level or the largest number of 16 bits.
     ramp = 1.0 + recipe.sky_slope * np.linspace(-0.5, 0.5, recipe.side_px)
-    expected = recipe.sky_e * np.broadcast_to(ramp, light.shape) + light
-    electrons = rng.poisson(expected) + recipe.read_noise_e * rng.standard_normal(expected.shape)
-    counted = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, MAX_SIGNAL))
+    expected_e = recipe.sky_e * np.broadcast_to(ramp, starlight.shape) + starlight
+    photo_electrons = rng.poisson(expected_e)
+    electrons = photo_electrons + recipe.read_noise_e * rng.standard_normal(expected_e.shape)
+    image = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, 65535))
+    # Centres of light from the first moments of the noise-free stamps, whose sum is 1.
     psf = psf[: kind.size]
     axis = np.arange(RENDER_PX) - RENDER_PX // 2
-    centre = np.stack([psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis], axis=1)
-    centroid = np.rint(position) + centre
-    return ExampleField(counted.astype(np.uint16), position, centroid, flux, psf, kind)
+    centre_in_stamp = np.stack([psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis], axis=1)
+    centroid = np.rint(position) + centre_in_stamp
+    return ExampleField(image.astype(np.uint16), position, centroid, flux, psf, kind)
 
 
 def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
-    """Noise-free images of stars at positions of the field.
+    """Return noise-free images of stars at positions of the field.
 
     Parameters
     ----------
@@ -106,36 +110,43 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
     ndarray, shape (n, RENDER_PX, RENDER_PX), float32
         Sum 1; the pixel nearest to the position has the index RENDER_PX/2.
     """
-    fine = OVERSAMPLING * RENDER_PX
-    field = position / (0.5 * recipe.side_px) - 1.0
+    # Optics on a grid of 3 × 3 sub-pixels, beyond whose Nyquist frequency seeing leaves nothing.
+    oversampling = 3
+    fine = oversampling * RENDER_PX
+    field = position / (0.5 * recipe.side_px) - 1.0  # −1 … 1 along either axis
     source = seidel_wavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
     pupil = annular_pupil(128, 0.35)
-    propagate = StampPropagator(pupil, fine, recipe.pixel / OVERSAMPLING, precision="complex64")
-    blur = _moffat_transfer(recipe.seeing_px * OVERSAMPLING, fine)
+    propagate = StampPropagator(pupil, fine, recipe.pixel / oversampling, precision="complex64")
+    blur = _moffat_transfer(recipe.seeing_px * oversampling, fine)
     # The chief ray is at the corner between the two middle sub-pixels of the fine image.
     shift = position - np.rint(position) + 0.5
-    out = np.empty((len(field), RENDER_PX, RENDER_PX), np.float32)
-    for start in range(0, len(field), BATCH):
-        part = np.arange(start, min(start + BATCH, len(field)))
+    stamps = np.empty((len(field), RENDER_PX, RENDER_PX), np.float32)
+    for start in range(0, len(field), 32):
+        part = np.arange(start, min(start + 32, len(field)))
         sharp = propagate(source.opd(part, pupil, propagate.real_dtype))
-        phase = _shift_transfer(shift[part] * OVERSAMPLING, fine)
+        # Seeing and sub-pixel position are factors of the Fourier transform.
+        phase = _shift_transfer(shift[part] * oversampling, fine)
         blurred = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
-        binned = blurred.reshape(len(part), RENDER_PX, OVERSAMPLING, RENDER_PX, OVERSAMPLING)
+        # Sum of the sub-pixels of each pixel, without ripples below 0, of flux 1.
+        binned = blurred.reshape(len(part), RENDER_PX, oversampling, RENDER_PX, oversampling)
         pixels = np.clip(binned.sum(axis=(2, 4)), 0.0, None)
-        out[part] = pixels / pixels.sum(axis=(1, 2), keepdims=True)
-    return out
+        stamps[part] = pixels / pixels.sum(axis=(1, 2), keepdims=True)
+    return stamps
 
 
 def _moffat_transfer(fwhm: float, side: int) -> np.ndarray:
-    """Fourier transform of a centred Moffat profile of exponent 3, sum 1."""
-    core = 0.5 * fwhm / np.sqrt(2.0 ** (1.0 / 3.0) - 1.0)
+    """Return the Fourier transform of a centred Moffat profile of exponent 3, sum 1.
+
+    The profile is (1 + r²/α²)^(−3); it falls to 1/2 at r = α √(2^(1/3) − 1) = FWHM/2.
+    """
+    core_radius = 0.5 * fwhm / np.sqrt(2.0 ** (1.0 / 3.0) - 1.0)
     axis = np.fft.fftfreq(side, 1.0 / side)
-    profile = (1.0 + (axis[:, None] ** 2 + axis**2) / core**2) ** -3.0
+    profile = (1.0 + (axis[:, None] ** 2 + axis**2) / core_radius**2) ** -3.0
     return np.fft.rfft2(profile / profile.sum()).real
 
 
 def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
-    """Factors that move images by (x, y) pixels, shape (n, side, side//2 + 1)."""
+    """Return the factors that move images by (x, y) pixels, shape (n, side, side//2 + 1)."""
     rows = np.exp(-2j * np.pi * np.fft.fftfreq(side) * shift[:, 1, None])
     columns = np.exp(-2j * np.pi * np.fft.rfftfreq(side) * shift[:, 0, None])
     factors: np.ndarray = rows[:, :, None] * columns[:, None, :]
@@ -143,33 +154,34 @@ def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
 
 
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Flux of every star in electrons."""
+    """Draw the flux of every star in electrons, shape (n,)."""
+    # Noise of the flux of a faint star on the axis: σ √A, A the noise-equivalent area.
     axis_psf = star_images(recipe, np.full((1, 2), recipe.side_px / 2.0))[0]
-    noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_equivalent_px(axis_psf))
+    flux_noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_equivalent_px(axis_psf))
+    # Signal to noise uniform in its logarithm between two limits.
     draw = rng.uniform(size=kind.size)
-    faint = (kind == "faint")[:, None]
-    low, high = np.where(faint, recipe.faint_snr, recipe.bright_snr).T
-    flux = noise * low * (high / low) ** draw
-    # Twice to four times what fills the brightest pixel.
-    full = recipe.saturation * recipe.gain / axis_psf.max()
-    fluxes: np.ndarray = np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
-    return fluxes
+    is_faint = (kind == "faint")[:, None]
+    lowest_snr, highest_snr = np.where(is_faint, recipe.faint_snr, recipe.bright_snr).T
+    unsaturated_flux = flux_noise * lowest_snr * (highest_snr / lowest_snr) ** draw
+    # Saturated stars: two to four times the flux that fills the brightest pixel.
+    saturating_flux = recipe.saturation * recipe.gain / axis_psf.max()
+    saturated_flux = saturating_flux * (2.0 + 2.0 * draw)
+    flux: np.ndarray = np.where(kind == "saturated", saturated_flux, unsaturated_flux)
+    return flux
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Add stamps (n, d, d) to an image, in place; what is off the image is lost.
+    """Add stamps (n, d, d) to an image, in place, without pixels that are off the image.
 
     The stamp's pixel (d/2, d/2) goes to the pixel nearest to the 0-based position.
     """
-    d = stamps.shape[-1]
-    rows = central_pixel(y)[:, None, None] - d // 2 + np.arange(d)[:, None]
-    columns = central_pixel(x)[:, None, None] - d // 2 + np.arange(d)
+    side = stamps.shape[-1]
+    rows = central_pixel(y)[:, None, None] - side // 2 + np.arange(side)[:, None]
+    columns = central_pixel(x)[:, None, None] - side // 2 + np.arange(side)
     rows, columns = np.broadcast_arrays(rows, columns)
+    # `add.at` adds each stamp where several overlap; indexed assignment would keep the last one.
     inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
     np.add.at(image, (rows[inside], columns[inside]), stamps[inside])
-
-
-# Files.
 
 
 def write_cube(path: Path, stamps: np.ndarray, **cards: str | float) -> None:
@@ -190,7 +202,7 @@ def write_field(
     """Write an image with header cards, float64 as float32, and a CSV catalogue of its stars.
 
     The image has a tangential WCS with north up; the catalogue has the columns id,
-    X_IMAGE, Y_IMAGE (1-based, as in SExtractor) and ra, dec (degrees), and `columns` besides.
+    X_IMAGE, Y_IMAGE (1-based, as in SExtractor), ra, dec (degrees), and `columns`.
     `x`, `y` are 0-based.
     """
     from astropy.table import Table
@@ -211,6 +223,7 @@ def write_field(
 
 
 def _write_image(path: Path, pixels: np.ndarray, cards: Mapping[str, object]) -> None:
+    """Write pixels as the primary image of a FITS file, float64 as float32."""
     from astropy.io import fits
 
     pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels

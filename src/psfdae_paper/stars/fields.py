@@ -8,7 +8,7 @@ from psfdae_paper.configuration.schema import Grid
 
 
 def square_grid(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """A centred square grid of field points.
+    """Return a centred square grid of field points.
 
     Parameters
     ----------
@@ -30,13 +30,16 @@ def square_grid(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def relative_field(grid: Grid) -> np.ndarray:
-    """Field vectors (h_x, h_y) of a grid's points, 1 at the edge on an axis, shape (P², 2)."""
+    """Return field vectors (h_x, h_y) of a grid, 1 at the edge on an axis, shape (P², 2)."""
     _, angle_deg = square_grid(grid.points, grid.spacing_deg)
     return angle_deg / grid.edge_deg
 
 
 def assign_fields(count: int, fields: int, rng: np.random.Generator) -> np.ndarray:
-    """Field of every star: a random permutation of k mod `fields`, k = 0 … count − 1."""
+    """Return a field for every star: a random permutation of k mod `fields`, k < `count`.
+
+    All fields have equally many stars, up to one. Integers, shape (count,).
+    """
     return rng.permutation(np.arange(count) % fields)
 
 
@@ -47,7 +50,7 @@ def perturb(
     jitter_waves: float = 0.0,
     shifts: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Random aberrations: every coefficient times (1 + fraction · N(0, 1)) + jitter · N(0, 1).
+    """Draw aberrations: every coefficient times (1 + fraction · N(0, 1)) + jitter · N(0, 1).
 
     The paper (section 3.1) gives "variance of different percentage"; `fraction` is read
     as a standard deviation. The jitter also moves terms that vanish, such as focus on the
@@ -60,9 +63,14 @@ def perturb(
     fraction : float
         Relative standard deviation, ≥ 0.
     factors, shifts : Generator
-        Where the two kinds of draws come from.
+        Random streams of the factors and of the jitter.
     jitter_waves : float
         Standard deviation in waves, ≥ 0.
+
+    Returns
+    -------
+    ndarray, shape (n, J)
+        Coefficients in waves.
     """
     perturbed = coefficients * (1.0 + fraction * factors.standard_normal(coefficients.shape))
     if jitter_waves and shifts:

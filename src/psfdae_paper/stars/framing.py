@@ -25,6 +25,7 @@ from psfdae.telescope.settings import OwnTelescope, Telescope
 from psfdae_paper.configuration.schema import Framing, Optics
 
 Propagator = StampPropagator | BlurredPropagator
+"""Functions of OPDs and stamp centres that give stamps, without or with seeing."""
 
 
 class FramingError(Error, ValueError):
@@ -42,9 +43,15 @@ def brightest_pixel(image: np.ndarray, tie: float) -> tuple[int, int]:
     image : ndarray, shape (h, w)
     tie : float
         Relative tolerance below the maximum.
+
+    Returns
+    -------
+    tuple of int
+        (row, column).
     """
-    flat = int(np.argmax(image >= (1.0 - tie) * image.max()))
-    row, column = np.unravel_index(flat, image.shape)
+    # argmax of a boolean array is the index of its first True.
+    first_index = int(np.argmax(image >= (1.0 - tie) * image.max()))
+    row, column = np.unravel_index(first_index, image.shape)
     return int(row), int(column)
 
 
@@ -62,11 +69,13 @@ def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.nda
     -------
     ndarray, shape (B, d, d)
     """
+    # The first pixel of the stamp is at margin − jitter: a brightest pixel that moves by +1 in
+    # the stamp needs a cut that begins one pixel earlier.
     pixels = np.arange(framed.shape[-1] - 2 * margin)
-    start = np.broadcast_to(margin - np.asarray(jitter), (len(framed), 2))[:, :, None] + pixels
+    index = np.broadcast_to(margin - np.asarray(jitter), (len(framed), 2))[:, :, None] + pixels
     stars = np.arange(len(framed))[:, None, None]
-    cut: np.ndarray = framed[stars, start[:, 0, :, None], start[:, 1, None, :]]
-    return cut
+    stamps: np.ndarray = framed[stars, index[:, 0, :, None], index[:, 1, None, :]]
+    return stamps
 
 
 def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,19 +90,6 @@ def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     flux = stamps.sum(axis=(-2, -1))
     return stamps / flux[..., None, None], flux
-
-
-RAY_MARGIN, RUNG = 3.0, 8
-"""Pixels beyond the outermost ray in which the brightest pixel is looked for, and steps of the
-sizes of search images."""
-
-SEARCH_ERROR = 1e-3
-"""Search-image pixels this far below a tie with the maximum may still be the brightest.
-
-The search image errs by 8e-5 of its maximum at most (256 stars each of scene 1 at 10 and
-50 %, and of scene 2). A pixel that is alone on the shortlist settles a star; only the
-others are computed exactly.
-"""
 
 
 class Propagation:
@@ -129,11 +125,14 @@ class Propagation:
         self.telescope = telescope
         self.optics = optics
         self.framing = framing
-        pixel = telescope.pixel
+        pixel = telescope.pixel  # width in λ/D
+        # Farthest point of the focal plane that any stamp can contain, in λ/D: a peak at the
+        # border of the largest search window, half a stamp, and the centring errors.
         reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
         edge = reach * pixel
-        own = telescope if isinstance(telescope, OwnTelescope) else None
-        seeing, self._blur = (own.seeing, own.blur) if own else (None, None)
+        # Seeing carries light into the stamp from as far as its profile reaches.
+        seeing = telescope.seeing if isinstance(telescope, OwnTelescope) else None
+        self._blur = telescope.blur if isinstance(telescope, OwnTelescope) else None
         if seeing is not None and self._blur is not None:
             edge += self._blur.reach
             if edge > optics.pupil_samples[-1]:
@@ -142,25 +141,37 @@ class Propagation:
                     f"around the stamps need N ≥ {edge:.0f} pupil samples; "
                     f"optics.pupil_samples = {optics.pupil_samples}"
                 )
+        # The smallest pupil grid without aliasing within ± edge, from the wavefront's slopes.
         slopes = source.slopes()
         needed = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(needed, tuple(optics.pupil_samples))
-        # Rays land at twice the slope, in λ/D; here (row, column) and (min, max) in pixels.
+        # First search window of each wavefront: where its rays land. They land at twice the
+        # slope, in λ/D; here (row, column) and (min, max) in pixels.
         rays = 2.0 * slopes[:, ::-1] / pixel
-        half = 0.5 * np.ptp(rays, axis=2).max(axis=1) + RAY_MARGIN
+        # Diffraction moves the brightest pixel by less than 3 px beyond the outermost ray. Sizes
+        # are multiples of 8 px, so that many wavefronts share a search image's kernel.
+        half_width = 0.5 * np.ptp(rays, axis=2).max(axis=1) + 3.0
         self._centre = np.rint(rays.mean(axis=2)).astype(np.int64)
-        self._reach = (RUNG * np.ceil(half / RUNG)).astype(np.int64)
-        far = self._reach + np.abs(self._centre).max(axis=1) > 2 * search_px
-        far |= self._reach > search_px
-        self._centre[far], self._reach[far] = 0, search_px
+        self._reach = (8 * np.ceil(half_width / 8)).astype(np.int64)
+        # A window that leaves the permitted area is replaced by ± search_px around the chief ray.
+        is_too_large = self._reach + np.abs(self._centre).max(axis=1) > 2 * search_px
+        is_too_large |= self._reach > search_px
+        self._centre[is_too_large], self._reach[is_too_large] = 0, search_px
         self._pupils: dict[int, Pupil] = {}
 
     def stamps(
         self, stamp_px: int, offset_px: np.ndarray, stars: np.ndarray | None = None
     ) -> np.ndarray:
-        """Pixel-integrated stamps centred `offset_px` (row, column), (B, 2), from the chief ray.
+        """Propagate wavefronts to pixel-integrated stamps at given places of the focal plane.
 
-        `stars` are the B wavefronts; all of the source by default.
+        Parameters
+        ----------
+        stamp_px : int
+            Side of a stamp.
+        offset_px : ndarray, shape (B, 2)
+            (row, column) from the chief ray to the centre of each stamp.
+        stars : ndarray of int, shape (B,), optional
+            The wavefronts; all of the source by default.
 
         Returns
         -------
@@ -168,20 +179,20 @@ class Propagation:
             Fraction of the light through the pupil on each pixel.
         """
         stars = np.arange(len(self.source)) if stars is None else stars
-        out = np.empty((len(stars), stamp_px, stamp_px))
+        stamps = np.empty((len(stars), stamp_px, stamp_px))
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = self._pupil(samples)
-            kernel = self._kernel(pupil, stamp_px, self.optics.precision)
+            propagator = self._propagator(pupil, stamp_px, self.optics.precision)
 
             def propagate(batch: np.ndarray) -> None:
-                opd = self.source.opd(stars[batch], pupil, kernel.real_dtype)
-                out[batch] = kernel(opd, offset_px[batch])
+                opd = self.source.opd(stars[batch], pupil, propagator.real_dtype)
+                stamps[batch] = propagator(opd, offset_px[batch])
 
             return propagate
 
         self._run(stars, prepare)
-        return out
+        return stamps
 
     def framed(
         self,
@@ -190,7 +201,7 @@ class Propagation:
         stars: np.ndarray | None = None,
         phase_px: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps that have their brightest pixel in the middle, up to a centring error.
+        """Return stamps that have their brightest pixel in the middle, up to a centring error.
 
         Pixel j of the focal plane spans j … j + 1 pixels from the chief ray. The
         brightest one goes to the 0-based index (side/2, side/2) + `jitter` (`side` even),
@@ -199,8 +210,9 @@ class Propagation:
         Parameters
         ----------
         side : int
+            Side of a stamp in pixels.
         jitter : ndarray of int, shape (B, 2)
-            (row, column).
+            Centring error (row, column) in pixels.
         stars, phase_px : as for `brightest`
 
         Returns
@@ -216,7 +228,7 @@ class Propagation:
     def brightest(
         self, stars: np.ndarray | None = None, phase_px: np.ndarray | None = None
     ) -> np.ndarray:
-        """Brightest pixel (row, column) of every wavefront, in pixels from the chief ray.
+        """Find the brightest pixel (row, column) of every wavefront, counted from the chief ray.
 
         A single-precision search image shortlists pixels; those are then computed
         in complex128, and the first in (row, column) order within the tie
@@ -229,43 +241,70 @@ class Propagation:
         stars : ndarray of int, shape (B,), optional
             The wavefronts; all of the source by default.
         phase_px : ndarray, shape (B, 2), optional
-            (row, column) by which the pixel grid of every wavefront lies beside the one
+            (row, column) by which the pixel grid of every wavefront is displaced from the one
             that has the chief ray on a corner; 0 by default.
+
+        Returns
+        -------
+        ndarray of int, shape (B, 2)
 
         Raises
         ------
         FramingError
-            If the brightest pixel lies on the border of that window, too.
+            If the brightest pixel lies on the border of the last window, too.
         """
         stars = np.arange(len(self.source)) if stars is None else stars
         phase_px = np.zeros((len(stars), 2)) if phase_px is None else phase_px
         centre, reach = self._centre[stars], self._reach[stars]
         peaks = np.empty((len(stars), 2), dtype=np.int64)
-        border = np.arange(len(stars))
-        while border.size:
-            for distance in np.unique(reach[border]):
-                own = border[reach[border] == distance]
-                offset = phase_px[own] + centre[own]
-                peaks[own] = centre[own] + self._search(stars[own], offset, int(distance))
-            border = border[_touches(peaks[border] - centre[border], reach[border])]
-            outside = border[reach[border] > self.search_px]
+        pending = np.arange(len(stars))
+        while pending.size:
+            # Wavefronts with windows of one size share a search image's kernel.
+            for distance in np.unique(reach[pending]):
+                members = pending[reach[pending] == distance]
+                offset = phase_px[members] + centre[members]
+                peaks[members] = centre[members] + self._search(
+                    stars[members], offset, int(distance)
+                )
+            # Pixel indices of a window run from −reach to reach − 1. A peak on its border may be
+            # the flank of a brighter one outside.
+            peak_in_window, limit = peaks[pending] - centre[pending], reach[pending][:, None]
+            on_border = (peak_in_window == -limit) | (peak_in_window == limit - 1)
+            pending = pending[on_border.any(axis=1)]
+            outside = pending[reach[pending] > self.search_px]
             if outside.size:
                 raise FramingError(
                     f"search_px = {self.search_px}: the brightest pixel of {outside.size} of "
                     f"{len(peaks)} wavefronts lies {2 * self.search_px} px or more from the chief "
-                    f"ray (the first is wavefront {stars[outside[0]]}); a larger value would do"
+                    f"ray (the first is wavefront {stars[outside[0]]}); choose a larger search_px"
                 )
-            whole = (reach[border] == self.search_px) & ~centre[border].any(axis=1)
-            reach[border], centre[border] = np.where(whole, 2, 1) * self.search_px, 0
+            # Next: the window ± search_px around the chief ray; if that was it, twice the size.
+            was_full_window = (reach[pending] == self.search_px) & ~centre[pending].any(axis=1)
+            reach[pending] = np.where(was_full_window, 2, 1) * self.search_px
+            centre[pending] = 0
         return peaks
 
     def _search(self, stars: np.ndarray, phase_px: np.ndarray, reach: int) -> np.ndarray:
+        """Find brightest pixels within ± `reach` pixels of window centres.
+
+        Parameters
+        ----------
+        stars : ndarray of int, shape (B,)
+        phase_px : ndarray, shape (B, 2)
+            (row, column) of the window's centre from the chief ray.
+        reach : int
+
+        Returns
+        -------
+        ndarray of int, shape (B, 2)
+            (row, column) from the centre of the window.
+        """
         peaks = np.empty((len(stars), 2), dtype=np.int64)
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = self._pupil(samples)
-            search = self._kernel(pupil, 2 * reach, "complex64")
-            exact = self._kernel(pupil, 1, "complex128", 2 * EXTRA_POINTS)
+            search = self._propagator(pupil, 2 * reach, "complex64")
+            exact = self._propagator(pupil, 1, "complex128", 2 * EXTRA_POINTS)
 
             def find(batch: np.ndarray) -> None:
                 members, phase = stars[batch], phase_px[batch]
@@ -286,12 +325,33 @@ class Propagation:
         image: np.ndarray,
         exact: Propagator,
     ) -> np.ndarray:
-        """Brightest pixel of every search image; exact values where several compete."""
+        """Find the brightest pixel of every search image; exact values where several compete.
+
+        Parameters
+        ----------
+        batch : ndarray of int, shape (B,)
+            The wavefronts.
+        phase_px : ndarray, shape (B, 2)
+            (row, column) of the centre of each image from the chief ray.
+        image : ndarray, shape (B, h, h)
+            Search images, single precision.
+        exact : callable
+            Propagator to stamps of one pixel, double precision.
+
+        Returns
+        -------
+        ndarray of int, shape (B, 2)
+            (row, column), index of the pixel in the image.
+        """
         half = image.shape[-1] // 2
-        least = (1.0 - self.framing.tie) * (1.0 - SEARCH_ERROR)
-        bright = image >= least * image.max(axis=(1, 2), keepdims=True)
-        contested = bright.sum(axis=(1, 2)) > 1
-        star, row, column = np.nonzero(bright & contested[:, None, None])
+        # Shortlist. The search image errs by 8e-5 of its maximum at most (256 stars each of
+        # scene 1 at 10 and 50 %, and of scene 2): a pixel that is 1e-3 below a tie with the
+        # maximum may still be the brightest. One that is alone on the shortlist is.
+        threshold = (1.0 - self.framing.tie) * (1.0 - 1e-3)
+        shortlisted = image >= threshold * image.max(axis=(1, 2), keepdims=True)
+        contested = shortlisted.sum(axis=(1, 2)) > 1
+        star, row, column = np.nonzero(shortlisted & contested[:, None, None])
+        # Contested images keep nothing but their shortlisted pixels, which are computed exactly.
         values = np.where(contested[:, None, None], 0.0, image)
         # The centre of pixel j is at j + 1/2 pixels; a one-pixel stamp is centred there.
         offsets = np.stack([row, column], axis=1) - half + 0.5 + phase_px[star]
@@ -302,6 +362,7 @@ class Propagation:
         return np.array([brightest_pixel(image, self.framing.tie) for image in values])
 
     def _pupil(self, samples: int) -> Pupil:
+        """Return the telescope's pupil with `samples` samples across; each size is made once."""
         if samples not in self._pupils:
             self._pupils[samples] = annular_pupil(samples, self.telescope.obscuration)
         return self._pupils[samples]
@@ -309,21 +370,16 @@ class Propagation:
     def _run(
         self, stars: np.ndarray, prepare: Callable[[int], Callable[[np.ndarray], None]]
     ) -> None:
+        """Process wavefronts in batches of one grid size, with what `prepare` makes for it."""
         # torch has threads of its own, inside every product.
         threads = 1 if self.optics.backend == "torch" else self.optics.threads
         in_batches(self.samples[stars], self.optics.batch, threads, prepare)
 
-    def _kernel(
+    def _propagator(
         self, pupil: Pupil, stamp_px: int, precision: Precision, extra: int = EXTRA_POINTS
     ) -> Propagator:
-        common = (pupil, stamp_px, self.telescope.pixel)
+        """Return the propagation from a pupil to stamps, with the telescope's seeing if any."""
+        geometry = (pupil, stamp_px, self.telescope.pixel)
         if self._blur is not None:
-            return BlurredPropagator(*common, self._blur, precision)
-        return StampPropagator(*common, extra, precision, self.optics.backend)
-
-
-def _touches(peaks: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Which brightest pixels (n, 2) lie on the border of a window of ± `reach` pixels, (n,)."""
-    reach = reach[:, None]
-    touches: np.ndarray = ((peaks == -reach) | (peaks == reach - 1)).any(axis=1)
-    return touches
+            return BlurredPropagator(*geometry, self._blur, precision)
+        return StampPropagator(*geometry, extra, precision, self.optics.backend)

@@ -40,7 +40,7 @@ class Symmetry:
 
     @property
     def matrix(self) -> np.ndarray:
-        """What moves field vectors (x, y), shape (2, 2)."""
+        """Matrix that moves field vectors (x, y), shape (2, 2)."""
         exchange = np.eye(2)[::-1] if self.transpose else np.eye(2)
         return np.diag([1 - 2 * self.flip_columns, 1 - 2 * self.flip_rows]) @ exchange
 
@@ -53,22 +53,27 @@ class Symmetry:
         return np.where([self.flip_rows, self.flip_columns], -1 - index, index)
 
     def field(self, index: np.ndarray, points: int) -> np.ndarray:
-        """Move field points, numbered ix + P·iy on a grid of `points` = P a side."""
+        """Move field points, numbered ix + P·iy on a grid of `points` = P a side.
+
+        The grid is centred, so a flip takes index i to P − 1 − i.
+        """
         iy, ix = np.divmod(index, points)
         if self.transpose:
             iy, ix = ix, iy
         iy = points - 1 - iy if self.flip_rows else iy
         ix = points - 1 - ix if self.flip_columns else ix
-        moved: np.ndarray = ix + points * iy
-        return moved
+        field: np.ndarray = ix + points * iy
+        return field
 
     def window(self, jitter: tuple[int, int], margin: int) -> tuple[int, int]:
-        """First row and column to cut from an image whose brightest pixel is at d/2 + `margin`.
+        """Return the first row and column to cut from an image with a margin around the stamp.
 
-        The d × d pixels from there, moved by `image`, have it at (d/2, d/2) + `jitter`;
-        |jitter| must be below `margin`.
+        The brightest pixel of the image is at (d/2, d/2) + `margin`. In the d × d pixels from
+        the returned corner, moved by `image`, it is at (d/2, d/2) + `jitter`; |jitter| must be
+        below `margin`.
         """
         flips = (self.flip_rows, self.flip_columns)
+        # A flip takes index d/2 of an even stamp to d/2 − 1, and the jitter changes its sign.
         start = [
             margin + 1 + shift if flip else margin - shift
             for shift, flip in zip(jitter, flips, strict=True)
@@ -76,16 +81,17 @@ class Symmetry:
         return (start[1], start[0]) if self.transpose else (start[0], start[1])
 
     def _flip(self, stamps: np.ndarray) -> np.ndarray:
+        """Mirror images (..., h, h) along the axes that this symmetry flips."""
         if self.flip_rows:
             stamps = stamps[..., ::-1, :]
         return stamps[..., ::-1] if self.flip_columns else stamps
 
 
 SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
-"""All eight, the identity first."""
+"""The eight symmetries of a square, the identity first."""
 
 
 def orbit(field: np.ndarray, points: int) -> np.ndarray:
-    """First of the fields to which the symmetries take each field: the same for all of them."""
-    first: np.ndarray = np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
-    return first
+    """Return the lowest of the fields to which symmetries take each: a name of their orbit."""
+    lowest: np.ndarray = np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
+    return lowest

@@ -21,25 +21,20 @@ import numpy as np
 from scipy.special import gamma, jv, kv
 
 Removal = Literal["none", "piston", "tilt"]
+"""Modes that can be taken out of wavefronts; "tilt" includes the piston."""
 
 WAVES_PER_RING = 8
 """Plane waves in a ring of the frequency plane; their angles are stratified."""
 
-INNERMOST = 0.5
-"""Radius of the innermost ring, a disc around f = 0, in units of 1/L0."""
+HALF_FRIED_CONSTANT = (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
+"""Half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/r0)^(5/3)."""
 
-STRENGTH = (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
-"""Half of Fried's 6.88, by which r0 is defined."""
-
-SPECTRUM = gamma(11.0 / 6.0) ** 2 / (2.0 * np.pi ** (11.0 / 3.0)) * STRENGTH
+SPECTRUM = gamma(11.0 / 6.0) ** 2 / (2.0 * np.pi ** (11.0 / 3.0)) * HALF_FRIED_CONSTANT
 """Factor 0.0229 of the phase spectrum."""
-
-BLOCK = 4
-"""Directions per matrix product: their rows still fit the cache of a core."""
 
 
 def structure_function(separation: np.ndarray, r0: float, outer_scale: float) -> np.ndarray:
-    """Von Kármán phase structure function D(r) = ⟨[φ(x + r) − φ(x)]²⟩.
+    """Return the von Kármán phase structure function D(r) = ⟨[φ(x + r) − φ(x)]²⟩.
 
     Conan 2000 (thesis, Université de Nice); Lucke & Young 2007, Appl. Opt. 46, 559:
     with u = 2πr/L0,
@@ -47,18 +42,30 @@ def structure_function(separation: np.ndarray, r0: float, outer_scale: float) ->
         D = (L0/r0)^(5/3) 2^(1/6) Γ(11/6) π^(−8/3) [24/5 Γ(6/5)]^(5/6)
             × [Γ(5/6) 2^(−1/6) − u^(5/6) K_(5/6)(u)].
 
-    The bracket cancels for small u: six digits are left at r = 2e-7 L0. Lengths r ≥ 0 of
-    any shape (...) in metres to rad² at the wavelength at which r0 is given.
+    The bracket cancels for small u: six digits are left at r = 2e-7 L0.
+
+    Parameters
+    ----------
+    separation : ndarray, any shape
+        Distance r ≥ 0 in metres.
+    r0, outer_scale : float
+        Fried's parameter and outer scale L0 in metres.
+
+    Returns
+    -------
+    ndarray, shape of `separation`
+        rad² at the wavelength at which r0 is given.
     """
     u = 2.0 * np.pi * np.asarray(separation, float) / outer_scale
+    # K_(5/6) is infinite at 0, where D = 0: any other argument avoids a warning.
     positive = np.where(u > 0, u, 1.0)
     bracket = gamma(5 / 6) / 2 ** (1 / 6) - positive ** (5 / 6) * kv(5 / 6, positive)
     scale = (outer_scale / r0) ** (5 / 3) * 2 ** (1 / 6) * gamma(11 / 6) / np.pi ** (8 / 3)
-    return np.where(u > 0, scale * STRENGTH * bracket, 0.0)
+    return np.where(u > 0, scale * HALF_FRIED_CONSTANT * bracket, 0.0)
 
 
 def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
-    """Fried's parameter of each layer in metres, r0_l = r0 · s_l^(−3/5).
+    """Return Fried's parameter of each layer in metres, r0_l = r0 · s_l^(−3/5).
 
     `r0` is that of all layers together, `strengths` are the fractions s_l of each.
     """
@@ -85,7 +92,7 @@ class PlaneWaves:
 def draw_waves(
     count: int, r0: float, outer_scale: float, highest: float, rng: np.random.Generator
 ) -> PlaneWaves:
-    """Random plane waves whose ensemble has the von Kármán spectrum up to a frequency.
+    """Draw plane waves whose ensemble has the von Kármán spectrum up to a frequency.
 
     The frequency plane is cut into rings with log-spaced edges around a disc
     that reaches f = 0. Within a ring the radius is drawn with a density
@@ -113,31 +120,35 @@ def draw_waves(
         If `count` does not fill at least two rings or `highest` is not above
         the innermost disc.
     """
-    rings, rest = divmod(count, WAVES_PER_RING)
-    if rest or rings < 2:
+    rings, remainder = divmod(count, WAVES_PER_RING)
+    if remainder or rings < 2:
         raise ValueError(
             f"{count} plane waves: must be a multiple of {WAVES_PER_RING}, "
             f"at least {2 * WAVES_PER_RING}"
         )
-    low = 1.0 / outer_scale
-    if highest <= INNERMOST * low:
-        raise ValueError(f"highest frequency {highest} must exceed {INNERMOST}/L0 = {low / 2}")
-    edges = np.concatenate([[0.0], np.geomspace(INNERMOST * low, highest, rings)])
-    # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6)
-    integral = (edges**2 + low**2) ** (-5.0 / 6.0)
-    drop = integral[:-1] - integral[1:]
-    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * drop / WAVES_PER_RING
+    # Edges of the rings: a disc of radius 1/(2 L0) around f = 0, then equal steps of ln f.
+    outer_frequency = 1.0 / outer_scale
+    if highest <= 0.5 * outer_frequency:
+        raise ValueError(f"highest frequency {highest} must exceed 0.5/L0 = {outer_frequency / 2}")
+    edges = np.concatenate([[0.0], np.geomspace(0.5 * outer_frequency, highest, rings)])
+    # Variance of each wave: the ring's integral of the spectrum, divided by the ring's waves.
+    # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6), with f0 = 1/L0.
+    integral = (edges**2 + outer_frequency**2) ** (-5.0 / 6.0)
+    ring_integral = integral[:-1] - integral[1:]
+    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / WAVES_PER_RING
+    # Radii by inversion of that integral; a wave's angle lies in its own part of the half-turn.
     radius_draw, angle_draw, phase_draw = rng.random((3, rings, WAVES_PER_RING))
-    remaining = integral[:-1, None] - radius_draw * drop[:, None]
-    radius = np.sqrt(np.maximum(remaining ** (-6.0 / 5.0) - low**2, 0.0))
+    drawn_integral = integral[:-1, None] - radius_draw * ring_integral[:, None]
+    radius = np.sqrt(np.maximum(drawn_integral ** (-6.0 / 5.0) - outer_frequency**2, 0.0))
     angle = np.pi * (np.arange(WAVES_PER_RING) + angle_draw) / WAVES_PER_RING
     frequency = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    # The real part of a·exp(iφ) has the variance |a|²/2.
     amplitude = np.sqrt(2.0 * power)[:, None] * np.exp(2j * np.pi * phase_draw)
     return PlaneWaves(frequency.reshape(-1, 2), amplitude.ravel())
 
 
 def fitted_planes(wavevector: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
-    """Least-squares plane p + t_x x + t_y y of waves exp(iκ·x) over the lit pupil.
+    """Fit the least-squares plane p + t_x x + t_y y of waves exp(iκ·x) over the lit pupil.
 
     In closed form, hence the same for every pupil grid: over the disc of radius
     R, ⟨exp(iκ·x)⟩ = 2J1(κR)/(κR) and ⟨x exp(iκ·x)⟩ = 2i κ_x J2(κR)/κ².
@@ -154,16 +165,20 @@ def fitted_planes(wavevector: np.ndarray, obscuration: float = 0.0) -> np.ndarra
     ndarray, shape (K, 3), complex128
         p, t_x, t_y; the tilts per pupil radius.
     """
+    # The formulas are 0/0 at κ = 0; 1e-6 gives their limits to double precision.
     kappa = np.maximum(np.hypot(*wavevector.T), 1e-6)
+    # Integrals over the annulus in units of the disc's area: those over the disc minus those
+    # over the obscuration.
     mean, moment = np.zeros_like(kappa), np.zeros_like(kappa)
     for radius, area in ((1.0, 1.0), (obscuration, -(obscuration**2))):
         if area:
             mean += area * 2.0 * jv(1, kappa * radius) / (kappa * radius)
             moment += area * 2.0 * jv(2, kappa * radius) / kappa**2
-    lit = 1.0 - obscuration**2
-    second = 0.25 * (1.0 + obscuration**2)  # ⟨x²⟩ over the annulus
-    tilt = 1j * wavevector * (moment / lit / second)[:, None]
-    return np.concatenate([(mean / lit)[:, None].astype(complex), tilt], axis=1)
+    # Piston ⟨exp(iκ·x)⟩, tilt ⟨x exp(iκ·x)⟩ / ⟨x²⟩: over the annulus x, y and 1 are orthogonal.
+    lit_area = 1.0 - obscuration**2
+    second_moment = 0.25 * (1.0 + obscuration**2)  # ⟨x²⟩ over the annulus
+    tilt = 1j * wavevector * (moment / lit_area / second_moment)[:, None]
+    return np.concatenate([(mean / lit_area)[:, None].astype(complex), tilt], axis=1)
 
 
 class Footprints:
@@ -200,12 +215,15 @@ class Footprints:
         frequency = np.concatenate([layer.frequency for layer in layers])
         amplitude = np.concatenate([layer.amplitude for layer in layers])
         height = np.repeat(np.asarray(heights, float), [len(w.amplitude) for w in layers])
-        shift = np.asarray(directions, float) @ (frequency * height[:, None]).T
-        self.wavevector = np.pi * diameter * frequency
-        self.coefficients = amplitude / (2.0 * np.pi) * np.exp(2j * np.pi * shift)
+        # Phase of each wave in the middle of each footprint, in turns: f · h θ, shape (B, K).
+        turns = np.asarray(directions, float) @ (frequency * height[:, None]).T
+        self.wavevector = np.pi * diameter * frequency  # radians per pupil radius
+        # OPD in waves is the phase over 2π.
+        self.coefficients = amplitude / (2.0 * np.pi) * np.exp(2j * np.pi * turns)
+        # Piston and tilts to subtract from each direction, shape (B, 3); the others are 0.
         self.planes = (self.coefficients @ fitted_planes(self.wavevector, obscuration)).real
-        kept = {"none": 0, "piston": 1, "tilt": 3}[remove]
-        self.planes[:, kept:] = 0.0
+        removed_terms = {"none": 0, "piston": 1, "tilt": 3}[remove]
+        self.planes[:, removed_terms:] = 0.0
         # All directions look through the same part of a layer at height 0.
         self._moving = np.flatnonzero(height != 0.0)
         self._common = np.flatnonzero(height == 0.0)
@@ -215,7 +233,7 @@ class Footprints:
         return len(self.coefficients)
 
     def opd(self, index: np.ndarray, axis: np.ndarray, dtype: np.dtype) -> np.ndarray:
-        """OPD in waves of the directions `index`.
+        """Return the OPD in waves of the directions `index`.
 
         Parameters
         ----------
@@ -231,42 +249,56 @@ class Footprints:
         ndarray, shape (b, M, M)
             Indexed [y, x].
         """
-        wanted, inverse = np.unique(index, return_inverse=True)
-        waves_y, waves_x, common = self._factors(axis, np.dtype(dtype))
+        directions, inverse = np.unique(index, return_inverse=True)
+        waves_y, waves_x, common_opd = self._factors(axis, np.dtype(dtype))
         coefficients = self.coefficients[:, self._moving].astype(waves_y.dtype)
-        out = np.empty((wanted.size, axis.size, axis.size), dtype)
-        for start in range(0, wanted.size, BLOCK):
-            part = wanted[start : start + BLOCK]
+        opd = np.empty((directions.size, axis.size, axis.size), dtype)
+        # OPD[y, x] = Re Σ_k c_k exp(iκ_y y) exp(iκ_x x), as a product of real matrices; with 4
+        # directions at a time, their rows fit the cache of a core.
+        for start in range(0, directions.size, 4):
+            part = directions[start : start + 4]
             rows = _real_rows(coefficients[part, None, :] * waves_y)
-            out[start : start + BLOCK] = (rows @ waves_x).reshape(part.size, axis.size, -1)
-        piston, tilt_x, tilt_y = self.planes[wanted].T[:, :, None]
+            opd[start : start + 4] = (rows @ waves_x).reshape(part.size, axis.size, -1)
+        piston, tilt_x, tilt_y = self.planes[directions].T[:, :, None]
         # The planes carry the tilts of thousands of waves: formed in float64, cast once.
-        out += common
-        out -= (piston + tilt_y * axis).astype(dtype)[:, :, None]
-        out -= (tilt_x * axis).astype(dtype)[:, None, :]
-        return out if wanted.size == np.size(index) and (wanted == index).all() else out[inverse]
+        opd += common_opd
+        opd -= (piston + tilt_y * axis).astype(dtype)[:, :, None]
+        opd -= (tilt_x * axis).astype(dtype)[:, None, :]
+        # No copy if the directions are in ascending order and no one is named twice.
+        is_sorted = directions.size == np.size(index) and (directions == index).all()
+        return opd if is_sorted else opd[inverse]
 
     def _factors(self, axis: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, ...]:
-        """exp(iκ_y y), the real matrix of exp(iκ_x x), and the OPD common to all directions."""
+        """Return the factors of the waves on a pupil grid; each grid is computed once.
+
+        Returns
+        -------
+        waves_y : ndarray, shape (M, K), complex
+            exp(iκ_y y) of the waves above the ground.
+        waves_x : ndarray, shape (2K, M), real
+            Real and imaginary parts of exp(−iκ_x x), interleaved.
+        common_opd : ndarray, shape (M, M)
+            OPD in waves of the layers at the ground, the same for all directions.
+        """
         key = (np.asarray(axis).tobytes(), dtype.str)
         if key not in self._cache:
             kappa = self.wavevector[:, None, :] * axis[None, :, None]
             x, y = np.moveaxis(np.exp(1j * kappa), -1, 0)
-            still = self.coefficients[0, self._common, None] * x[self._common]
-            common = (y[self._common].T @ still).real
-            moving = np.ascontiguousarray(y[self._moving].T)
+            ground_x = self.coefficients[0, self._common, None] * x[self._common]
+            common_opd = (y[self._common].T @ ground_x).real
+            waves_y = np.ascontiguousarray(y[self._moving].T)
             # Re(a b) = Re a · Re b − Im a · Im b: the conjugate brings the sign.
-            across = _real_rows(np.ascontiguousarray(x[self._moving].T.conj())).T
+            waves_x = _real_rows(np.ascontiguousarray(x[self._moving].T.conj())).T
             complex_dtype = np.result_type(dtype, np.complex64)
             self._cache[key] = (
-                moving.astype(complex_dtype),
-                np.ascontiguousarray(across, dtype=dtype),
-                common.astype(dtype),
+                waves_y.astype(complex_dtype),
+                np.ascontiguousarray(waves_x, dtype=dtype),
+                common_opd.astype(dtype),
             )
         return self._cache[key]
 
 
 def _real_rows(array: np.ndarray) -> np.ndarray:
-    """Complex (..., K) as real rows (·, 2K), real and imaginary parts interleaved."""
+    """Return complex (..., K) as real rows (·, 2K), real and imaginary parts interleaved."""
     real = array.view(array.real.dtype)
     return real.reshape(-1, real.shape[-1])

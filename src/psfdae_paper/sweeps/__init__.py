@@ -1,1 +1,1 @@
-"""Sweeps: points of a search space, each trained and tested like the main workflow's models."""
+"""Sweeps: points of a search space, each trained and tested as models of the main workflow."""

@@ -1,7 +1,7 @@
 """Adaptive search: Optuna's ask and tell, one process per trial.
 
-What a trial asks for follows from the results of earlier trials alone, which are files
-of the workflow: each process tells a new study what they were.
+The values of a trial follow only from the results of earlier trials, which are files of the
+workflow: each process makes a new study and adds these results to it.
 """
 
 from __future__ import annotations
@@ -18,94 +18,88 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import FrozenTrial
 
-FINISHED = ("finished", "stopped")
-"""States of a point that has a result."""
-
 
 def ask(
     space: Mapping[str, Axis],
     search: Mapping[str, Any],
     slot: int,
-    known: Sequence[Mapping[str, Any]],
+    earlier_results: Sequence[Mapping[str, Any]],
 ) -> dict[str, Value]:
-    """Values of all axes for a trial: at random at first, then by a Parzen estimator (TPE).
+    """Propose values of all axes: at random at first, then by a Parzen estimator (TPE).
 
     Bergstra et al. (2011), *Algorithms for hyper-parameter optimization*, as
     implemented by Optuna.
 
     Parameters
     ----------
-    space : axes by name
+    space : mapping of str to Axis
+        Axes by name.
     search : mapping
         seed, startup, metric and direction of the sweep.
     slot : int
         Number of the trial.
-    known : sequence of mappings
-        Results of earlier trials: slot, values, status and metrics.
+    earlier_results : sequence of mappings
+        slot, values, status and metrics of earlier trials.
 
     Returns
     -------
     dict
-        The same for the same arguments, in whatever order the results come.
+        Value by axis. It does not depend on the order of the results.
     """
     import optuna
 
     seed = int(stream(search["seed"], "sweep", "trial", slot).integers(2**31))
-    _silence()
+    # Without this, Optuna writes a message for each trial.
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(
         direction=search["direction"],
         sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=search["startup"]),
     )
-    for result in sorted(known, key=lambda result: result["slot"]):
+    for result in sorted(earlier_results, key=lambda result: result["slot"]):
         study.add_trial(_trial(space, result, search))
-    asked = study.ask(_distributions(space)).params
-    return {name: _read(axis, asked[name]) for name, axis in space.items()}
+    parameters = study.ask(_distributions(space)).params
+    return {
+        name: json.loads(parameters[name]) if axis.options else tidy(axis, parameters[name])
+        for name, axis in space.items()
+    }
 
 
 def _trial(
     space: Mapping[str, Axis], result: Mapping[str, Any], search: Mapping[str, Any]
 ) -> FrozenTrial:
+    """Return an earlier trial as Optuna stores it; a failed one has no value."""
     from optuna.trial import TrialState, create_trial
 
-    done = result["status"] in FINISHED
+    has_metrics = result["status"] in ("finished", "stopped")
     return create_trial(
-        state=TrialState.COMPLETE if done else TrialState.FAIL,
-        value=float(result["metrics"][search["metric"]]) if done else None,
-        params={name: _written(axis, result["values"][name]) for name, axis in space.items()},
+        state=TrialState.COMPLETE if has_metrics else TrialState.FAIL,
+        value=float(result["metrics"][search["metric"]]) if has_metrics else None,
+        params={name: _stored_value(axis, result["values"][name]) for name, axis in space.items()},
         distributions=_distributions(space),
     )
 
 
 def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
+    """Return Optuna's distributions of the axes: categories, whole numbers, or a range."""
     from optuna.distributions import (
         CategoricalDistribution,
         FloatDistribution,
         IntDistribution,
     )
 
-    found: dict[str, BaseDistribution] = {}
+    distributions: dict[str, BaseDistribution] = {}
     for name, axis in space.items():
         if axis.options:
-            found[name] = CategoricalDistribution([_written(axis, v) for v in axis.options])
+            options = [_stored_value(axis, option) for option in axis.options]
+            distributions[name] = CategoricalDistribution(options)
         elif axis.integer:
             low, high = map(int, axis.ends)
-            found[name] = IntDistribution(low, high, log=axis.log)
+            distributions[name] = IntDistribution(low, high, log=axis.log)
         else:
-            found[name] = FloatDistribution(*axis.ends, log=axis.log)
-    return found
+            distributions[name] = FloatDistribution(*axis.ends, log=axis.log)
+    return distributions
 
 
-def _written(axis: Axis, value: Any) -> Any:
-    """A value as Optuna stores it; lists are text there."""
+def _stored_value(axis: Axis, value: Any) -> Any:
+    """Return a value as Optuna stores it; options, which may be lists, as JSON."""
     return json.dumps(value) if axis.options else value
-
-
-def _read(axis: Axis, value: Any) -> Any:
-    return json.loads(value) if axis.options else tidy(axis, value)
-
-
-def _silence() -> None:
-    """No message of Optuna's for each trial."""
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)

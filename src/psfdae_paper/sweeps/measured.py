@@ -1,4 +1,4 @@
-"""What the points of a sweep share when they are trained and measured."""
+"""Training and measurement of a sweep's points: tasks, tables, results and their files."""
 
 from __future__ import annotations
 
@@ -21,8 +21,27 @@ if TYPE_CHECKING:
     from psfdae.files import Product
     from psfdae_paper.configuration.schema import Config
 
-EVALUATION, VALIDATION = "evaluation.csv", "validation.csv"
-"""Tables of a point: on the test part, as in the main workflow, and on the validation part."""
+EVALUATION = "evaluation.csv"
+"""Table of a point's errors on the test part, as in the main workflow."""
+
+VALIDATION = "validation.csv"
+"""Table of a point's errors on the validation part."""
+
+RESULT = "result.json"
+"""Result of a point."""
+
+FINISHED = "finished.json"
+"""Copy of a point's result that the workflow does not know.
+
+A workflow that is killed takes the outputs of its last jobs for incomplete and deletes them, even
+if the jobs still came to their end; the copy keeps these trainings from being repeated.
+"""
+
+COST = "cost.json"
+"""Seconds and CPU seconds of a point's training."""
+
+CHECKSUM = "sha256"
+"""Key of the checksum of all other keys in a result."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +51,15 @@ class Task:
     Attributes
     ----------
     dataset, split, reference : str
-        Go into the tables.
+        Names in the tables.
     data : mapping of role to Path
         Products: "stars", or "states", "validation" and "test".
     levels : sequence of float
         Noise levels λ of validation and test.
     folder : Path
-        Receives all files of the point.
+        Folder for all files of the point.
     checkpoint : Path
-        Lets an interrupted training resume.
+        File from which an interrupted training resumes.
     """
 
     dataset: str
@@ -52,35 +71,34 @@ class Task:
     checkpoint: Path
 
     def described(self) -> dict[str, object]:
-        """What of the task decides its result: names, levels and the bytes of the products."""
+        """Return all that decides the result: names, levels and digests of the products."""
+        digests = {}
+        for role, path in sorted(self.data.items()):
+            with path.open("rb") as file:
+                digests[role] = hashlib.file_digest(file, "sha256").hexdigest()
         return {
             "names": [self.dataset, self.split, self.reference],
             "levels": list(self.levels),
-            "data": {role: _digest(path) for role, path in sorted(self.data.items())},
+            "data": digests,
         }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What became of a point.
+    """Metrics and cost of a point that was trained.
 
     Attributes
     ----------
     metrics : dict
         validation_<metric> and test_<metric> over all levels, and at each: …_<λ>.
     described : dict
-        The point's whole configuration, that of its stars or states included.
+        The point's whole configuration, with that of its stars or states.
     seconds, cpu_seconds : float
-        Of the training; NaN where a resumed one does not know.
+        Duration of the training; NaN if it was resumed and has no record of it.
     epochs : int or None
-        Passes over the training data, where they may end early.
+        Passes over the training data; None for methods without epochs.
     stopped : bool
-        Ended by early stopping.
+        The training ended by early stopping.
     attempt : int
         New starts after a dead network.
     """
@@ -95,7 +113,7 @@ class Measured:
 
 
 def geometric_mean(values: Sequence[float]) -> float:
-    """Mean over noise levels in which every level counts alike."""
+    """Return the mean over noise levels in which relative changes of all levels count alike."""
     return float(np.exp(np.mean(np.log(values))))
 
 
@@ -108,20 +126,23 @@ def image_rows(
     noisy: Callable[[np.ndarray, float], np.ndarray],
     model: Method,
 ) -> list[dict[str, Any]]:
-    """Rows of a table as the stage `evaluate` makes them, of one method.
+    """Measure one method at all noise levels; return rows like those of the stage `evaluate`.
 
     Parameters
     ----------
-    config : stage config with `evaluation`
+    config : Config
+        Stage configuration with `evaluation`.
     task : Task
     method : str
         Name in the table.
-    product : product "stars" with the reference
+    product : Product
+        Product "stars" with the reference.
     stars : ndarray of int, shape (n,)
-        Those that are measured; standard errors are clustered by their fields.
+        Stars that are measured; standard errors are clustered by their fields.
     noisy : callable
-        Noisy images of noise-free ones at a noise level.
+        Function of noise-free images and a noise level that returns noisy images.
     model : Method
+        Fitted method.
     """
     from psfdae.metrics import quality, summarised
     from psfdae.model.star_sets import field_positions
@@ -129,21 +150,25 @@ def image_rows(
     images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
     field, position = product["field_index"][stars], field_positions(product)[stars]
     key = {"dataset": task.dataset, "split": task.split, "reference": task.reference}
+    # Errors of all stars at each level, summarised with standard errors clustered by field.
     rows = []
     for level in task.levels:
         estimate = model.estimate(noisy(images, level), level, position)
-        found = quality(estimate, truth, config.evaluation.data_range)
-        rows += summarised({**key, "method": method, "noise_level": level}, found, field)
+        errors = quality(estimate, truth, config.evaluation.data_range)
+        rows += summarised({**key, "method": method, "noise_level": level}, errors, field)
     return rows
 
 
 def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """MSE and SSIM of a part, over all noise levels and at each."""
+    """Return MSE and SSIM of a part, over all noise levels and at each.
+
+    The MSE of different levels differ by orders of magnitude, and get the geometric mean.
+    """
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
-        found = {row["noise_level"]: row["value"] for row in rows if row["metric"] == metric}
-        metrics[f"{part}_{metric}"] = mean(list(found.values()))
-        metrics |= {f"{part}_{metric}_{level:g}": value for level, value in found.items()}
+        by_level = {row["noise_level"]: row["value"] for row in rows if row["metric"] == metric}
+        metrics[f"{part}_{metric}"] = mean(list(by_level.values()))
+        metrics |= {f"{part}_{metric}_{level:g}": value for level, value in by_level.items()}
     return metrics
 
 
@@ -161,12 +186,20 @@ def measure_images(
 
     Parameters
     ----------
-    config : stage config (seed, noise, parts, evaluation)
+    config : Config
+        Stage configuration (seed, noise, parts, evaluation).
     task : Task
     method : str
         Name in the tables.
-    validate_with, test_with : Method
-        One that has not been fitted to the validation stars, and the main workflow's.
+    validate_with : Method
+        Method that has not been fitted to the validation stars.
+    test_with : Method
+        Method that has been fitted as in the main workflow.
+
+    Returns
+    -------
+    dict
+        See `Measured.metrics`.
     """
     import pandas as pd
 
@@ -185,36 +218,25 @@ def measure_images(
     def noisy_test(images: np.ndarray, level: float) -> np.ndarray:
         return noisy_test_images(config, product, parts.test, level)
 
+    # Each part has its own stars, noise, fit and table.
     metrics: dict[str, float] = {}
-    for part, stars, noisy, model, name in (
+    for part, stars, noisy, model, table in (
         ("validation", parts.validation, noisy_validation, validate_with, VALIDATION),
         ("test", parts.test, noisy_test, test_with, EVALUATION),
     ):
         rows = image_rows(config, task, method, product, stars, noisy, model)
         metrics |= image_metrics(part, rows)
-        write_csv(task.folder / name, pd.DataFrame(rows))
+        write_csv(task.folder / table, pd.DataFrame(rows))
     return metrics
 
 
-RESULT, COST, FINISHED = "result.json", "cost.json", "finished.json"
-"""Result and cost of a point, and a copy of its result that a workflow does not know.
-
-A workflow that was killed takes what its last jobs still brought to an end for
-incomplete and deletes their results; the copy keeps these trainings from being repeated.
-"""
-
-
-CHECKSUM = "sha256"
-"""Key of the checksum of all other keys in a result."""
-
-
 def read_result(path: Path) -> dict[str, Any]:
-    """A point's `result.json` without its checksum.
+    """Read a point's `result.json`, and return it without its checksum.
 
     Raises
     ------
     ProductError
-        If the file is missing, or not what was written.
+        If the file is missing, or does not agree with its checksum.
     """
     tree = read_json(path)
     if tree.pop(CHECKSUM, None) != checksum(tree):
@@ -223,17 +245,17 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def read_cost(folder: Path) -> dict[str, float]:
-    """Seconds and CPU seconds of a point's training; raises ProductError."""
+    """Read seconds and CPU seconds of a point's training; raises ProductError."""
     path = folder / COST
     tree = read_json(path)
     return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
 
 
 def fit_in(kind: type[Method], folder: Path) -> Path:
-    """Where the fit of a point is: the folder itself, or a file in it."""
+    """Return the place of a point's fit: the folder itself, or a file in it."""
     return folder if storage_of(kind).files else folder / f"{kind.name}.h5"
 
 
 def checksum(tree: object) -> str:
-    """SHA-256 of a tree as JSON."""
+    """Return the SHA-256 of a tree as JSON."""
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()

@@ -15,20 +15,17 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration.alignment import OF_STATES
+from psfdae_paper.configuration.alignment import STATE_GROUPS
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
-    checked,
     compose,
-    decisive,
+    decisive_settings,
     overrides_for,
     stage_tree,
+    validate_tree,
 )
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.sweep import Axis, Sweep, Value, load_sweep
-
-DIGITS = 4
-"""Significant digits of a drawn number: enough for a search, and short to paste."""
 
 
 class SweepError(Error, ValueError):
@@ -36,7 +33,10 @@ class SweepError(Error, ValueError):
 
 
 def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
-    """Every combination of the options of all axes, none of them a range, the last axis fastest."""
+    """Return every combination of the options of all axes, the last axis fastest.
+
+    No axis may be a range.
+    """
     names = list(space)
     return [
         dict(zip(names, options, strict=True))
@@ -45,7 +45,7 @@ def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
 
 
 def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, Value]]:
-    """Random values of all axes, uniform in each option or along the range.
+    """Draw random values of all axes, uniform over the options or along the range.
 
     Each axis has a stream of its own for each draw: more trials extend the list, and
     the order of axes does not matter.
@@ -57,25 +57,30 @@ def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, V
 
 
 def _draw(axis: Axis, rng: np.random.Generator) -> Value:
+    """Draw a random value of an axis."""
     if axis.options:
         return axis.options[int(rng.integers(len(axis.options)))]
     # Half a step beyond the ends makes all whole numbers equally likely.
     margin = 0.5 if axis.integer else 0.0
     low, high = axis.ends
     ends = np.array([low - margin, high + margin])
+    # A logarithmic range is uniform in ln(value).
     value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
     return tidy(axis, float(value))
 
 
 def tidy(axis: Axis, value: float) -> int | float:
-    """A number of a range, whole or with few digits, and inside the range."""
+    """Round a number of a range to a whole number or four significant digits, inside the range.
+
+    Four digits are enough for a search, and short to paste.
+    """
     if axis.integer:
         return int(np.clip(round(value), *axis.ends))
-    return float(np.clip(float(f"{value:.{DIGITS}g}"), *axis.ends))
+    return float(np.clip(float(f"{value:.4g}"), *axis.ends))
 
 
 def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str, Value]:
-    """Configuration keys and their values at a point of the space."""
+    """Return the configuration keys and their values at a point of the space."""
     keys: dict[str, Value] = {}
     for name, axis in space.items():
         keys |= axis.changes(name, values[name])
@@ -83,29 +88,26 @@ def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str,
 
 
 def with_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str, Any]:
-    """A configuration tree with other values at dotted keys; the tree itself stays.
+    """Return a copy of a configuration tree with other values at dotted keys.
 
     Raises
     ------
     SweepError
-        If the tree has no such key, or a whole group there.
+        If the tree has no such key, or if it is a whole group.
     """
-    new = dict(tree)
-    for key, value in keys.items():
-        node, parts = new, key.split(".")
-        for part in parts[:-1]:
-            if not isinstance(node.get(part), Mapping):
-                raise SweepError(f"{key}: unknown key")
-            node[part] = dict(node[part])
-            node = node[part]
-        if parts[-1] not in node or isinstance(node[parts[-1]], Mapping):
-            raise SweepError(f"{key}: unknown key")
-        node[parts[-1]] = value
-    return new
-
-
-NAME_LENGTH = 12
-"""Hexadecimal digits of a point's name: in 1e5 points, two alike by chance once in 5e4 sweeps."""
+    changed_tree = dict(tree)
+    for dotted_key, value in keys.items():
+        # Copy each group on the way to the key, so that the given tree does not change.
+        node, (*groups, key) = changed_tree, dotted_key.split(".")
+        for group in groups:
+            if not isinstance(node.get(group), Mapping):
+                raise SweepError(f"{dotted_key}: unknown key")
+            node[group] = dict(node[group])
+            node = node[group]
+        if key not in node or isinstance(node[key], Mapping):
+            raise SweepError(f"{dotted_key}: unknown key")
+        node[key] = value
+    return changed_tree
 
 
 @dataclass(frozen=True)
@@ -117,9 +119,10 @@ class Point:
     name : str
         Hash of all that decides the result.
     values : dict
-        Value of every axis; empty for a trial of an adaptive sweep, which finds its own.
+        Value of every axis; empty for a trial of an adaptive sweep, whose values are proposed
+        when it runs.
     keys : dict
-        Configuration keys that differ from the dataset's, those that all points share included.
+        Configuration keys that differ from the dataset's, with those that all points share.
     config : dict
         Groups that the point's stage reads.
     slot : int or None
@@ -141,29 +144,26 @@ class Plan:
     ----------
     name : str
     sweep : Sweep
-    given : tuple of str
-        The workflow's overrides, for all points.
     tree : dict
         Whole configuration that the points start from.
     """
 
     name: str
     sweep: Sweep
-    given: tuple[str, ...]
     tree: dict[str, Any]
 
     @cached_property
     def points(self) -> dict[str, Point]:
         """Points by name in the order of the sweep; equal ones are one point."""
         if self.sweep.kind == "adaptive":
-            self._check_range()
-            found = [self._point({}, slot) for slot in range(self.sweep.trials or 0)]
+            self._check_ends()
+            points = [self._point({}, slot) for slot in range(self.sweep.trials or 0)]
         elif self.sweep.kind == "random":
-            drawn = draws(self.sweep.space, self.sweep.trials or 0, self.sweep.seed)
-            found = [self._point(values) for values in drawn]
+            value_sets = draws(self.sweep.space, self.sweep.trials or 0, self.sweep.seed)
+            points = [self._point(values) for values in value_sets]
         else:
-            found = [self._point(values) for values in grid(self.sweep.space)]
-        return {point.name: point for point in found}
+            points = [self._point(values) for values in grid(self.sweep.space)]
+        return {point.name: point for point in points}
 
     @property
     def levels(self) -> list[float]:
@@ -172,88 +172,86 @@ class Plan:
 
     @property
     def search(self) -> dict[str, Any]:
-        """What decides the values that an adaptive sweep asks for."""
+        """Settings that decide the values which an adaptive sweep proposes."""
         keys = ("space", "seed", "metric", "direction", "startup", "parallel", "overrides")
         return self.sweep.model_dump(include=set(keys), exclude_none=True)
 
-    def known(self, point: Point) -> list[Point]:
-        """Trials that a trial of an adaptive sweep learns from.
+    def earlier_trials(self, point: Point) -> list[Point]:
+        """Return the trials from whose results a trial of an adaptive sweep learns.
 
-        They are all that are certain to be finished while `parallel` trials run at once,
-        so that the values asked for do not depend on which one happens to end first.
+        These are all that are certain to be finished while `parallel` trials run at once,
+        so that the proposed values do not depend on which trial happens to end first.
         """
         if point.slot is None:
             return []
         return list(self.points.values())[: max(0, point.slot + 1 - self.sweep.parallel)]
 
     def _point(self, values: dict[str, Value], slot: int | None = None) -> Point:
+        """Make the point at some values of the axes, or the trial of a number."""
         keys = {**self.sweep.overrides, **(changes(self.sweep.space, values) if values else {})}
-        config = self._checked(keys, values)
+        config = self._point_config(keys, values)
+        # All that can change the result: points with the same content have the same name.
         content = {
             "model": self.sweep.model,
             "split": self.sweep.split,
             "reference": self.sweep.reference,
             "levels": self.levels,
             "data": self._data,
-            "config": decisive(config),
+            "config": decisive_settings(config),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
-        return Point(hash_of(content)[:NAME_LENGTH], values, keys, config, slot)
+        # 12 hexadecimal digits: among 1e5 points, two names agree by chance once in 5e4 sweeps.
+        return Point(hash_of(content)[:12], values, keys, config, slot)
 
-    def _checked(self, keys: Mapping[str, Value], values: Mapping[str, Value]) -> dict[str, Any]:
-        """The stage's groups with some keys set, or an error that names file and point."""
-        where = config_dir() / "sweep" / f"{self.name}.yaml"
+    def _point_config(
+        self, keys: Mapping[str, Value], values: Mapping[str, Value]
+    ) -> dict[str, Any]:
+        """Return the groups of a point with some keys set; SweepError names file and point."""
+        path = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
-            tree = with_values(self.tree, keys)
-            whole = checked(tree).model_dump()
+            config = validate_tree(with_values(self.tree, keys)).model_dump()
         except (SweepError, ConfigError) as error:
-            at = f" (point {', '.join(f'{k}={v}' for k, v in values.items())})" if values else ""
-            raise SweepError(f"{where}: {str(error).splitlines()[0]}{at}") from None
-        return stage_tree(self.sweep.reads, whole)
+            settings = ", ".join(f"{name}={value}" for name, value in values.items())
+            point = f" (point {settings})" if values else ""
+            raise SweepError(f"{path}: {str(error).splitlines()[0]}{point}") from None
+        return stage_tree(self.sweep.reads, config)
 
     @cached_property
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
-        return stage_tree(SIMULATION if self.sweep.dataset else OF_STATES, self._base)
+        config = validate_tree(self.tree).model_dump()
+        return stage_tree(SIMULATION if self.sweep.dataset else STATE_GROUPS, config)
 
-    @cached_property
-    def _base(self) -> dict[str, Any]:
-        return checked(self.tree).model_dump()
-
-    def _check_range(self) -> None:
-        """Refuse a space with a corner that the configuration does not allow."""
-        ends = [
-            {name: option}
-            for name, axis in self.sweep.space.items()
-            for option in axis.options or [int(end) if axis.integer else end for end in axis.ends]
-        ]
-        for values in ends:
-            (name,) = values
-            keys = self.sweep.space[name].changes(name, values[name])
-            self._checked({**self.sweep.overrides, **keys}, values)
+    def _check_ends(self) -> None:
+        """Refuse a space with an option or an end of a range that the configuration refuses."""
+        for name, axis in self.sweep.space.items():
+            ends = [] if axis.options else [int(e) if axis.integer else e for e in axis.ends]
+            for value in axis.options or ends:
+                keys = {**self.sweep.overrides, **axis.changes(name, value)}
+                self._point_config(keys, {name: value})
 
 
-def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
+def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     """Read a sweep and its dataset's configuration.
 
     Parameters
     ----------
     name : str
-        A file of `config/sweep`.
-    given : sequence of str
-        Hydra overrides of the whole workflow, the preset among them.
+        File of `config/sweep`, without its ending.
+    overrides : sequence of str
+        Hydra overrides of the whole workflow, with the preset.
 
     Raises
     ------
     ConfigError, SweepError
-        Name file and key.
+        If a file is wrong; the message names file and key.
     """
     sweep = load_sweep(name)
-    chosen = (*sweep.choice, *overrides_for(given, sweep.choice))
-    return Plan(name, sweep, tuple(given), compose(chosen))
+    tree = compose((*sweep.choice, *overrides_for(overrides, sweep.choice)))
+    return Plan(name, sweep, tree)
 
 
 def hash_of(tree: object) -> str:
-    """Hash of a tree in its canonical JSON."""
+    """Return the SHA-256 of a tree as JSON with sorted keys and without spaces."""
     canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The paper's published tables as data, and tables of ours in the same shape."""
+"""The paper's published tables as data, and tables of measured errors in the same shape."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from psfdae_paper.configuration.methods import registered
 
 
 def paper_rows() -> dict[str, str]:
-    """Rows of the paper's tables and our name of the method."""
-    return {kind.look.paper[0]: kind.name for kind in registered() if kind.look.paper}
+    """Return the names of methods here by their names in the paper's tables."""
+    return {m.look.paper[0]: m.name for m in registered() if m.look.paper}
 
 
 def published(table: str) -> pd.DataFrame:
-    """A published table: `psf`, `alignment` or `correlation`."""
+    """Read a published table: `psf`, `alignment` or `correlation`."""
     with resources.files(__package__).joinpath(f"tables_{table}.csv").open() as file:
         return pd.read_csv(file)
 
 
 def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFrame:
-    """One table of the paper: its rows as published and ours for each reference.
+    """Return one table of the paper: its rows as published, and measured ones by reference.
 
     Parameters
     ----------
@@ -34,11 +34,11 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     -------
     DataFrame
         Columns source (paper or psfdae), reference, method, one per noise level.
-        The paper has no rows for datasets that it does not tabulate. Our methods say in brackets
-        what they are given beside the image; of the paper's that is not known.
+        The paper has no rows for datasets that it does not tabulate. Methods of psfdae have in
+        brackets what they are given beside the image; for the paper's that is unknown.
     """
-    labels = {kind.name: kind.look.paper[1] for kind in registered() if kind.look.paper}
-    ours = metrics[
+    labels = {m.name: m.look.paper[1] for m in registered() if m.look.paper}
+    measured = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
         & (metrics.split == "random")
@@ -49,24 +49,25 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         source="paper", reference="as published"
     )
     paper["method"] = paper["method"].map(paper_rows())
-    both = pd.concat([paper, ours], ignore_index=True)
-    both["order"] = both["method"].map({method: i for i, method in enumerate(labels)})
-    wide = both.pivot(
+    # One row per source, reference and method, in the order of the configuration.
+    rows = pd.concat([paper, measured], ignore_index=True)
+    rows["order"] = rows["method"].map({method: i for i, method in enumerate(labels)})
+    table = rows.pivot(
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
-    wide = wide.reset_index().drop(columns="order")
-    given = wide["method"].map({kind.name: str(kind.needs) for kind in registered()})
-    wide["method"] = wide["method"].map(labels) + given.where(wide["source"] == "psfdae", "")
-    wide.columns = [f"{c:g}" if isinstance(c, float) else c for c in wide.columns]
-    return wide
+    table = table.reset_index().drop(columns="order")
+    inputs = table["method"].map({m.name: str(m.needs) for m in registered()})
+    table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
+    table.columns = [f"{c:g}" if isinstance(c, float) else c for c in table.columns]
+    return table
 
 
 def as_markdown(table: pd.DataFrame, dataset: str, metric: str) -> str:
-    """A paper-shaped table as Markdown, errors in scientific notation."""
+    """Return a table of `paper_table` as Markdown, MSE in scientific notation."""
     digits = ".4e" if metric == "mse" else ".4f"
-    shown = table.copy()
-    for column in shown.columns[3:]:
-        shown[column] = shown[column].map(lambda value: format(value, digits))
-    shown.columns = [*shown.columns[:3], *(f"λ = {c}" for c in shown.columns[3:])]
-    body = shown.to_markdown(index=False, disable_numparse=True)
+    formatted = table.copy()
+    for column in formatted.columns[3:]:
+        formatted[column] = formatted[column].map(lambda value: format(value, digits))
+    formatted.columns = [*formatted.columns[:3], *(f"λ = {c}" for c in formatted.columns[3:])]
+    body = formatted.to_markdown(index=False, disable_numparse=True)
     return f"{metric.upper()} of {dataset}, split random\n\n{body}\n"
