@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 from psfdae.bright_stars import BrightStars
 from psfdae.field_law import (
     MARGIN_PX,
-    Asked,
     FieldLaw,
     FieldSettings,
-    parts_of,
+    FieldStamps,
+    StarPosterior,
+    batches_of,
+    node_step,
     phase_of,
     phases_of,
-    step_of,
 )
 from psfdae.field_psf import FieldFit, FieldModel, fit_field, refit_field
 from psfdae.method import (
@@ -116,7 +117,7 @@ class FieldMixture(FieldLaw, Method):
         used = bright.of(fit.good)
         terms = fit.model.terms(used.place)
         usual = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
-        step = step_of(float(measure_shapes(usual).fwhm_px[0]), field.step_px)
+        step = node_step(float(measure_shapes(usual).fwhm_px[0]), field.step_px)
         offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field, step)
         return cls(
             coefficients=fit.model.coefficients.astype(np.float32),
@@ -264,7 +265,7 @@ class FieldMixture(FieldLaw, Method):
 
     def free_flux(self) -> Self:
         """The form that finds flux and sky."""
-        return replace(self, free=True)
+        return replace(self, measures_flux=True)
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
         """The field's PSFs (n, m, m) at positions, as `FieldModel.images` draws them.
@@ -326,11 +327,12 @@ class FieldMixture(FieldLaw, Method):
             If a pixel is not finite.
         """
         count, pixels = len(noisy), noisy[0].size
-        even = np.full(count, 1.0 / pixels)
-        known = None if self.free else np.ones(count)
-        noise = np.sqrt(self.noise.variance(even, np.asarray(level)))
-        sky = None if self.free else np.zeros(count)
-        return self.measure(noisy, noise, position, flux=known, sky=sky)
+        # A star's photons count as if they were spread evenly over the stamp.
+        even_star = np.full(count, 1.0 / pixels)
+        noise = np.sqrt(self.noise.variance(even_star, np.asarray(level)))
+        flux = None if self.measures_flux else np.ones(count)
+        sky = None if self.measures_flux else np.zeros(count)
+        return self.measure(noisy, noise, position, flux=flux, sky=sky)
 
     def measure(
         self,
@@ -376,42 +378,54 @@ class FieldMixture(FieldLaw, Method):
             raise ValueError("stamps must be finite")
         unknown = np.full(count, np.nan)
         flux, sky = (unknown if a is None else a for a in (flux, sky))
+        # Centres of the list in the coordinates of the field's centres.
         listed = np.full((count, 2), np.nan) if centre is None else centre
         if len(self.listed) and np.isfinite(self.listed).all():
             listed = listed + self.listed[0]
-        terms, positioned = self._terms(position, count)
-        level = np.nan_to_num(sky)
-        stars = Asked(
-            *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
-            *(self._prior(listed), None, flux, np.isfinite(sky)),
-            np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
-            np.full(count, self.off_node_px),
+        terms, position_known = self._terms(position, count)
+        sky_level = np.nan_to_num(sky)
+        stars = FieldStamps(
+            images=images - sky_level[:, None],
+            noise=np.broadcast_to(noise, count),
+            terms=terms,
+            position_known=True,
+            log_prior=self._prior(listed),
+            centre=None,
+            flux=flux,
+            sky_known=np.isfinite(sky),
+            unit_per_electron=np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
+            cell_sigma_px=np.full(count, self.cell_sigma_px),
         )
-        known = np.isfinite(listed).all(axis=1) & fixed
-        found = np.empty((count, 6 + 2 * images.shape[1]))
-        covariance = np.empty((count, 4, 4))
-        for centred, located in np.ndindex(2, 2):
-            for part in parts_of(np.flatnonzero((known == centred) & (positioned == located))):
-                some = stars.of(part)._replace(positioned=bool(located))
-                if centred:
-                    at = listed[part]
-                    near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)
-                    alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
-                    some = some._replace(centre=at, prior=alone, off_node=np.zeros(len(part)))
-                found[part], covariance[part] = self._restored(some, *self._start(some))
-        values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
+        # Stars of known and unknown centre, and of known and unknown position, one after the other.
+        centre_known = np.isfinite(listed).all(axis=1) & fixed
+        posterior = StarPosterior.empty(count, images.shape[1])
+        for has_centre, has_position in np.ndindex(2, 2):
+            rows = np.flatnonzero((centre_known == has_centre) & (position_known == has_position))
+            for batch in batches_of(rows):
+                selected = stars.select(batch)._replace(position_known=bool(has_position))
+                if has_centre:
+                    # One node, the nearest one, which is taken to be at exactly this centre.
+                    known = listed[batch]
+                    nearest = np.square(self.places - known[:, None]).sum(axis=-1).argmin(axis=1)
+                    is_nearest = np.arange(len(self.places)) == nearest[:, None]
+                    selected = selected._replace(
+                        centre=known,
+                        log_prior=np.where(is_nearest, 0.0, -np.inf),
+                        cell_sigma_px=np.zeros(len(batch)),
+                    )
+                posterior.set(batch, self._posterior(selected))
         measured = Measured(
-            flux=values[:, 1],
-            background=values[:, 2] + level,
-            centre=values[:, 3:5] - self._list_offset,
-            covariance=covariance,
+            flux=posterior.measurement[:, 0],
+            background=posterior.measurement[:, 1] + sky_level,
+            centre=posterior.measurement[:, 2:] - self._list_offset,
+            covariance=posterior.covariance,
         )
         return Estimate(
-            psf=psf.reshape(stamps.shape).astype(np.float32),
-            sigma=sigma.reshape(stamps.shape).astype(np.float32),
-            evidence=values[:, 0],
+            psf=posterior.psf.reshape(stamps.shape).astype(np.float32),
+            sigma=posterior.psf_sigma.reshape(stamps.shape).astype(np.float32),
+            evidence=posterior.log_evidence,
             measured=measured,
-            outlier_score=values[:, 5],
+            outlier_score=posterior.mahalanobis2,
         )
 
 
