@@ -331,7 +331,7 @@ class FindsFlux(FreesFlux, Protocol):
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, object]:
         """That flux of images (n, d, d), shape (n,), and which parts of its law are near them.
 
-        `estimate` and `outlier_score` take the latter as `near` and look at no other part.
+        `estimate` and `outlier_score` take the latter as `near_clusters` and look at no other.
         """
 
 

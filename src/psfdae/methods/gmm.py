@@ -271,10 +271,12 @@ class GaussianMixture(MixtureLaw, Method):
         arrays, said = super().pack(stamp_px, noise)
         if len(self.cross) or self.whitening.size:
             return arrays, said
-        kept, width = [], self.free_flux()._leading(noise**2)
+        kept, width = [], self.free_flux()._distinct_count(noise**2)
         for cluster in self._clusters:
-            _, size, axis = np.linalg.svd(cluster.own[:, :width], full_matrices=False)
-            kept.append((size[:, None] * axis)[cluster.scale * size**2 > FLAT_VARIANCE * noise**2])
+            _, size, axis = np.linalg.svd(cluster.residuals[:, :width], full_matrices=False)
+            kept.append(
+                (size[:, None] * axis)[cluster.residual_factor * size**2 > FLAT_VARIANCE * noise**2]
+            )
         arrays["rows"] = np.array([len(rows) for rows in kept])
         arrays["deviation"] = np.vstack(kept).astype(np.float16)
         arrays["deviation_center"] = np.empty((len(arrays["deviation"]), 0))
@@ -301,61 +303,63 @@ class GaussianMixture(MixtureLaw, Method):
         yield "shrinkage", "a number above 0", self.shrinkage.shape == (1,) and self.shrinkage > 0
 
     def outlier_score(
-        self, noisy: np.ndarray, level: np.ndarray, near: np.ndarray | None = None
+        self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
     ) -> np.ndarray:
-        """From the evidence of the leading `OUTLIER_COORDINATES`; `near` as for `estimate`.
+        """Return the score by the leading `OUTLIER_COORDINATES` (eq. 12 of docs/mixture.md).
 
         The others hold noise, which is an estimate: their χ² would say that it is wrong.
         """
-        some = self._telling
+        law = self._outlier_law
         s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
-        usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
+        usual = np.log(2 * np.pi * (law._total_variance + s[:, None])).sum(axis=1)
         evidence = np.empty(len(noisy))
-        for part, seen in some._parts(noisy, level):
-            _, evidence[part] = some._weights(seen, None if near is None else near[part])
+        for part, batch in law._batches(noisy, level):
+            near = None if near_clusters is None else near_clusters[part]
+            _, evidence[part] = law._weights(batch, near)
         return np.asarray(-2.0 * evidence - usual)
 
     def free_flux(self) -> Self:
         """The law of images whose flux and sky are estimates."""
-        return replace(self, loose=FLUX_SIGMA)
+        return replace(self, flux_sigma=FLUX_SIGMA)
 
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flux of the star in that by which its image was divided, and clusters that are near.
 
         The flux is 1 where fluxes are known.
         """
-        flux, near = np.ones(len(noisy)), np.zeros((len(noisy), len(self.count)), bool)
-        for part, seen in self._parts(noisy, level):
-            weight, _ = self._weights(seen, None)
-            near[part] = weight > 0
-            if self.loose:
-                flux[part] = self._flux(seen, weight)
-        return flux, near
+        flux = np.ones(len(noisy))
+        is_near = np.zeros((len(noisy), len(self.count)), bool)
+        for part, batch in self._batches(noisy, level):
+            weight, _ = self._weights(batch, None)
+            is_near[part] = weight > 0
+            if self.flux_sigma:
+                flux[part] = self._flux(batch, weight)
+        return flux, is_near
 
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
         """PSFs, float32; raises as `estimate`."""
-        return self._estimate(noisy, level, position, sure=False).psf
+        return self._estimate(noisy, level, position, with_sigma=False).psf
 
     def estimate(
         self,
         noisy: np.ndarray,
         level: float | np.ndarray,
         position: np.ndarray | None = None,
-        near: np.ndarray | None = None,
+        near_clusters: np.ndarray | None = None,
     ) -> Estimate:
         """PSFs, float32, their standard deviation, and the evidence of every image.
 
-        Only clusters count that are `near` an image, shape (n, K) of bool, by default those that
-        the common covariance finds.
+        Only `near_clusters` of an image are looked at, shape (n, K) of bool, by default those that
+        are nearest by the common covariance.
 
         Raises
         ------
         ValueError
             If a pixel is not finite.
         """
-        return self._estimate(noisy, level, position, sure=True, near=near)
+        return self._estimate(noisy, level, position, with_sigma=True, near_clusters=near_clusters)
 
 
 def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
