@@ -271,8 +271,8 @@ class Packing:
 class MeasuresStars(Protocol):
     """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
 
-    def beyond(self, position: np.ndarray) -> np.ndarray:
-        """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
 
     def measure(
         self,

@@ -710,7 +710,7 @@ class Engine:
         flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
         raise_flag(flags, StarFlag.NO_FLUX, lost)
         raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
-        raise_flag(flags, StarFlag.BEYOND, method.beyond(place) & ~lost)
+        raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~lost)
         sky = start + own.background
         unit = np.where(lost, 1.0, flux)[:, None, None]
         images = (data - own.background[:, None, None]) / unit
