@@ -17,7 +17,7 @@ from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import MOST_PX2, OUTLIER_MODES, step_of
+from psfdae.field_law import MAX_NODE_AREA_PX2, OUTLIER_AXES, node_step
 from psfdae.field_psf import fit_field
 from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
@@ -221,8 +221,8 @@ def test_outlier_score_has_the_law_of_chi2_and_tells_blends(chosen, snr):
     faint = Faint(400, snr)
     here, nowhere = faint.measured(field), field.measure(faint.stamps, faint.sigma)
     for found in (here, nowhere):
-        assert np.median(found.outlier_score) == pytest.approx(OUTLIER_MODES, rel=0.25)
-        assert (found.outlier_score < OUTLIER_MODES + 8 * np.sqrt(2 * OUTLIER_MODES)).mean() > 0.98
+        assert np.median(found.outlier_score) == pytest.approx(OUTLIER_AXES, rel=0.25)
+        assert (found.outlier_score < OUTLIER_AXES + 8 * np.sqrt(2 * OUTLIER_AXES)).mean() > 0.98
     blend = 0.8 * faint.psf + 0.2 * np.roll(faint.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + faint.noise / 1000), faint.sigma, faint.position)
     if snr == 50:
@@ -255,7 +255,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
 def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monkeypatch):
     faint = Faint(40, snr)
     found = faint.measured(field)
-    monkeypatch.setattr("psfdae.field_law.LEAST_NODES", round(MOST_PX2 * 16))
+    monkeypatch.setattr("psfdae.field_law.MIN_NODES", round(MAX_NODE_AREA_PX2 * 16))
     every = faint.measured(field)
     assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
     assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
@@ -277,8 +277,10 @@ def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, s
         near, means, faint.stamps, found.psf, found.sigma, strict=True
     ):
         node, star = field._nodes[k], (stamp.ravel() - 3) / 1000
-        inverse = np.linalg.inv(node.rows.T @ node.rows + np.diag(node.diagonal + s))
-        restored = star - s * inverse @ (star - mean / mean.sum() - node.mean[-1])
+        inverse = np.linalg.inv(
+            node.residual_modes.T @ node.residual_modes + np.diag(node.diagonal + s)
+        )
+        restored = star - s * inverse @ (star - mean / mean.sum() - node.images[-1])
         assert psf.ravel() == pytest.approx(restored / restored.sum(), abs=1e-6)
         variance = s - s**2 * inverse.diagonal()
         assert np.square(sigma).sum() == pytest.approx(
@@ -369,9 +371,9 @@ def test_list_of_the_training_is_known(field):
 
 
 def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, stars, monkeypatch):
-    assert [step_of(fwhm, 0.25) for fwhm in (1.1, 1.7, 2.5)] == [1 / 8, 1 / 5, 0.25]
+    assert [node_step(fwhm, 0.25) for fwhm in (1.1, 1.7, 2.5)] == [1 / 8, 1 / 5, 0.25]
     assert field.step_px == 0.25
-    monkeypatch.setattr("psfdae.field_law.STEP_FWHM", 0.2 / size(stars.wide).mean())
+    monkeypatch.setattr("psfdae.field_law.MAX_STEP_FWHM", 0.2 / size(stars.wide).mean())
     finer = fitted(stars)
     assert finer.step_px == pytest.approx(0.18, abs=0.021)
     assert np.diff(np.unique(finer.places)) == pytest.approx(finer.step_px)

@@ -115,7 +115,7 @@ def dense(mixture, noisy, level, position):
         image = mixture.mean[k] @ axes.T
         other = mixture.mean_reference[k] if len(mixture.cross) else image
         star = [image - 1 / pixels, other if len(mixture.cross) else image - 1 / pixels]
-        free = mixture.loose * np.concatenate([star[0], np.zeros(told), star[1]])
+        free = mixture.flux_sigma * np.concatenate([star[0], np.zeros(told), star[1]])
         covariance += np.outer(free, free)
         seen, hidden = slice(z.shape[1]), slice(z.shape[1], None)
         observed = covariance[seen, seen] + np.diag(noise)
@@ -169,7 +169,10 @@ def test_a_flux_that_is_an_estimate_is_found(same):
     truth = images if same else wider
     errors = [found.psf / found.flux[:, None, None], mixture.predict(noisy, LEVEL / 5)] - truth
     assert np.square(errors[0]).mean() < 0.9 * np.square(errors[1]).mean()
-    assert free.free_flux().loose == free.loose and mixture.estimate(noisy, LEVEL / 5).flux is None
+    assert (
+        free.free_flux().flux_sigma == free.flux_sigma
+        and mixture.estimate(noisy, LEVEL / 5).flux is None
+    )
 
 
 def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
@@ -179,8 +182,8 @@ def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
     plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
-    assert mixture._total == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
-    assert (mixture.free_flux()._total > 0.9 * moved - 1e-3 * plain.max()).all()
+    assert mixture._total_variance == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
+    assert (mixture.free_flux()._total_variance > 0.9 * moved - 1e-3 * plain.max()).all()
     assert (moved > 1.2 * plain).any()
 
 
@@ -243,8 +246,8 @@ def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free
     noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(1.0 / D**2, LEVEL)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
-    row = mixture.loose * mixture._contrast[0, :10].astype(float)
-    usual = np.diag(mixture._total[:10] + s)
+    row = mixture.flux_sigma * mixture._contrast[0, :10].astype(float)
+    usual = np.diag(mixture._total_variance[:10] + s)
     covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
     wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
     wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]

@@ -17,17 +17,14 @@ LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
 """Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
 pixel of a star that is made fainter has B − DEFECT √B at most."""
 
-LEAST_FLUX = 1e-300
-"""In any unit. A star that is seen to have less is fainter than any other."""
-
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
-    """Instrumental magnitudes of fluxes in counts; that of `LEAST_FLUX` for what is below."""
-    return np.asarray(-2.5 * np.log10(np.maximum(flux, LEAST_FLUX)))
+    """Return instrumental magnitudes of fluxes in counts, which are taken to be positive."""
+    return np.asarray(-2.5 * np.log10(np.maximum(flux, 1e-300)))
 
 
 def places(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """x, y, magnitude and colour of stars, on which the PSF may depend, shape (n, 4)."""
+    """Return x, y, magnitude and colour of stars, on which the PSF may depend, shape (n, 4)."""
     return np.column_stack([position, magnitude(flux), colour])
 
 
@@ -84,51 +81,52 @@ class BrightStars:
 
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
-        """Several sets, one after the other, with margins alike."""
+        """Return several sets with the same margin as one."""
         return cls(*(np.concatenate([getattr(s, f.name) for s in several]) for f in fields(cls)))
 
     def __len__(self) -> int:
         return len(self.wide)
 
-    def of(self, chosen: np.ndarray) -> BrightStars:
-        """A part of the stars, by a mask or by indices."""
-        return BrightStars(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    def of(self, selected: np.ndarray) -> BrightStars:
+        """Return some of the stars, by a mask or by indices."""
+        return BrightStars(*(getattr(self, f.name)[selected] for f in fields(self)))
 
     @property
     def place(self) -> np.ndarray:
         """x, y, magnitude and colour, (n, 4); an unknown colour is the median of the others."""
-        known = np.isfinite(self.colour)
-        usual = np.median(self.colour[known]) if known.any() else np.nan
-        return places(self.position, self.flux, np.where(known, self.colour, usual))
+        has_colour = np.isfinite(self.colour)
+        median = np.median(self.colour[has_colour]) if has_colour.any() else np.nan
+        return places(self.position, self.flux, np.where(has_colour, self.colour, median))
 
     def area(self) -> np.ndarray:
-        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
+        """Return the noise-equivalent area A = (F / (σ S/N))² of each star in pixels, (n,)."""
         return np.asarray((self.flux / (self.noise * self.snr)) ** 2)
 
     def aligned(self) -> np.ndarray:
-        """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
+        """Return the stars with flux 1, moved to the common centre (s//2, s//2), (n, s, s)."""
         return np.asarray(moved(self.wide, -self.centre) / self.flux[:, None, None])
 
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
-        """Photons per pixel whose Poisson noise is the sky's, read noise included.
+        """Return the photons per pixel whose Poisson noise is that of the sky and of reading out.
 
-        From the electrons per count; `otherwise` where they are unknown. At most `MOST_SKY`, beside
-        which no star has photons that count.
+        `gain` is in electrons per count; `otherwise` is the result where it is unknown. It is at
+        most `MOST_SKY`, beside which the photons of no star matter.
         """
         if gain is None:
             return otherwise
         return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
 
     def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (n, side, side) with the brightest pixel at index (side//2, side//2).
+        """Return frames (n, side, side) with the brightest pixel at index (side//2, side//2).
 
-        The second array says which pixels were measured. Those that `wide` does not show are 0.
+        The second array is True for pixels that were measured. Pixels outside of `wide` are 0.
         """
+        # A margin of NaN, out of which each star's frame is cut.
         wide = np.pad(self.wide, ((0, 0), (side, side), (side, side)), constant_values=np.nan)
         start = side + self.wide.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
         images = wide[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
-        seen = np.isfinite(images)
+        is_inside = np.isfinite(images)
         bad = np.pad(self.bad, ((0, 0), (side, side), (side, side)))
         bad = bad[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
-        return np.where(seen, images, 0.0).astype(np.float64), seen & ~bad
+        return np.where(is_inside, images, 0.0).astype(np.float64), is_inside & ~bad

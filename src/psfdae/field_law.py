@@ -1,28 +1,20 @@
-"""The law of stars of an image: a mixture over sub-pixel centres about a model of the field.
+"""Posterior of a star, given a model of the PSF over the field: a mixture over sub-pixel centres.
 
-Bright stars give the PSF at every place (`psfdae.field_psf`) and, in what this model
-leaves of them, how real stars differ from it. A star's centre c in its stamp is a node of a
-square lattice, finer than a pixel. In each node a stamp x of a star of flux F on a sky b is
+Bright stars give the PSF at every place of the field (`psfdae.field_psf`). What this model leaves
+of them gives the covariance by which real stars differ from it. The centre of a star in its stamp
+is a node of a square lattice that is finer than a pixel. In each node, a stamp x of a star of flux
+F is
 
-    x = F (a m + u·∂m + e) + b + noise,   e ~ N(0, C),   u ~ N(0, step²/12),
+    x = F (a m + Lᵀ t + e) + noise,   e ~ N(0, C),   t ~ N(0, diag(σ²)),
 
-with the field's PSF m at this place and centre, moved by the part u of a step, and the
-covariance C of the training stars' residuals, moved to c. It is of low rank beside a
-diagonal, and without flux. F is a guess, the factor a is about 1, and nothing is known of b,
-so that sky and centre are rows L beside the residuals:
+with the field's PSF m (sum 1) at this place and centre, the factor a ~ N(1, 0.2²) of a guessed
+flux, and the three nuisance parameters t: sky over flux, row and column of the centre within the
+cell of its node. The rows of L are the derivatives of the image with respect to these. C is the
+covariance of the training stars' residuals at this centre, of low rank beside a diagonal.
 
-    S = C + s + LᵀL,   s = (noise/F)².
-
-The eigenvectors of C do not depend on the noise. Along the leading ones of a node, C + s is
-diagonal for every star, and beyond them C is taken for even; sky and centre are three unknowns
-more (Woodbury's identity). a is one unknown of generalised least squares (Aitken 1935, Proc. R.
-Soc. Edinb. 55, 42), and the star is what S leaves after noise and sky. Nodes count by their
-marginal likelihood and by what is known of the centre; of faint stars, every second one along both
-axes is enough. The weighted sum over the nodes is divided by its sum in the end: a faint star's
-flux differs between nodes, and so does what it is divided by.
-
-Where no position is known, m is the mean over the field and its variation is in C. A centre
-that is known is one node at exactly that place.
+Equations are numbered as on the page docs/field_model.md, which derives them. Where no position is
+known, m is the mean over the field, and its variation over the field is part of C. A centre that
+is known is one node at exactly that place.
 """
 
 from __future__ import annotations
@@ -42,48 +34,26 @@ from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
 
 MARGIN_PX = 2
-"""Pixels around a stamp in which the field and the residuals are known, too."""
+"""Width in pixels of the margin around a stamp in which field and residuals are known as well."""
 
-KNOWN_FLUX_SIGMA = 1e-6
-"""Standard deviation of a flux that is given, over itself."""
+MIN_NODES = 9
+"""Number of nodes per star of which the likelihood is computed at least."""
 
-FLUX_ROUNDS = 2
-"""Times that the flux, and with it the noise over the flux, is estimated anew."""
+MAX_NODE_AREA_PX2 = 3.0
+"""Area in px² of the nodes of which the likelihood of one star is computed at most."""
 
-LEAST_SNR = 1.5
-"""Least S/N that a star is taken to have."""
-
-LEAST_NODES, MOST_PX2 = 9, 3.0
-"""Nodes of which the likelihood is computed, at least, and the area that they have at most; a
-matched filter finds them."""
-
-STEP_FWHM = 0.125
-"""Largest step between two nodes over the FWHM: in between, stars change linearly."""
-
-FAR, MATCHED_SNR = 8.0, 30.0
-"""Nodes whose likelihood by the filter is further below the best than this, in ln, are looked at
-only if they are among the `LEAST_NODES` best: most would have less than `LEAST_WEIGHT`. The filter
-does not know the shape of bright stars, so that they count as stars of this S/N."""
-
-COARSE_SNR = 10.0
-"""S/N below which a star is looked at in every second node along both axes: over twice a step of
-an eighth of the FWHM, what is not linear is 1 % of a star's peak, and the noise at S/N 10 is 20 %
-of it."""
-
-WRONG_LIST = 0.05
-"""Probability that the list, or its place, is not what it was for the training stars."""
+MAX_STEP_FWHM = 0.125
+"""Largest distance of two nodes over the FWHM: in between, stars change linearly with it."""
 
 STARS_AT_ONCE = 1024
-"""Stars that are restored together."""
+"""Number of stars that are restored together at most, which limits the memory."""
 
-OUTLIER_MODES = 12
-"""Leading axes that tell outliers, as the others tell the training stars from all others."""
-
-VARIANCE_STEP = 0.1
-"""Step in ln of the noise variance between stars whose pixels are equally sure."""
+OUTLIER_AXES = 12
+"""Number of leading axes of the residual covariance that enter the outlier score: the others do
+not distinguish outliers from training stars."""
 
 AXES = 96
-"""Of the covariance of the residuals in a node."""
+"""Number of principal axes of the residual covariance that are kept at each node, at least."""
 
 
 class FieldSettings(Group):
@@ -118,196 +88,343 @@ class FieldSettings(Group):
 
 
 class Node(NamedTuple):
-    """A centre, and what a star looks like there.
+    """Node of the lattice of centres: a centre, and what stars look like that stand there.
 
     Attributes
     ----------
-    mean : ndarray, shape (K + 1, P)
-        Images of the field's terms; the mean residual.
-    total : ndarray, shape (K,)
-        Sums of the former.
-    rows : ndarray, shape (r, P)
-        Of C.
-    spread : ndarray, shape (K, P)
-        Rows that the variation over the field adds where the position is not known.
-    latent : ndarray, shape (3, P)
-        Change of a star of flux 1 with the sky, and with row and column of its centre.
+    images : ndarray, shape (K + 1, P)
+        Image of each of the field's K terms; the mean residual of the training stars.
+    image_sums : ndarray, shape (K,)
+        Sum of each term's image.
+    residual_modes : ndarray, shape (r, P)
+        Rows R of the residual covariance C = RᵀR + diag(`diagonal`).
+    field_modes : ndarray, shape (K, P)
+        Rows that the variation over the field adds to R where a star's position is unknown.
+    derivatives : ndarray, shape (3, P)
+        Rows of L: change of a star of flux 1 with the sky, and with row and column of its centre.
     diagonal : ndarray, shape (P,)
+        Variance of the residuals beyond their modes.
     """
 
-    mean: np.ndarray
-    total: np.ndarray
-    rows: np.ndarray
-    spread: np.ndarray
-    latent: np.ndarray
+    images: np.ndarray
+    image_sums: np.ndarray
+    residual_modes: np.ndarray
+    field_modes: np.ndarray
+    derivatives: np.ndarray
     diagonal: np.ndarray
 
 
-class Axes(NamedTuple):
-    """Leading axes of C in a node; beyond them, C is taken for even.
+class NodeAxes(NamedTuple):
+    """Principal axes of the residual covariance C in a node; beyond them, C is a multiple of 1.
+
+    With this, G = C + s is diagonal along the axes for stars of every noise variance s (eq. 6).
+    Noise variances, shape (n, 1), are those of a pixel of n stars of flux 1. `prior_sigma`, shape
+    (n, 3), is the standard deviation of the nuisance parameters before the star is measured.
 
     Attributes
     ----------
     basis : ndarray, shape (3 + m, P)
-        The node's `latent`; then the axes, orthonormal, by descending variance.
+        The derivatives of the node; then the m axes V, orthonormal, by descending variance.
     variance : ndarray, shape (m,)
-        Along the axes.
-    rest : float
-        Mean variance beyond them.
-    mean, latent : ndarray, shape (K + 1, m) and (3, m)
-        Those of the node along the axes.
-    products : ndarray, shape (m + 1, 9)
-        Of `latent` with each other along each axis, and beyond all.
+        Variance λ along each axis.
+    variance_beyond : float
+        Mean variance λ₀ per dimension beyond the axes.
+    images : ndarray, shape (K + 1, m)
+        Images of the node along the axes.
+    derivatives : ndarray, shape (3, m)
+        Derivatives of the node along the axes.
+    derivative_products : ndarray, shape (m + 1, 9)
+        Products of the derivatives with each other, along each axis and beyond all.
     """
 
     basis: np.ndarray
     variance: np.ndarray
-    rest: float
-    mean: np.ndarray
-    latent: np.ndarray
-    products: np.ndarray
+    variance_beyond: float
+    images: np.ndarray
+    derivatives: np.ndarray
+    derivative_products: np.ndarray
 
-    def inverse(self, s: np.ndarray) -> np.ndarray:
-        """1/(C + s) along the axes and beyond them, (n, m + 1), for noise of variances s (n, 1)."""
-        return np.asarray(1.0 / (np.append(self.variance, self.rest) + s))
+    def inverse(self, noise_variance: np.ndarray) -> np.ndarray:
+        """Return G⁻¹ along the axes and, last, beyond them, shape (n, m + 1) (eq. 6)."""
+        return np.asarray(1.0 / (np.append(self.variance, self.variance_beyond) + noise_variance))
 
-    def noise_parts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Part s/(C + s) beyond the axes (n, 1), and by how much it differs along them (n, m)."""
-        part = s * self.inverse(s)
-        return part[:, -1:], part[:, :-1] - part[:, -1:]
+    def noise_fractions(self, noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the fraction s G⁻¹ of a residual that is noise (eq. 11).
 
-    def certainty(self, s: np.ndarray, width: np.ndarray) -> np.ndarray:
-        """Inverse covariance (n, 3, 3) of sky and centre, in their standard deviations (n, 3)."""
-        products = (self.inverse(s) @ self.products).reshape(-1, 3, 3)
-        return np.asarray(np.eye(3) + products * (width[:, :, None] * width[:, None]))
-
-    def leading(
-        self, along: np.ndarray, s: np.ndarray, width: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stars (n, m) along the `OUTLIER_MODES` leading axes alone, with noise of variances s.
-
-        Their χ², (n,); their products with sky, row and column in units of these numbers' standard
-        deviations (n, 3), (n, 3); what the axes add to the inverse covariance of these, (n, 3, 3).
+        The first array, (n, 1), is the fraction beyond the axes; the second one, (n, m), by how
+        much the fraction along each axis differs from it.
         """
-        along, scatter = along[:, :OUTLIER_MODES], self.variance[:OUTLIER_MODES] + s
-        latent = width[:, :, None] * self.latent[:, :OUTLIER_MODES]
-        scaled = latent / scatter[:, None]
-        pull = np.einsum("nij,nj->ni", scaled, along)
-        return (along**2 / scatter).sum(axis=1), pull, scaled @ latent.transpose(0, 2, 1)
+        fraction = noise_variance * self.inverse(noise_variance)
+        return fraction[:, -1:], fraction[:, :-1] - fraction[:, -1:]
 
-    def pixel_variance(self, s: np.ndarray, width: np.ndarray) -> np.ndarray:
-        """Variance (n, P) of a star without noise and sky, of known flux, once it is seen."""
-        beyond, along = self.noise_parts(s)
-        left = np.linalg.inv(self.certainty(s, width))
-        latent, vectors = self.basis[:3], self.basis[3:]
-        rows = ((self.latent * along[:, None]).reshape(-1, len(vectors)) @ vectors).reshape(
-            len(s), 3, -1
+    def nuisance_precision(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
+        """Return Λ = 1 + σ L G⁻¹ Lᵀ σ, the inverse covariance of t/σ, (n, 3, 3) (eq. 7)."""
+        products = self.inverse(noise_variance) @ self.derivative_products
+        products = products.reshape(-1, 3, 3)
+        return np.asarray(np.eye(3) + products * (prior_sigma[:, :, None] * prior_sigma[:, None]))
+
+    def leading_terms(
+        self, residual: np.ndarray, noise_variance: np.ndarray, prior_sigma: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what the `OUTLIER_AXES` leading axes alone contribute to a fit (eq. 14).
+
+        Parameters
+        ----------
+        residual : ndarray, shape (n, m)
+            Residuals r of stars along the axes.
+        noise_variance : ndarray, shape (n, 1)
+        prior_sigma : ndarray, shape (n, 3)
+
+        Returns
+        -------
+        chi2 : ndarray, shape (n,)
+            r G⁻¹ rᵀ.
+        gradient : ndarray, shape (n, 3)
+            σ L G⁻¹ rᵀ.
+        precision : ndarray, shape (n, 3, 3)
+            σ L G⁻¹ Lᵀ σ, their part of the inverse covariance of t/σ.
+        """
+        residual = residual[:, :OUTLIER_AXES]
+        total_variance = self.variance[:OUTLIER_AXES] + noise_variance
+        derivatives = prior_sigma[:, :, None] * self.derivatives[:, :OUTLIER_AXES]
+        weighted = derivatives / total_variance[:, None]
+        gradient = np.einsum("nij,nj->ni", weighted, residual)
+        chi2 = (residual**2 / total_variance).sum(axis=1)
+        return chi2, gradient, weighted @ derivatives.transpose(0, 2, 1)
+
+    def pixel_variance(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
+        """Return the posterior variance of a star's pixels if its flux is known (eq. 12).
+
+        Shape (n, P), of stars of flux 1 without noise and sky.
+        """
+        beyond, along = self.noise_fractions(noise_variance)
+        covariance = np.linalg.inv(self.nuisance_precision(noise_variance, prior_sigma))
+        derivatives, axes = self.basis[:3], self.basis[3:]
+        # σ L s G⁻¹: how the noise that is subtracted changes with the nuisance parameters.
+        rows = ((self.derivatives * along[:, None]).reshape(-1, len(axes)) @ axes).reshape(
+            len(noise_variance), 3, -1
         )
-        rows = (rows + beyond[:, None] * latent) * width[:, :, None]
-        pull = left @ rows
-        noise = s * (1.0 - beyond - along @ vectors**2) + (rows * pull).sum(axis=1)
-        noise += width[:, :1] ** 2 * left[:, :1, 0] - 2 * width[:, :1] * pull[:, 0]
-        return np.asarray(np.maximum(noise, 0.0))
+        rows = (rows + beyond[:, None] * derivatives) * prior_sigma[:, :, None]
+        pull = covariance @ rows
+        # diag(C − C G⁻¹ C) = s diag(1 − s G⁻¹); then what the nuisance parameters leave open. The
+        # sky itself is no part of the star: its row is σ L s G⁻¹ − σ_sky.
+        variance = noise_variance * (1.0 - beyond - along @ axes**2) + (rows * pull).sum(axis=1)
+        variance += (
+            prior_sigma[:, :1] ** 2 * covariance[:, :1, 0] - 2 * prior_sigma[:, :1] * pull[:, 0]
+        )
+        return np.asarray(np.maximum(variance, 0.0))
 
 
-def axes_of(node: Node, positioned: bool) -> Axes:
-    """Axes of a node, for stars whose position is known or is not.
+def principal_axes(node: Node, position_known: bool) -> NodeAxes:
+    """Return the principal axes of the residual covariance of a node (eq. 6).
 
-    They are those of C in the space of its rows and of the pixels with the largest diagonal
-    (Rayleigh and Ritz).
+    They are those of C within the space that its rows and the pixels of the largest diagonal span
+    (method of Rayleigh and Ritz), which needs no eigenvectors of P x P.
     """
-    rows = node.rows if positioned else np.vstack([node.rows, node.spread])
+    rows = node.residual_modes
+    if not position_known:
+        rows = np.vstack([rows, node.field_modes])
     pixels = len(node.diagonal)
-    kept = min(max(AXES, len(rows)), pixels)
-    large = np.argsort(-node.diagonal, kind="stable")[: kept - len(rows)]
+    axis_count = min(max(AXES, len(rows)), pixels)
+    # Orthonormal basis of the space.
+    large = np.argsort(-node.diagonal, kind="stable")[: axis_count - len(rows)]
     space = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
-    along = rows @ space
-    variance, turn = np.linalg.eigh((space.T * node.diagonal) @ space + along.T @ along)
+    # Eigenvectors of C in this space, and the mean variance that is left outside of it.
+    projected = rows @ space
+    variance, rotation = np.linalg.eigh((space.T * node.diagonal) @ space + projected.T @ projected)
     beyond = node.diagonal.sum() + np.square(rows).sum() - variance.sum()
-    basis = np.vstack([node.latent, (space @ turn[:, ::-1]).T])
-    mean, latent = node.mean @ basis[3:].T, node.latent @ basis[3:].T
-    even = node.latent @ node.latent.T - latent @ latent.T
-    each = (latent[:, None] * latent).reshape(9, -1).T
-    return Axes(
-        basis,
-        variance[::-1].copy(),
-        float(beyond / (pixels - kept)) if kept < pixels else 1.0,
-        mean,
-        latent,
-        np.vstack([each, even.ravel()]),
+    basis = np.vstack([node.derivatives, (space @ rotation[:, ::-1]).T])
+    # What every star needs along the axes: images, derivatives and the products of the latter.
+    images, derivatives = node.images @ basis[3:].T, node.derivatives @ basis[3:].T
+    products_beyond = node.derivatives @ node.derivatives.T - derivatives @ derivatives.T
+    products_along = (derivatives[:, None] * derivatives).reshape(9, -1).T
+    return NodeAxes(
+        basis=basis,
+        variance=variance[::-1].copy(),
+        variance_beyond=float(beyond / (pixels - axis_count)) if axis_count < pixels else 1.0,
+        images=images,
+        derivatives=derivatives,
+        derivative_products=np.vstack([products_along, products_beyond.ravel()]),
     )
 
 
+class FieldStamps(NamedTuple):
+    """Stamps of n stars, with what is known of each star; see `FieldMixture.measure`.
+
+    Attributes
+    ----------
+    images : ndarray, shape (n, P)
+        Stamps with the sky roughly subtracted, or exactly where `sky_known`.
+    noise : ndarray, shape (n,)
+        RMS of the noise of a pixel.
+    terms : ndarray, shape (n, K)
+        Terms of the field at the positions of the stars.
+    position_known : bool
+        The positions of all stars are known; otherwise that of none is.
+    log_prior : ndarray, shape (n, nodes)
+        ln of the probability of each node; −inf where no centre is.
+    centre : ndarray, shape (n, 2), or None
+        (row, column) from the middle pixel if the centres are known.
+    flux : ndarray, shape (n,)
+        Known fluxes; NaN where the flux is measured.
+    sky_known : ndarray of bool, shape (n,)
+    unit_per_electron : ndarray, shape (n,)
+        Value of an electron in units of the images; 0 where unknown.
+    cell_sigma_px : ndarray, shape (n,)
+        σ of a centre about its node, along each axis, in pixels; 0 where the centre is known.
+    """
+
+    images: np.ndarray
+    noise: np.ndarray
+    terms: np.ndarray
+    position_known: bool
+    log_prior: np.ndarray
+    centre: np.ndarray | None
+    flux: np.ndarray
+    sky_known: np.ndarray
+    unit_per_electron: np.ndarray
+    cell_sigma_px: np.ndarray
+
+    def select(self, stars: np.ndarray | slice) -> FieldStamps:
+        """Return the stamps of some of these stars, by their indices or a mask."""
+        return FieldStamps._make(a[stars] if isinstance(a, np.ndarray) else a for a in self)
+
+    def prior_sigma(self) -> np.ndarray:
+        """Return σ of sky (over flux), row and column before the star is measured, (n, 3).
+
+        A sky that is not known has 1: the whole flux in each pixel. What is known has 0.
+        """
+        return np.stack([~self.sky_known * 1.0, self.cell_sigma_px, self.cell_sigma_px], axis=1)
+
+
+class Photometry(NamedTuple):
+    """First measurement of n stars, by the matched filter of the mean PSF (eq. 16).
+
+    Attributes
+    ----------
+    flux : ndarray, shape (n,)
+        Flux in the most probable node.
+    is_nearby : ndarray of bool, shape (n, nodes)
+        Nodes of which the likelihood is computed.
+    root_area : ndarray, shape (n,)
+        Square root of the noise-equivalent area, in pixels: σ of a flux over that of a pixel.
+    """
+
+    flux: np.ndarray
+    is_nearby: np.ndarray
+    root_area: np.ndarray
+
+
 class Pairs(NamedTuple):
-    """Stars in nodes, in order of the nodes: N pairs of a star x and a node with its mean m."""
+    """Pairs of a star x and a node with its PSF m, N of them, in the order of the nodes.
 
-    star: np.ndarray  # (N,)
-    node: np.ndarray  # (N,)
-    along: np.ndarray  # (N, 2, m), x and m along the axes
-    beyond: np.ndarray  # (N, 2, 5), products of both with x, m and the `latent` rows, beyond them
+    Attributes
+    ----------
+    star, node : ndarray of int, shape (N,)
+    along : ndarray, shape (N, 2, m)
+        x and m along the axes of the node.
+    beyond : ndarray, shape (N, 2, 5)
+        Products of x and m with x, m and the three derivatives, beyond the axes.
+    """
 
-    def of(self, chosen: np.ndarray) -> Pairs:
-        """A part of these pairs, by a mask."""
-        return Pairs._make(a[chosen] for a in self)
+    star: np.ndarray
+    node: np.ndarray
+    along: np.ndarray
+    beyond: np.ndarray
+
+    def select(self, mask: np.ndarray) -> Pairs:
+        """Return the pairs for which a mask is true."""
+        return Pairs._make(a[mask] for a in self)
 
     def by_node(self) -> Iterator[tuple[int, slice]]:
-        """Nodes, and which pairs are of them."""
+        """Yield the number of each node, and which pairs are with it."""
         nodes, first = np.unique(self.node, return_index=True)
         for k, start, stop in zip(nodes.tolist(), first, [*first[1:], len(self.node)], strict=True):
             yield k, slice(start, stop)
 
 
-class Fit(NamedTuple):
-    """Stars x over a guess of their flux, in nodes with their means m; N pairs.
+class PairFit(NamedTuple):
+    """Fit of N stars x, divided by a guess of their flux, each in one node with its PSF m.
 
-    Products are those with (C + s)⁻¹, in which sky and centre are not.
+    Attributes
+    ----------
+    log_likelihood : ndarray, shape (N,)
+        ln of the marginal likelihood, without (2π)^(P/2) (eq. 9).
+    factor : ndarray, shape (N,)
+        Posterior mean of the factor a (eq. 8).
+    variance : ndarray, shape (N,)
+        Variance of a.
+    precision : ndarray, shape (N, 3, 3)
+        Inverse covariance Λ of the nuisance parameters t/σ, of known a (eq. 7).
+    covariance : ndarray, shape (N, 3, 3)
+        Λ⁻¹.
+    nuisance : ndarray, shape (N, 2, 3)
+        Mean of t/σ in a fit to x and in one to m; that of x − a m is their difference.
     """
 
-    log: np.ndarray  # (N,), ln of the likelihood, without (2π)^(P/2)
-    factor: np.ndarray  # (N,), a
-    variance: np.ndarray  # (N,), of a
-    certain: np.ndarray  # (N, 3, 3), inverse covariance of sky and centre in σ
-    left: np.ndarray  # (N, 3, 3), the covariance, once the star is seen
-    pull: np.ndarray  # (N, 2, 3), mean of these for x and for m
+    log_likelihood: np.ndarray
+    factor: np.ndarray
+    variance: np.ndarray
+    precision: np.ndarray
+    covariance: np.ndarray
+    nuisance: np.ndarray
 
-    def of(self, chosen: np.ndarray) -> Fit:
-        """That of a part of the pairs, by a mask."""
-        return Fit._make(a[chosen] for a in self)
+    def select(self, mask: np.ndarray) -> PairFit:
+        """Return the fits of the pairs for which a mask is true."""
+        return PairFit._make(a[mask] for a in self)
 
 
-class Asked(NamedTuple):
-    """Stars to restore; see `FieldMixture.measure`."""
+class StarPosterior(NamedTuple):
+    """Posterior of n stars, mixed over the nodes (eq. 10 to 15).
 
-    images: np.ndarray  # (n, P), sky roughly off
-    noise: np.ndarray  # (n,)
-    terms: np.ndarray  # (n, K)
-    positioned: bool  # all positions are known, or none is
-    prior: np.ndarray  # (n, nodes), ln; −inf where no centre is
-    centre: np.ndarray | None  # (n, 2), if it is known
-    flux: np.ndarray  # (n,), NaN where to be found
-    sky: np.ndarray  # (n,) of bool: the sky is off
-    per_photon: np.ndarray  # (n,), unit of the images for an electron; 0 where unknown
-    off_node: np.ndarray  # (n,), σ of a centre about its node, per axis, in pixels; 0 where exact
+    Attributes
+    ----------
+    log_evidence : ndarray, shape (n,)
+        ln of the marginal likelihood of the stamp.
+    measurement : ndarray, shape (n, 4)
+        Mean of flux, sky, and row and column of the centre from the middle pixel.
+    covariance : ndarray, shape (n, 4, 4)
+        Covariance of these four.
+    mahalanobis2 : ndarray, shape (n,)
+        Outlier score: squared Mahalanobis distance along the leading axes.
+    psf, psf_sigma : ndarray, shape (n, P)
+        Posterior mean of the star without noise and sky, of sum 1, and its standard deviation.
+    """
 
-    def of(self, chosen: np.ndarray | slice) -> Asked:
-        """A part of these stars, by indices or a mask."""
-        return Asked._make(a[chosen] if isinstance(a, np.ndarray) else a for a in self)
+    log_evidence: np.ndarray
+    measurement: np.ndarray
+    covariance: np.ndarray
+    mahalanobis2: np.ndarray
+    psf: np.ndarray
+    psf_sigma: np.ndarray
+
+    @classmethod
+    def empty(cls, count: int, pixels: int) -> StarPosterior:
+        """Return arrays for so many stars, whose values are still to be set."""
+        shapes: list[tuple[int, ...]] = [(), (4,), (4, 4), (), (pixels,), (pixels,)]
+        return cls(*(np.empty((count, *shape)) for shape in shapes))
+
+    def set(self, rows: np.ndarray, posterior: StarPosterior) -> None:
+        """Set some rows to the posterior of other stars."""
+        for whole, part in zip(self, posterior, strict=True):
+            whole[rows] = part
 
 
 @dataclass(frozen=True, eq=False)
 class FieldLaw:
-    """A field and the residuals of its stars.
+    """Distribution of the stars of an image: the PSF over the field, and residuals about it.
 
     Attributes
     ----------
     coefficients, low, high : ndarray
-        Of the `FieldModel`.
+        Those of the `FieldModel`.
     usual, spread : ndarray, shape (K,) and (K, K)
-        Mean and covariance of its terms over the training stars.
+        Mean and covariance of the terms of the field over the training stars.
     offset : ndarray, shape (f², w²)
         Mean residual at the f phases of a pixel along rows and columns, in frames of
         w = d + 2 `MARGIN_PX` pixels whose middle pixel has the star.
     modes : ndarray, shape (f², r, w²)
+        Principal modes of the residuals in each phase, each times its standard deviation.
     diagonal : ndarray, shape (f², w²)
         Variance of the residuals beyond their modes.
     listed : ndarray, shape (2, 2)
@@ -315,8 +432,8 @@ class FieldLaw:
         was no list.
     noise : NoiseModel
     settings : FieldSettings
-    free : bool
-        `estimate` finds flux and sky.
+    measures_flux : bool
+        `estimate` measures flux and sky; otherwise the flux is 1 and the sky 0.
     """
 
     coefficients: np.ndarray
@@ -330,21 +447,23 @@ class FieldLaw:
     listed: np.ndarray
     noise: NoiseModel
     settings: FieldSettings
-    free: bool = False
-    _made: dict[tuple[int, bool], Axes] = field(default_factory=dict, init=False, repr=False)
+    measures_flux: bool = False
+    _axes_cache: dict[tuple[int, bool], NodeAxes] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     # The field.
 
     @cached_property
     def model(self) -> FieldModel:
-        """The PSF at every place."""
+        """The PSF at every place of the field (eq. 1)."""
         coefficients = self.coefficients.astype(np.float64)
         spacing = spacing_of(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
         return FieldModel(coefficients, self.low, self.high, spacing)
 
     @property
     def order(self) -> int:
-        """Order of its polynomial."""
+        """Order of the field's polynomial in x and y."""
         return self.model.order
 
     @property
@@ -353,121 +472,149 @@ class FieldLaw:
         return isqrt(self.offset.shape[-1]) - 2 * MARGIN_PX
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Terms of the field of each star, and where its position is known, (n,) of bool.
+        """Return the terms of the field for each star, and whether its position is known.
 
-        They are the usual ones where it is not, and so are those of an unknown magnitude or colour.
-        A star whose PSF is not known for want of these counts as one of unknown position.
+        Terms of an unknown position, magnitude or colour are their mean over the training stars. A
+        star counts as one of unknown position if anything is unknown that changes its PSF.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n, 2) to (n, 4), or None
+            x, y, magnitude and colour; NaN where unknown. None if nothing is known.
+        count : int
+            Number of stars n if there are no positions.
+
+        Returns
+        -------
+        terms : ndarray, shape (n, K)
+        position_known : ndarray of bool, shape (n,)
         """
-        place = np.full((count if position is None else len(position), 4), np.nan)
+        coordinates = np.full((count if position is None else len(position), 4), np.nan)
         if position is not None:
-            place[:, : position.shape[1]] = position
-        given, more = np.isfinite(place), self.model.of_star
-        positioned = given[:, :2].all(axis=1) | (self.order == 0)
-        of_place = len(self.usual) - STAR_TERMS * len(more)
-        known = np.hstack(
+            coordinates[:, : position.shape[1]] = position
+        # Terms of x and y first, then two of each star property that changes the PSF.
+        is_known, properties = np.isfinite(coordinates), self.model.of_star
+        place_known = is_known[:, :2].all(axis=1) | (self.order == 0)
+        place_terms = len(self.usual) - STAR_TERMS * len(properties)
+        term_known = np.hstack(
             [
-                np.repeat(positioned[:, None], of_place, axis=1),
-                np.repeat(given[:, more], STAR_TERMS, axis=1),
+                np.repeat(place_known[:, None], place_terms, axis=1),
+                np.repeat(is_known[:, properties], STAR_TERMS, axis=1),
             ]
         )
-        positioned = positioned & given[:, more].all(axis=1)
-        terms = self.model.terms(np.nan_to_num(place))
-        return np.where(known, terms, self.usual), positioned
+        position_known = place_known & is_known[:, properties].all(axis=1)
+        terms = self.model.terms(np.nan_to_num(coordinates))
+        return np.where(term_known, terms, self.usual), position_known
 
     # The nodes.
 
     @cached_property
     def step_px(self) -> float:
-        """Between two nodes, for which there are residuals."""
+        """Distance of two nodes in pixels, for which there are residuals."""
         step, phases = self.settings.step_px, isqrt(len(self.offset))
         return step if len(phases_of(step)) == phases else 1.0 / phases
 
     @cached_property
-    def _axis(self) -> np.ndarray:
-        """Nodes along an axis in units of a step."""
-        most = round(self.settings.reach_px / self.step_px)
-        return np.arange(-most, most + 1)
+    def _lattice(self) -> np.ndarray:
+        """Coordinates of the nodes along an axis, in units of a step."""
+        outermost = round(self.settings.reach_px / self.step_px)
+        return np.arange(-outermost, outermost + 1)
 
     @cached_property
     def places(self) -> np.ndarray:
         """Centres (row, column) of the nodes from the stamp's middle pixel, shape (nodes, 2)."""
-        row, column = np.meshgrid(self._axis, self._axis, indexing="ij")
+        row, column = np.meshgrid(self._lattice, self._lattice, indexing="ij")
         return self.step_px * np.stack([row.ravel(), column.ravel()], axis=1)
 
     @cached_property
     def _nodes(self) -> list[Node]:
-        count, axis = len(self.usual), self.step_px * self._axis
+        """All nodes, in the order of `places`."""
+        count, axis = len(self.usual), self.step_px * self._lattice
         phases, steps = phases_of(self.step_px), ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
 
         def drawn(terms: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:
             images = self.model.on_lattice(terms, axis + row, axis + column, self.side)
             return images.reshape(len(terms), len(self.places), -1)
 
-        every, usual = drawn(np.eye(count)), self.usual[None]
+        # Images of each term in all nodes, and central differences of the mean star's image.
+        term_images, usual = drawn(np.eye(count)), self.usual[None]
         slopes = [
             (drawn(usual, *e) - drawn(usual, -e[0], -e[1]))[0] / (2 * SLOPE_PX) for e in steps
         ]
-        field_spread = _root(self.spread.reshape(count, count))
+        field_modes = _covariance_rows(self.spread.reshape(count, count))
         nodes = []
         for k, place in enumerate(self.places):
-            images = every[:, k]
-            total = images.sum(axis=1)
-            flux = float(self.usual @ total)
+            images = term_images[:, k]
+            image_sums = images.sum(axis=1)
+            flux = float(self.usual @ image_sums)
             mean = self.usual @ images / flux
 
-            def lit(rows: np.ndarray, mean: np.ndarray = mean, flux: float = flux) -> np.ndarray:
+            # A change of a star whose light in the stamp is kept at 1: (δ − Σδ m) / F.
+            def at_constant_flux(
+                rows: np.ndarray, mean: np.ndarray = mean, flux: float = flux
+            ) -> np.ndarray:
                 return np.asarray((rows - rows.sum(axis=-1, keepdims=True) * mean) / flux)
 
+            # Residuals are stored by the phase of a centre in its pixel, in frames that are larger
+            # than a stamp: whole pixels of a node's place choose the window.
             phase, window = phase_of(place, phases, self.side)
             residuals = np.vstack([self.offset[phase, window], self.modes[phase][:, window]])
-            residuals = lit(residuals.astype(np.float64))
+            residuals = at_constant_flux(residuals.astype(np.float64))
+            shifts = at_constant_flux(np.stack([s[k] for s in slopes]))
             nodes.append(
                 Node(
-                    mean=np.vstack([images, residuals[:1]]),
-                    total=total,
-                    rows=residuals[1:],
-                    spread=lit(field_spread @ images),
-                    latent=np.vstack([np.ones_like(mean), lit(np.stack([s[k] for s in slopes]))]),
+                    images=np.vstack([images, residuals[:1]]),
+                    image_sums=image_sums,
+                    residual_modes=residuals[1:],
+                    field_modes=at_constant_flux(field_modes @ images),
+                    derivatives=np.vstack([np.ones_like(mean), shifts]),
                     diagonal=self.diagonal[phase, window].astype(np.float64),
                 )
             )
         return nodes
 
     @cached_property
-    def _usual(self) -> tuple[np.ndarray, np.ndarray]:
-        """Usual stars of sum 1 in all nodes, less their average, and their squares' sums."""
+    def _filters(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matched filters of all nodes, (nodes, P), and the sum of squares of each, (nodes,).
+
+        A filter is the mean star of sum 1 less its average over the stamp, so that a flat sky
+        gives nothing.
+        """
         parts = np.append(self.usual, 0.0)
-        means = np.stack([parts @ node.mean / (self.usual @ node.total) for node in self._nodes])
-        means += np.stack([node.mean[-1] for node in self._nodes])
+        means = np.stack(
+            [parts @ node.images / (self.usual @ node.image_sums) for node in self._nodes]
+        )
+        means += np.stack([node.images[-1] for node in self._nodes])
         means -= means.mean(axis=1, keepdims=True)
         return means, np.square(means).sum(axis=1)
 
-    def _parts(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
-        """Coefficients (n, K + 1) of PSFs of sum 1 that the field has in a node, in its `mean`."""
+    def _image_weights(self, k: int, stars: FieldStamps, rows: np.ndarray) -> np.ndarray:
+        """Return weights (n, K + 1) of the images of node k that add up to PSFs m of sum 1."""
         terms = stars.terms[rows]
-        return np.hstack([terms / (terms @ self._nodes[k].total)[:, None], np.ones((len(rows), 1))])
+        sums = (terms @ self._nodes[k].image_sums)[:, None]
+        return np.hstack([terms / sums, np.ones((len(rows), 1))])
 
-    def _mean(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
-        """PSFs (n, P) of sum 1 that the field has for some stars in a node."""
+    def _mean(self, k: int, stars: FieldStamps, rows: np.ndarray) -> np.ndarray:
+        """Return the field's PSFs m, (n, P), of sum 1, for some stars in node k (eq. 5)."""
         node = self._nodes[k]
         if stars.centre is None:
-            return np.asarray(self._parts(k, stars, rows) @ node.mean)
+            return np.asarray(self._image_weights(k, stars, rows) @ node.images)
         images = self.model.images(stars.terms[rows], stars.centre[rows], self.side)
         images = images.reshape(len(rows), -1)
-        return np.asarray(images / images.sum(axis=1, keepdims=True) + node.mean[-1])
+        return np.asarray(images / images.sum(axis=1, keepdims=True) + node.images[-1])
 
-    def _axes(self, k: int, positioned: bool) -> Axes:
-        """Axes of a node, made once."""
-        if (k, positioned) not in self._made:
-            self._made[k, positioned] = axes_of(self._nodes[k], positioned)
-        return self._made[k, positioned]
+    def _axes(self, k: int, position_known: bool) -> NodeAxes:
+        """Return the principal axes of node k, which are computed once."""
+        if (k, position_known) not in self._axes_cache:
+            self._axes_cache[k, position_known] = principal_axes(self._nodes[k], position_known)
+        return self._axes_cache[k, position_known]
 
     @property
-    def off_node_px(self) -> float:
-        """σ of a place between two nodes."""
+    def cell_sigma_px(self) -> float:
+        """σ of a centre about its node, along an axis: uniform in a cell of one step."""
         return float(self.step_px / np.sqrt(12.0))
 
-    # Stars.
+    # The stars.
 
     @cached_property
     def _list_offset(self) -> np.ndarray:
@@ -476,300 +623,405 @@ class FieldLaw:
         return np.asarray(self.listed[0] if known else np.zeros(2))
 
     def _prior(self, listed: np.ndarray) -> np.ndarray:
-        """ln of each node's probability for stars with centres of a list, or NaN, (n, nodes)."""
+        """Return ln of each node's prior probability, shape (n, nodes) (eq. 17).
+
+        Parameters
+        ----------
+        listed : ndarray, shape (n, 2)
+            Centres of a list, NaN where there is none.
+        """
+        # Without a list: the part of a node's cell that is within ±`centring_px`.
         step, half = self.step_px, self.settings.centring_px
         box = np.clip((half + step / 2 - np.abs(self.places)) / step, 0.0, 1.0).prod(axis=1)
         prior = np.tile(box / box.sum(), (len(listed), 1))
-        near = np.isfinite(listed).all(axis=1)
-        if near.any() and len(self.listed) and np.isfinite(self.listed).all():
-            sigma = np.hypot(self.listed[1], self.off_node_px)
-            off = (self.places - listed[near, None]) / sigma
-            there = np.exp(-0.5 * np.square(off).sum(axis=-1))
-            total = there.sum(axis=1, keepdims=True)
-            there /= np.where(total > 0, total, 1.0)
-            prior[near] = WRONG_LIST * prior[near] + (1.0 - WRONG_LIST) * there
+        is_listed = np.isfinite(listed).all(axis=1)
+        if is_listed.any() and len(self.listed) and np.isfinite(self.listed).all():
+            # A normal distribution about the listed place, as wide as the error of the list.
+            sigma = np.hypot(self.listed[1], self.cell_sigma_px)
+            offset_sigma = (self.places - listed[is_listed, None]) / sigma
+            density = np.exp(-0.5 * np.square(offset_sigma).sum(axis=-1))
+            total = density.sum(axis=1, keepdims=True)
+            density /= np.where(total > 0, total, 1.0)
+            # 5 %: the list, or this entry of it, is worse than it was for the training stars.
+            prior[is_listed] = 0.05 * prior[is_listed] + 0.95 * density
         with np.errstate(divide="ignore"):
             return np.asarray(np.log(prior / prior.sum(axis=1, keepdims=True)))
 
-    def _start(self, stars: Asked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fluxes by the node that fits best, the nodes (n, nodes) to look at, and √A there."""
-        means, square = self._usual
-        along = stars.images @ means.T
-        known = np.isfinite(stars.flux)[:, None]
-        flux = np.where(known, stars.flux[:, None], np.maximum(along / square, 0.0))
-        gain = flux * along - 0.5 * flux**2 * square
+    def _matched_filter(self, stars: FieldStamps) -> Photometry:
+        """Return fluxes by a matched filter, and the nodes that are probable by it (eq. 16)."""
+        # ln of the likelihood ratio of a star of flux F against none: (F ⟨x,m⟩ − ½ F² ⟨m,m⟩) / s.
+        filters, square = self._filters
+        product = stars.images @ filters.T
+        is_known = np.isfinite(stars.flux)[:, None]
+        flux = np.where(is_known, stars.flux[:, None], np.maximum(product / square, 0.0))
+        gain = flux * product - 0.5 * flux**2 * square
         variance = stars.noise[:, None] ** 2
-        score = gain / variance + stars.prior
+        score = gain / variance + stars.log_prior
         rows, best = np.arange(len(flux)), score.argmax(axis=1)
-        unclear = gain / (variance + flux**2 * square / MATCHED_SNR**2) + stars.prior
-        limits = LEAST_NODES, round(MOST_PX2 / self.step_px**2)
-        few, most = (min(count, score.shape[1]) - 1 for count in limits)
-        nearest = -np.partition(-unclear, [few, most], axis=1)
-        least = np.clip(unclear.max(axis=1) - FAR, nearest[:, most], nearest[:, few])
-        near = np.isfinite(score) & (unclear >= least[:, None])
-        near[rows, best] = True
-        return flux[rows, best], near, 1.0 / np.sqrt(square[best])
+        # The filter does not know the shape of a bright star: its score counts as that of a star
+        # of S/N 30. Nodes more than 8 below the best, in ln, would have a weight below e⁻⁸, less
+        # than what `mixing_weights` drops; the number of nodes has limits on both sides.
+        tempered = gain / (variance + flux**2 * square / 30.0**2) + stars.log_prior
+        limits = MIN_NODES, round(MAX_NODE_AREA_PX2 / self.step_px**2)
+        fewest, largest = (min(count, score.shape[1]) - 1 for count in limits)
+        ranked = -np.partition(-tempered, [fewest, largest], axis=1)
+        threshold = np.clip(tempered.max(axis=1) - 8.0, ranked[:, largest], ranked[:, fewest])
+        is_nearby = np.isfinite(score) & (tempered >= threshold[:, None])
+        is_nearby[rows, best] = True
+        return Photometry(flux[rows, best], is_nearby, 1.0 / np.sqrt(square[best]))
 
-    def _paired(self, stars: Asked, near: np.ndarray) -> Pairs:
-        """Stars in the nodes (n, nodes) that are to be looked at."""
-        node, star = near.T.nonzero()
-        images, kept = stars.images, len(self._axes(node[0], stars.positioned).variance)
-        pairs = Pairs(star, node, *(np.empty((len(star), 2, count)) for count in (kept, 5)))
+    def _projected(self, stars: FieldStamps, is_nearby: np.ndarray) -> Pairs:
+        """Return stars and PSFs along the axes of each nearby node, and products beyond them.
+
+        Products with G⁻¹ are sums over the axes and one term beyond them, for any noise (eq. 6).
+        """
+        node, star = is_nearby.T.nonzero()
+        images, axis_count = stars.images, len(self._axes(node[0], stars.position_known).variance)
+        pairs = Pairs(
+            star, node, *(np.empty((len(star), 2, columns)) for columns in (axis_count, 5))
+        )
         square = np.square(images).sum(axis=1)
         for k, rows in pairs.by_node():
-            latent, axes = self._nodes[k].latent, self._axes(k, stars.positioned)
+            derivatives, axes = self._nodes[k].derivatives, self._axes(k, stars.position_known)
             image, mean = images[star[rows]], self._mean(k, stars, star[rows])
             along, beyond = pairs.along[rows], pairs.beyond[rows]
             along[:, 0] = image @ axes.basis[3:].T
             if stars.centre is None:
-                along[:, 1] = self._parts(k, stars, star[rows]) @ axes.mean
+                along[:, 1] = self._image_weights(k, stars, star[rows]) @ axes.images
             else:
                 along[:, 1] = mean @ axes.basis[3:].T
+            # Products over all pixels, less those along the axes.
             beyond[:, 0, 0] = square[star[rows]]
             beyond[:, 0, 1] = beyond[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
             beyond[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
-            beyond[:, 0, 2:], beyond[:, 1, 2:] = image @ latent.T, mean @ latent.T
-            beyond -= products_of(along, along, axes.latent)
+            beyond[:, 0, 2:], beyond[:, 1, 2:] = image @ derivatives.T, mean @ derivatives.T
+            beyond -= _products(along, along, axes.derivatives)
         return pairs
 
-    def _restored(
-        self, stars: Asked, guess: np.ndarray, near: np.ndarray, width: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What stars are (n, 6 + 2P), and the covariance of four of it (n, 4, 4).
-
-        These are evidence, flux, sky, row, column, outlier score, PSF and its σ. The rest is what
-        `_start` has for these stars.
-        """
-        # A faint star is looked at in every second node along both axes, if many are near: what is
-        # not linear over twice the step is far below its noise. Such a node counts for four.
-        even = near & (np.rint(self.places / self.step_px) % 2 == 0).all(axis=1)
-        faint = (guess < COARSE_SNR * stars.noise * width) & (even.sum(axis=1) > 4)
-        near = np.where(faint[:, None], even, near)
+    def _posterior(self, stars: FieldStamps) -> StarPosterior:
+        """Return the posterior of stars whose positions, and centres, are all known or all not."""
+        flux, is_nearby, root_area = self._matched_filter(stars)
+        # Stars of an S/N below 10 are looked at in every second node along both axes if more than
+        # four of these are probable: over twice a step of an eighth of the FWHM, what is not linear
+        # is 1 % of a star's peak, and the noise is 20 % of it. Such a node counts for four.
+        is_coarse = is_nearby & (np.rint(self.places / self.step_px) % 2 == 0).all(axis=1)
+        is_faint = (flux < 10.0 * stars.noise * root_area) & (is_coarse.sum(axis=1) > 4)
+        is_nearby = np.where(is_faint[:, None], is_coarse, is_nearby)
         stars = stars._replace(
-            off_node=np.where(faint, 2.0, 1.0) * stars.off_node,
-            prior=stars.prior + np.where(faint, np.log(4.0), 0.0)[:, None],
+            cell_sigma_px=np.where(is_faint, 2.0, 1.0) * stars.cell_sigma_px,
+            log_prior=stars.log_prior + np.where(is_faint, np.log(4.0), 0.0)[:, None],
         )
-        known = np.isfinite(stars.flux) & (stars.flux > 0)
-        precision = np.where(known, KNOWN_FLUX_SIGMA, FLUX_SIGMA) ** -2.0
-        pairs = self._paired(stars, near)
-        for _ in range(FLUX_ROUNDS):
-            least = LEAST_SNR * stars.noise * width
-            flux = np.where(known, stars.flux, np.maximum(guess, least))
-            fit = self._fitted(stars, pairs, flux, precision)
-            log = np.full(near.shape, -np.inf)
-            log[pairs.star, pairs.node] = fit.log
-            weight, evidence = mixing_weights(log + stars.prior)
-            part = weight[pairs.star, pairs.node]
-            guess = flux * np.bincount(pairs.star, part * fit.factor, len(flux))
-            used = part > 0
-            pairs, part, fit = pairs.of(used), part[used], fit.of(used)
-        values, covariance, outlying, psf, sigma = self._summed(stars, pairs, part, fit, flux)
-        covariance += self._photon_covariance(stars, pairs, part, flux, precision)
-        evidence -= stars.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
-        unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
-        found = np.hstack([evidence[:, None], values * unit, outlying[:, None], psf, sigma])
-        return found, covariance * unit[:, :, None] * unit[:, None, :]
+        # 1/τ², the prior precision of the factor a: a known flux has a relative σ of 1e-6.
+        flux_known = np.isfinite(stars.flux) & (stars.flux > 0)
+        flux_precision = np.where(flux_known, 1e-6, FLUX_SIGMA) ** -2.0
+        pairs = self._projected(stars, is_nearby)
+        # The noise over the flux, s, depends on the flux: two rounds of fits with a guessed flux.
+        for _ in range(2):
+            # A guess is that of a star of S/N 1.5 at least: s has to stay finite.
+            least_flux = 1.5 * stars.noise * root_area
+            unit = np.where(flux_known, stars.flux, np.maximum(flux, least_flux))
+            fit = self._fitted(stars, pairs, unit, flux_precision)
+            # Weights of the nodes: marginal likelihood times prior (eq. 10).
+            log = np.full(is_nearby.shape, -np.inf)
+            log[pairs.star, pairs.node] = fit.log_likelihood
+            node_weight, evidence = mixing_weights(log + stars.log_prior)
+            weight = node_weight[pairs.star, pairs.node]
+            flux = unit * np.bincount(pairs.star, weight * fit.factor, len(unit))
+            used = weight > 0
+            pairs, weight, fit = pairs.select(used), weight[used], fit.select(used)
+        # Density of the stamp in its own unit: (2π)^(−P/2) F^(−P) times that of x/F.
+        evidence -= stars.images.shape[1] * np.log(np.sqrt(2 * np.pi) * unit)
+        posterior = self._mixed(stars, pairs, weight, fit, unit)
+        covariance = posterior.covariance
+        covariance += self._photon_covariance(stars, pairs, weight, unit, flux_precision)
+        # Flux and sky were in units of the guessed flux.
+        units = np.stack([unit, unit, *np.ones((2, len(unit)))], axis=1)
+        return posterior._replace(
+            log_evidence=evidence,
+            measurement=posterior.measurement * units,
+            covariance=covariance * units[:, :, None] * units[:, None, :],
+        )
 
-    def _width(self, stars: Asked) -> np.ndarray:
-        """Standard deviations (n, 3) of sky, row and column before a star is seen; 0 if known."""
-        # A sky of the whole flux in each pixel is as good as unknown.
-        return np.stack([~stars.sky * 1.0, stars.off_node, stars.off_node], axis=1)
-
-    def _fitted(self, stars: Asked, pairs: Pairs, flux: np.ndarray, precision: np.ndarray) -> Fit:
-        """Stars over their guessed flux in nodes: likelihood, and a with its prior."""
-        count, s = len(pairs.star), np.square(stars.noise / flux)[pairs.star, None]
-        unit, width = 1.0 / flux[pairs.star, None], self._width(stars)[pairs.star]
-        products, certain, det = (np.empty((count, *shape)) for shape in ((2, 5), (3, 3), ()))
+    def _fitted(
+        self, stars: FieldStamps, pairs: Pairs, unit: np.ndarray, flux_precision: np.ndarray
+    ) -> PairFit:
+        """Return the fit of stars, divided by their guessed flux `unit`, in their nodes."""
+        count, s = len(pairs.star), np.square(stars.noise / unit)[pairs.star, None]
+        scale, sigma = 1.0 / unit[pairs.star, None], stars.prior_sigma()[pairs.star]
+        products, precision, log_det = (np.empty((count, *shape)) for shape in ((2, 5), (3, 3), ()))
+        # Products ⟨·,·⟩ with G⁻¹, the precision Λ of the nuisance parameters, and ln det G.
         for k, rows in pairs.by_node():
-            axes, along = self._axes(k, stars.positioned), pairs.along[rows]
+            axes, along = self._axes(k, stars.position_known), pairs.along[rows]
             inverse = axes.inverse(s[rows])
-            products[rows] = products_of(along * inverse[:, None, :-1], along, axes.latent)
+            products[rows] = _products(along * inverse[:, None, :-1], along, axes.derivatives)
             products[rows] += inverse[:, -1, None, None] * pairs.beyond[rows]
-            certain[rows] = axes.certainty(s[rows], width[rows])
-            more = stars.images.shape[1] - inverse.shape[1]  # axes as the last one
-            det[rows] = -np.log(inverse).sum(axis=1) - more * np.log(inverse[:, -1])
-        products[:, 0] *= unit
-        products[:, :, 0] *= unit
-        products[:, :, 2:] *= width[:, None]
-        left = np.linalg.inv(certain)
-        pull = products[:, :, 2:] @ left
-        products[:, :, :2] -= pull @ products[:, :, 2:].transpose(0, 2, 1)
-        (square, along), (_, means) = products[:, :, :2].transpose(1, 2, 0)
-        prior = precision[pairs.star]
-        information, off = means + prior, along - means
-        chi2 = square - along - off - off**2 / information
-        det += np.linalg.slogdet(certain)[1]
-        log = -0.5 * (chi2 + np.log(information / prior) + det)
-        # What was found before says nothing new: it is no part of the error.
-        variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, means)
-        return Fit(log, 1.0 + off / information, variance, certain, left, pull)
+            precision[rows] = axes.nuisance_precision(s[rows], sigma[rows])
+            # `inverse` has one entry for all dimensions beyond the axes; here are the others.
+            dimensions = stars.images.shape[1] - inverse.shape[1]
+            log_det[rows] = -np.log(inverse).sum(axis=1) - dimensions * np.log(inverse[:, -1])
+        products[:, 0] *= scale
+        products[:, :, 0] *= scale
+        products[:, :, 2:] *= sigma[:, None]
+        # Woodbury: S⁻¹ = G⁻¹ − G⁻¹ Lᵀ σ Λ⁻¹ σ L G⁻¹; products with S⁻¹ from now on (eq. 7).
+        covariance = np.linalg.inv(precision)
+        nuisance = products[:, :, 2:] @ covariance
+        products[:, :, :2] -= nuisance @ products[:, :, 2:].transpose(0, 2, 1)
+        (xx, xm), (_, mm) = products[:, :, :2].transpose(1, 2, 0)
+        # Generalised least squares for a with its prior about 1 (eq. 8): the residual x − m, along
+        # m, over the information.
+        prior = flux_precision[pairs.star]
+        information, residual = mm + prior, xm - mm
+        chi2 = xx - xm - residual - residual**2 / information
+        # ln of the marginal likelihood (eq. 9), with ln det S = ln det G + ln det Λ.
+        log_det += np.linalg.slogdet(precision)[1]
+        log_likelihood = -0.5 * (chi2 + np.log(information / prior) + log_det)
+        # The prior about the guessed flux comes from the same stamp: to count it as information
+        # would use the star twice. A known flux is information.
+        variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, mm)
+        factor = 1.0 + residual / information
+        return PairFit(log_likelihood, factor, variance, precision, covariance, nuisance)
 
     def _photon_covariance(
         self,
-        stars: Asked,
+        stars: FieldStamps,
         pairs: Pairs,
         weight: np.ndarray,
         unit: np.ndarray,
-        precision: np.ndarray,
+        flux_precision: np.ndarray,
     ) -> np.ndarray:
-        """What photons add to the covariance (n, 4, 4) of flux, sky, row and column.
+        """Return what photons add to the covariance (n, 4, 4) of flux, sky, row and column.
 
         In the likelihood, a star's photons are spread evenly over its stamp; they are where its
-        light is. The errors of an estimate W x, W = (J N⁻¹ Jᵀ)⁻¹ J N⁻¹ with N = C + s, have
-        W (V − s) Wᵀ more if the variance of the noise is V.
+        light is. The errors of an estimate W x, W = (J G⁻¹ Jᵀ)⁻¹ J G⁻¹, have W (V − s) Wᵀ more if
+        the variance of the noise is V (eq. 15).
         """
         count, pixels = stars.images.shape
-        found = np.zeros((count, 4, 4))
+        covariance = np.zeros((count, 4, 4))
         # One node of each star is enough: that of the largest weight.
         order = np.lexsort((-weight, pairs.star))
-        best = np.zeros(len(weight), dtype=bool)
-        best[order[np.unique(pairs.star[order], return_index=True)[1]]] = True
-        best &= (stars.per_photon > 0)[pairs.star]
-        if not best.any():
-            return found
-        # A number that is known has a prior that no data move.
-        precision = np.where(precision > FLUX_SIGMA**-2.0, precision, 0.0)
-        known = np.column_stack([precision, np.where(self._width(stars) > 0, 0.0, 1e30)])
-        for k, rows in pairs.of(best).by_node():
-            star = pairs.star[best][rows]
-            axes, s = self._axes(k, stars.positioned), np.square(stars.noise / unit)[star, None]
+        is_best = np.zeros(len(weight), dtype=bool)
+        is_best[order[np.unique(pairs.star[order], return_index=True)[1]]] = True
+        is_best &= (stars.unit_per_electron > 0)[pairs.star]
+        if not is_best.any():
+            return covariance
+        # Quantities that are known have a prior that no data move.
+        flux_precision = np.where(flux_precision > FLUX_SIGMA**-2.0, flux_precision, 0.0)
+        nuisance_precision = np.where(stars.prior_sigma() > 0, 0.0, 1e30)
+        prior = np.column_stack([flux_precision, nuisance_precision])
+        for k, rows in pairs.select(is_best).by_node():
+            star = pairs.star[is_best][rows]
+            axes, s = self._axes(k, stars.position_known), np.square(stars.noise / unit)[star, None]
             mean, inverse = self._mean(k, stars, star), axes.inverse(s)[:, None]
-            # J: the change of the image with flux, sky, row and column; J N⁻¹.
+            # J: the change of the image with flux, sky, row and column; J G⁻¹.
             change = np.empty((len(star), 4, pixels))
             change[:, 0], change[:, 1:] = mean, axes.basis[:3]
             along = (change @ axes.basis[3:].T) * (inverse[..., :-1] - inverse[..., -1:])
             weighted = inverse[..., -1:] * change + along @ axes.basis[3:]
-            information = weighted @ change.transpose(0, 2, 1) + known[star, :, None] * np.eye(4)
+            information = weighted @ change.transpose(0, 2, 1) + prior[star, :, None] * np.eye(4)
             influence = np.linalg.solve(information, weighted)
             # V − s of a star of flux F in units of F²: g (m − mean of m) / F.
-            more = (mean - mean.mean(axis=1, keepdims=True)) / unit[star, None]
-            more *= stars.per_photon[star, None]
-            found[star] = (influence * more[:, None]) @ influence.transpose(0, 2, 1)
-        return found
+            excess = (mean - mean.mean(axis=1, keepdims=True)) / unit[star, None]
+            excess *= stars.unit_per_electron[star, None]
+            covariance[star] = (influence * excess[:, None]) @ influence.transpose(0, 2, 1)
+        return covariance
 
-    def _summed(
-        self, stars: Asked, pairs: Pairs, weight: np.ndarray, fit: Fit, unit: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """Mean (n, 4) and covariance of flux, sky, row, column; outlier score; PSF (n, P) and σ.
+    def _mixed(
+        self,
+        stars: FieldStamps,
+        pairs: Pairs,
+        weight: np.ndarray,
+        fit: PairFit,
+        unit: np.ndarray,
+    ) -> StarPosterior:
+        """Return the posterior of stars, mixed over their nodes by `weight` (eq. 11 to 14).
 
-        Of stars over a guess of their flux, which is the unit of flux and sky. The score is the
-        square of Mahalanobis' distance along the leading axes of C, with the noise in them.
+        Stars are divided by a guess of their flux, which is the unit of flux and sky. The evidence
+        is left at 0.
         """
         count, pixels = stars.images.shape
         psf, square = np.zeros((2, count, pixels))
         images, s = stars.images / unit[:, None], np.square(stars.noise / unit)[:, None]
-        width, star, a = self._width(stars), pairs.star, fit.factor[:, None]
-        # Pixels of stars of about the same noise are equally sure.
-        step = np.rint(np.log(s) / VARIANCE_STEP)
-        kinds = np.column_stack([step, width])
-        _, one_of, kind = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
-        usual = np.exp(VARIANCE_STEP * step[one_of]), width[one_of]
-        width, free = width[star], ~stars.sky[star]
-        latent = width * (fit.pull[:, 0] - a * fit.pull[:, 1])
-        with_a = -width * fit.pull[:, 1]
-        flux, score = np.empty((2, len(star)))
-        pull, certain, unsure = np.empty((len(star), 3)), fit.certain, 2 - (stars.flux > 0).all()
+        sigma, star, factor = stars.prior_sigma(), pairs.star, fit.factor[:, None]
+        # The variance of pixels depends on s and σ alone. It is computed once for all stars whose s
+        # rounds to the same step of 0.1 in ln, which changes a standard deviation by 2.5 % at most.
+        ln_step = 0.1
+        noise_step = np.rint(np.log(s) / ln_step)
+        classes = np.column_stack([noise_step, sigma])
+        _, example, noise_class = np.unique(classes, axis=0, return_index=True, return_inverse=True)
+        class_variance, class_sigma = np.exp(ln_step * noise_step[example]), sigma[example]
+        # Nuisance parameters t of x − a m, and their derivative with respect to a.
+        sigma, sky_free = sigma[star], ~stars.sky_known[star]
+        nuisance = sigma * (fit.nuisance[:, 0] - factor * fit.nuisance[:, 1])
+        nuisance_slope = -sigma * fit.nuisance[:, 1]
+        flux, mahalanobis2 = np.empty((2, len(star)))
+        gradient, precision = np.empty((len(star), 3)), fit.precision
+        # If every flux is known, nothing has to be differentiated with respect to a.
+        derivatives_needed = 2 - (stars.flux > 0).all()
         for k, part in pairs.by_node():
-            axes, rows = self._axes(k, stars.positioned), star[part]
-            beyond, along = axes.noise_parts(s[rows])
-            w, even = weight[part, None], free[part, None] / pixels
+            axes, rows = self._axes(k, stars.position_known), star[part]
+            beyond, along = axes.noise_fractions(s[rows])
+            w, sky_share = weight[part, None], sky_free[part, None] / pixels
             image, mean = pairs.along[part].transpose(1, 0, 2)
-            left = image / unit[rows, None] - a[part] * mean - latent[part] @ axes.latent
-            score[part], pull[part], known = axes.leading(left, s[rows], width[part])
-            certain[part] -= known
-            # The star without noise and sky, and its change with a where that has a doubt.
-            rest = np.stack([latent[part], with_a[part]])[:unsure]
-            change = along * (mean + with_a[part] @ axes.latent)
-            combined = np.concatenate([beyond * rest, [-along * left, change][:unsure]], axis=2)
-            combined[..., 0] -= rest[..., 0]
-            one, *changes = combined @ axes.basis
+            # Residual r = x − a m − Lᵀ t along the axes, and its score along the leading ones.
+            residual = image / unit[rows, None] - factor[part] * mean
+            residual = residual - nuisance[part] @ axes.derivatives
+            mahalanobis2[part], gradient[part], leading = axes.leading_terms(
+                residual, s[rows], sigma[part]
+            )
+            precision[part] -= leading
+            # The star without noise and sky, x − t_sky − s G⁻¹ r (eq. 11), and its change with a.
+            # Both are sums over the rows of the basis: derivatives, then axes.
+            derivative_rows = np.stack([nuisance[part], nuisance_slope[part]])[:derivatives_needed]
+            residual_slope = along * (mean + nuisance_slope[part] @ axes.derivatives)
+            axis_rows = [-along * residual, residual_slope][:derivatives_needed]
+            combined = np.concatenate([beyond * derivative_rows, axis_rows], axis=2)
+            combined[..., 0] -= derivative_rows[..., 0]
+            restored, *slopes = combined @ axes.basis
             mean = beyond * self._mean(k, stars, rows)
-            one += (1.0 - beyond) * images[rows] + a[part] * mean
-            flux[part] = one.sum(axis=1)
-            one += even * (a[part] - flux[part, None])  # what is even in the star is sky
-            some, which = np.unique(kind[rows], return_inverse=True)
-            spread = axes.pixel_variance(*(known[some] for known in usual))[which]
-            spread += one**2
-            for slope in changes:
+            restored += (1.0 - beyond) * images[rows] + factor[part] * mean
+            flux[part] = restored.sum(axis=1)
+            # Where the sky is free, a star has the flux a: what is flat in the rest is sky.
+            restored += sky_share * (factor[part] - flux[part, None])
+            # Variance of its pixels (eq. 12): inside the node, and by the variance of a.
+            used, index = np.unique(noise_class[rows], return_inverse=True)
+            second_moment = axes.pixel_variance(class_variance[used], class_sigma[used])[index]
+            second_moment += restored**2
+            for slope in slopes:
                 change = slope + mean
-                change += even * (1.0 - change.sum(axis=1, keepdims=True))
-                spread += fit.variance[part, None] * change**2
-            psf[rows] += w * one
-            square[rows] += w * spread
-        score += (pull * np.linalg.solve(certain, pull[..., None])[..., 0]).sum(axis=1)
-        sky = latent[:, 0] - np.where(free, fit.factor - flux, 0.0) / pixels
-        flux = np.where(free, fit.factor, flux)
-        place = self.places[pairs.node] if stars.centre is None else stars.centre[star]
-        measured = np.column_stack([flux, sky, place + latent[:, 1:]])
-        with_a = np.hstack([np.ones_like(a), with_a])
-        inside = fit.variance[:, None, None] * with_a[:, :, None] * with_a[:, None]
-        inside[:, 1:, 1:] += width[:, :, None] * fit.left * width[:, None]
-        inside += measured[:, :, None] * measured[:, None]
-        first, second, total, score = (
-            _weighted_sums(star, weight, values, count)
-            for values in (measured, inside, flux, score)
+                change += sky_share * (1.0 - change.sum(axis=1, keepdims=True))
+                second_moment += fit.variance[part, None] * change**2
+            # Moments of the mixture (eq. 13).
+            psf[rows] += w * restored
+            square[rows] += w * second_moment
+        # Squared Mahalanobis distance along the leading axes, with what the other axes leave open
+        # of the nuisance parameters (eq. 14).
+        mahalanobis2 += (gradient * np.linalg.solve(precision, gradient[..., None])[..., 0]).sum(
+            axis=1
         )
-        # Of the star as it is: the doubt about its flux is in its pixels.
-        sigma = np.sqrt(np.maximum(square - psf**2, 0.0)) / np.abs(total[:, None])
-        covariance = second - first[:, :, None] * first[:, None]
-        return first, covariance, score, psf / total[:, None], sigma
+        # Flux, sky and centre of each pair, and the moments of these over the nodes.
+        sky = nuisance[:, 0] - np.where(sky_free, fit.factor - flux, 0.0) / pixels
+        flux = np.where(sky_free, fit.factor, flux)
+        place = self.places[pairs.node] if stars.centre is None else stars.centre[star]
+        measured = np.column_stack([flux, sky, place + nuisance[:, 1:]])
+        moments = _second_moments(fit, sigma, nuisance_slope, measured)
+        first, second, total, mahalanobis2 = (
+            _weighted_sums(star, weight, values, count)
+            for values in (measured, moments, flux, mahalanobis2)
+        )
+        # A faint star's flux differs between nodes, and so does what it would be divided by: the
+        # mixture is divided by its sum in the end. The error of its flux is in its pixels.
+        psf_sigma = np.sqrt(np.maximum(square - psf**2, 0.0)) / np.abs(total[:, None])
+        return StarPosterior(
+            log_evidence=np.zeros(count),
+            measurement=first,
+            covariance=second - first[:, :, None] * first[:, None],
+            mahalanobis2=mahalanobis2,
+            psf=psf / total[:, None],
+            psf_sigma=psf_sigma,
+        )
+
+
+def _second_moments(
+    fit: PairFit, sigma: np.ndarray, nuisance_slope: np.ndarray, measured: np.ndarray
+) -> np.ndarray:
+    """Return the mean of z zᵀ, (N, 4, 4), of flux, sky, row and column z in each pair (eq. 13).
+
+    Parameters
+    ----------
+    fit : PairFit
+    sigma, nuisance_slope : ndarray, shape (N, 3)
+        Prior σ of the nuisance parameters, and their derivative with respect to a.
+    measured : ndarray, shape (N, 4)
+        Mean of z.
+    """
+    # Covariance: that of a, carried on to t by its slope, and that of t at a given a.
+    slope = np.hstack([np.ones((len(sigma), 1)), nuisance_slope])
+    moments = fit.variance[:, None, None] * slope[:, :, None] * slope[:, None]
+    moments[:, 1:, 1:] += sigma[:, :, None] * fit.covariance * sigma[:, None]
+    moments += measured[:, :, None] * measured[:, None]
+    return np.asarray(moments)
 
 
 def _weighted_sums(
     star: np.ndarray, weight: np.ndarray, values: np.ndarray, count: int
 ) -> np.ndarray:
-    """Weighted sums (count, …) over the pairs of each star of their values (N, …)."""
+    """Return weighted sums (count, …) of values (N, …) over the pairs of each star."""
     columns = values.reshape(len(star), -1).T
     sums = [np.bincount(star, weight * column, count) for column in columns]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
 
-def products_of(weighted: np.ndarray, along: np.ndarray, latent: np.ndarray) -> np.ndarray:
-    """Products (n, 2, 5) of two weighted vectors (n, 2, m) with both, and with rows (3, m)."""
-    found = np.empty((len(along), 2, 5))
-    found[..., :2] = np.einsum("nim,njm->nij", weighted, along)
-    found[..., 2:] = (weighted.reshape(-1, weighted.shape[-1]) @ latent.T).reshape(-1, 2, 3)
-    return found
+def _products(weighted: np.ndarray, along: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
+    """Return products of two weighted vectors with vectors and derivatives, along axes.
+
+    Parameters
+    ----------
+    weighted, along : ndarray, shape (n, 2, m)
+        x and m along the axes, each axis with a weight, and without.
+    derivatives : ndarray, shape (3, m)
+
+    Returns
+    -------
+    ndarray, shape (n, 2, 5)
+        Products of x and m, weighted, with x, m and the three derivatives.
+    """
+    products = np.empty((len(along), 2, 5))
+    products[..., :2] = np.einsum("nim,njm->nij", weighted, along)
+    flat = weighted.reshape(-1, weighted.shape[-1])
+    products[..., 2:] = (flat @ derivatives.T).reshape(-1, 2, 3)
+    return products
 
 
-def step_of(fwhm_px: float, most_px: float) -> float:
-    """Step between two nodes in pixels, a whole part of one if it is not the largest."""
-    wanted = STEP_FWHM * fwhm_px
-    return most_px if wanted >= most_px else 1.0 / ceil(1.0 / wanted)
+def node_step(fwhm_px: float, max_step_px: float) -> float:
+    """Return the distance of two nodes in pixels for stars of this FWHM.
+
+    It is the largest one allowed, or else 1/n of a pixel with a whole n, so that nodes have few
+    phases.
+    """
+    step = MAX_STEP_FWHM * fwhm_px
+    return max_step_px if step >= max_step_px else 1.0 / ceil(1.0 / step)
 
 
-def parts_of(rows: np.ndarray) -> list[np.ndarray]:
-    """Rows, at most `STARS_AT_ONCE` together."""
+def batches_of(rows: np.ndarray) -> list[np.ndarray]:
+    """Return the rows in parts of at most `STARS_AT_ONCE`."""
     return np.array_split(rows, -(-rows.size // STARS_AT_ONCE)) if rows.size else []
 
 
-def phases_of(step: float) -> np.ndarray:
-    """Parts of a pixel at which nodes lie."""
-    place = step * np.arange(-round(MARGIN_PX / step), round(MARGIN_PX / step) + 1)
+def phases_of(step_px: float) -> np.ndarray:
+    """Return the offsets from the centre of a pixel at which nodes lie, in pixels."""
+    steps = round(MARGIN_PX / step_px)
+    place = step_px * np.arange(-steps, steps + 1)
     return np.unique(np.round(place - np.floor(place + 0.5), 9))
 
 
 def phase_of(place: np.ndarray, phases: np.ndarray, side: int) -> tuple[int, np.ndarray]:
-    """Number of the phase nearest to a centre (row, column), and its stamp's pixels in a frame."""
-    whole, phase = _split(place, phases)
-    return phase, _window(side, whole)
+    """Return where the residuals of stars with a given centre are stored.
 
+    Parameters
+    ----------
+    place : ndarray, shape (2,)
+        Centre (row, column) from the middle pixel of a stamp.
+    phases : ndarray
+        Offsets of `phases_of`.
+    side : int
+        Side of the stamp in pixels.
 
-def _split(place: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, int]:
-    """Whole pixels (row, column) of a node and the number of its phase."""
+    Returns
+    -------
+    phase : int
+        Number of the phase nearest to the centre.
+    window : ndarray of int, shape (side²,)
+        Pixels of the frame, which has a star in its middle pixel, that are the stamp.
+    """
     whole = np.floor(np.round(place, 9) + 0.5)
     row, column = np.abs((place - whole)[:, None] - phases).argmin(axis=1)
-    return whole.astype(int), int(row * len(phases) + column)
+    rows, columns = (np.arange(side) + MARGIN_PX - w for w in whole.astype(int))
+    window = (rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel()
+    return int(row * len(phases) + column), np.asarray(window)
 
 
-def _window(side: int, whole: np.ndarray) -> np.ndarray:
-    """Pixels of a frame that are a stamp of a star so many pixels off its middle."""
-    rows, columns = (np.arange(side) + MARGIN_PX - w for w in whole)
-    return np.asarray((rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel())
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """Rows L with LᵀL = covariance, those of directions that do not vary left out."""
+def _covariance_rows(covariance: np.ndarray) -> np.ndarray:
+    """Return rows R with RᵀR = covariance, without those of directions that do not vary."""
     variance, axes = np.linalg.eigh(covariance)
-    real = variance > 1e-12 * max(float(variance[-1]), 1e-300)
-    return np.asarray((axes * np.sqrt(np.where(real, variance, 0.0)))[:, real].T)
+    varies = variance > 1e-12 * max(float(variance[-1]), 1e-300)
+    return np.asarray((axes * np.sqrt(np.where(varies, variance, 0.0)))[:, varies].T)

@@ -18,44 +18,44 @@ if TYPE_CHECKING:
 
 
 def storage_of(kind: type[Method]) -> Storage:
-    """How the fits of a method are stored that leaves some."""
+    """Return how the fits of a method are stored; the method must leave files."""
     assert kind.storage is not None, f"{kind.name} leaves no file"
     return kind.storage
 
 
 def rule_of(kind: type[Method]) -> str:
-    """Name of the rule that fits a method."""
+    """Return the name of the rule that fits a method."""
     return storage_of(kind).rule or f"fit_{kind.name}"
 
 
 def suffix_of(kind: type[Method]) -> str:
-    """What ends the names of the bundles of a method."""
+    """Return the ending of the names of a method's bundles."""
     assert kind.packing is not None, f"{kind.name} is part of no bundle"
     return f"-{kind.name}" if kind.packing.suffix is None else kind.packing.suffix
 
 
 def stem(kind: type[Method], dataset: str, split: str, reference: str) -> str:
-    """What tells the fits of a method apart, as part of a path."""
+    """Return the part of a path that distinguishes the fits of a method."""
     return f"{dataset}/{split}" + (f"-{reference}" if storage_of(kind).per_reference else "")
 
 
 def place_of(kind: type[Method], dataset: str, split: str, reference: str) -> str:
-    """Folder or file of a fit, below the folder of results."""
+    """Return the folder or file of a fit, below the folder of results."""
     return f"{kind.name}/{named(kind, stem(kind, dataset, split, reference))}"
 
 
 def named(kind: type[Method], text: str) -> str:
-    """A name for a fit: as it is for a folder, with the ending of a product for a file."""
+    """Return the name of a fit: as it is for a folder, with the ending ".h5" for a file."""
     return text if storage_of(kind).files else f"{text}.h5"
 
 
 def own_files(kind: type[Method], place: str | Path) -> list[Path]:
-    """Files of a fit that the method itself reads."""
+    """Return the files of a fit that the method itself reads."""
     return [Path(place, name) for name in storage_of(kind).files] or [Path(place)]
 
 
 def beside(kind: type[Method], place: str | Path, name: str) -> Path:
-    """A further file of a fit: in its folder, or beside its product."""
+    """Return the path of a further file of a fit: in its folder, or beside its product."""
     place = Path(place)
     return place / name if storage_of(kind).files else place.with_name(f"{place.stem}.{name}")
 

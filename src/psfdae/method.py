@@ -1,4 +1,4 @@
-"""What a method is: a class that restores the PSF of a star from its noisy image.
+"""Base class of methods, which restore the PSF of a star from its noisy image.
 
 Each is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its settings;
 where files give others, these are in `config/<group>/default.yaml`. The list `methods` of
@@ -42,7 +42,7 @@ class FitError(Error, RuntimeError):
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """All that a method may learn from.
+    """Stars and facts that a method may learn from.
 
     Attributes
     ----------
@@ -57,17 +57,17 @@ class TrainingSet:
         Noise levels λ that are mixed.
     noise : NoiseModel
     seed : int
-        Of the method's random streams.
+        Seed of the method's random streams.
     reference : str
         "realisation" or "template".
     positions : ndarray, shape (n, 2) or (n, 4)
-        Where the stars stand in the field, any unit, and of an image their magnitudes and colours;
-        empty where nobody knows.
+        Positions of the stars in the field, in any unit, and for stars of an image their magnitudes
+        and colours; empty where unknown.
     own_noise : callable or None
-        Of images that are not noise-free: from star indices (m,) and their mean image (P,)
-        to what noise adds to their scatter (P, P) about it.
+        Noise of images that are not noise-free: a function of star indices (m,) and their mean
+        image (P,) that returns what noise adds to their scatter about it, (P, P).
     bright : BrightStars or None
-        The stars of which the images were made, if these are an image's, in counts.
+        The bright stars of an image from which the images were made, in counts.
     star : ndarray of int, shape (n,)
         Bright star of every image; empty if there are none.
     simulation : mapping
@@ -76,7 +76,7 @@ class TrainingSet:
         Fit of the method to the realisations of the same stars, from which that to their
         templates goes on.
     checkpoint : Path or None
-        Where a long fit may keep its state; the caller removes it once the result is safe.
+        File in which a long fit may keep its state; the caller removes it after the fit.
     """
 
     images: np.ndarray
@@ -97,22 +97,22 @@ class TrainingSet:
 
     @property
     def train(self) -> np.ndarray:
-        """All training stars, validation included, ascending."""
+        """Indices of all training stars, validation included, ascending."""
         return np.sort(np.concatenate([self.fit, self.validation]))
 
     def draw(self, stars: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Noisy images of `stars`, each at a random level, and these levels."""
+        """Draw noisy images of `stars`, each at a random level, and return these levels, too."""
         level = mixed_levels(self.levels, stars.size, rng)
         return self.noise.draw(self.images[stars], level, rng), level
 
     def without_validation(self) -> TrainingSet:
-        """This set without its validation stars."""
+        """Return this set without its validation stars."""
         return replace(self, validation=self.validation[:0])
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What a method measures of stars besides their PSFs, in the unit of their stamps.
+    """Photometry and astrometry of stars by a method, in the unit of their stamps.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Measured:
     centre : ndarray, shape (n, 2)
         (row, column) from pixel (d//2, d//2).
     covariance : ndarray, shape (n, 4, 4)
-        Of flux, background, row and column.
+        Covariance of flux, background, row and column.
     """
 
     flux: np.ndarray
@@ -131,25 +131,25 @@ class Measured:
 
 @dataclass(frozen=True)
 class Estimate:
-    """PSFs, and what a method says of them.
+    """PSFs that a method restored, with their uncertainty and what else it measured.
 
     Attributes
     ----------
     psf : ndarray, shape (n, d, d)
     sigma : ndarray, shape (n, d, d), or None
-        Standard deviation of each pixel of the PSF; of a method that measures stars, of the star
-        over its flux, the doubt about the flux included.
+        Standard deviation of each pixel of the PSF; for a method that measures stars, that of the
+        star over its flux, the error of the flux included.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
     flux : ndarray, shape (n,), or None
-        Flux of the star in that by which its image was divided, if the method was to find it;
-        the PSF has this sum.
+        Flux of the star over that by which its image was divided, if the method measures it; the
+        PSF has this sum.
     measured : Measured or None
-        Of a method that measures stars itself; its PSFs have the sum 1.
+        Measurements of a method that measures stars itself; its PSFs have the sum 1.
     outlier_score : ndarray, shape (n,), or None
-        As `ScoresOutliers.outlier_score`, of a method that finds it on the way.
+        See `ScoresOutliers.outlier_score`, if the method computes it together with the PSFs.
     explained : ndarray of bool, shape (n,), or None
-        Whether the method's own model explains each star; else its PSF is another method's.
+        True if the method's own model explains the star; otherwise its PSF is another method's.
     """
 
     psf: np.ndarray
@@ -166,12 +166,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Look:
-    """How a method is called and drawn.
+    """Label, colour and marker of a method in tables and figures.
 
     Attributes
     ----------
     label, color, marker : str
-        In tables and figures. What the method is given beside the image is added to its label.
+        What the method is given besides the image (`Needs`) is added to the label.
     paper : (str, str) or None
         Its row in the paper's tables as data, and as printed.
     drawn : bool
@@ -190,7 +190,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a method is given, and what a fit takes.
+    """Inputs of a method besides the image, and resources of a fit.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class Needs:
     validation : bool
         The fit leaves out the validation stars, or only chooses by them.
     memory_mb, minutes : int
-        What a fit takes at most.
+        Memory and time of a fit at most.
     """
 
     level: bool = False
@@ -212,14 +212,14 @@ class Needs:
     minutes: int = 30
 
     def __str__(self) -> str:
-        """What is given, as the end of a label: " (given λ, position)"."""
+        """Return the inputs as the end of a label: " (given λ, position)"."""
         names = ["λ"] * self.level + ["position"] * self.position
         return f" (given {', '.join(names)})" if names else ""
 
 
 @dataclass(frozen=True)
 class Storage:
-    """What a fit leaves on the disk, and the names of all that make it; see `psfdae.fits`.
+    """Files of a fit, and the names of the rule and runs that make them; see `psfdae.fits`.
 
     Attributes
     ----------
@@ -269,10 +269,10 @@ class Packing:
 
 @runtime_checkable
 class MeasuresStars(Protocol):
-    """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
+    """Method that measures flux, sky and centre of a star together with its PSF."""
 
-    def beyond(self, position: np.ndarray) -> np.ndarray:
-        """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
 
     def measure(
         self,
@@ -285,62 +285,62 @@ class MeasuresStars(Protocol):
         sky: np.ndarray | None = None,
         gain: np.ndarray | None = None,
     ) -> Estimate:
-        """From stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
+        """Measure stars on stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
 
 
 @runtime_checkable
 class DrawsStars(Protocol):
-    """Draws stars as they may be, by all that a fit leaves open."""
+    """Method that draws stars from their distribution, the uncertainty of its fit included."""
 
     def draw_stars(
         self, count: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
+        """Draw noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
 
     def fitted_flux_error(self) -> float:
-        """Error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
+        """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
 
 
 @runtime_checkable
 class KnowsField(Protocol):
-    """Knows the PSF between the stars."""
+    """Method that has a model of the PSF at every place of the field."""
 
     @property
     def order(self) -> int:
-        """Of the polynomial by which the PSF changes over the field."""
+        """Order of the polynomial by which the PSF changes over the field."""
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
+        """Return the PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
 
     def facts(self) -> Mapping[str, str]:
-        """What a fit knows of the field that its user should: a title and words for each."""
+        """Return facts about the field that a user should know, by their titles."""
 
 
 @runtime_checkable
 class FreesFlux(Protocol):
-    """Has a form for images whose flux and sky are estimates, and their sum therefore 1."""
+    """Method with a form for images whose flux and sky are estimates, and their sum is 1."""
 
     def free_flux(self) -> Self:
-        """That form."""
+        """Return the form for images whose flux and sky are estimates."""
 
 
 @runtime_checkable
 class FindsFlux(FreesFlux, Protocol):
-    """Finds, in that form, the flux of a star in that by which its image was divided."""
+    """Method that measures, in that form, the flux over that by which an image was divided."""
 
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, object]:
-        """That flux of images (n, d, d), shape (n,), and which parts of its law are near them.
+        """Return this flux of images (n, d, d), shape (n,), and which clusters are near them.
 
-        `estimate` and `outlier_score` take the latter as `near` and look at no other part.
+        `estimate` and `outlier_score` take the latter as `near_clusters` and look at no other.
         """
 
 
 @runtime_checkable
 class ScoresOutliers(Protocol):
-    """Has a law of the training stars."""
+    """Method that knows the distribution of the training stars, so that it scores outliers."""
 
     def outlier_score(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """How unlike all training stars images (n, d, d) are, shape (n,).
+        """Return how unlike all training stars images (n, d, d) are, shape (n,).
 
         −2 ln of the probability density; for a normal law the square of Mahalanobis' distance.
         """
@@ -348,19 +348,19 @@ class ScoresOutliers(Protocol):
 
 @runtime_checkable
 class HasConditions(Protocol):
-    """Knows conditions that the arrays of any fit fulfil."""
+    """Method with conditions that the arrays of any fit fulfil, to detect damaged files."""
 
     def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
-        """Name of an array, what it must have in words, and whether it has it, bool."""
+        """Yield the name of an array, what it must have in words, and whether it has it."""
 
 
 @runtime_checkable
 class GoesOn(Protocol):
-    """A fit to templates may go on from one to the realisations."""
+    """Method whose training on templates may start from a fit to the realisations."""
 
     @classmethod
     def continues(cls, config: Config) -> bool:
-        """Whether it does, by its settings."""
+        """Return True if the settings ask for this start."""
 
 
 class Method:
@@ -400,7 +400,7 @@ class Method:
 
     @classmethod
     def settings(cls, config: Config) -> dict[str, Group]:
-        """Its groups of a configuration, as `fit` takes them."""
+        """Return its groups of a configuration, as `fit` takes them."""
         return {name: getattr(config, name) for name in cls.groups}
 
     @classmethod
@@ -409,31 +409,31 @@ class Method:
 
     @classmethod
     def threads(cls, config: Config) -> int:
-        """Threads of a fit: the setting of that name, if there is one."""
+        """Return the threads of a fit: the setting of that name, or 1 if there is none."""
         groups = cls.settings(config).values()
         return next((g.threads for g in groups if hasattr(g, "threads")), 1)
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
-        """PSFs of noisy images at a noise level λ, or one of each image, shape (n,).
+        """Return the PSFs of noisy images at a noise level λ, or one per image, shape (n,).
 
-        A method that knows their uncertainty, or the images' evidence, gives it here.
+        A method that knows their uncertainty, or the images' evidence, adds it here.
         """
         return Estimate(self.restore(noisy, level, position))
 
     def restore(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
-        """`predict`, given what the method needs beside the image."""
-        given = (level,) * self.needs.level + (position,) * self.needs.position
-        return self.predict(noisy, *given)
+        """Return the PSFs by `predict`, which gets what the method needs besides the image."""
+        inputs = (level,) * self.needs.level + (position,) * self.needs.position
+        return self.predict(noisy, *inputs)
 
     # A fit as files, and as part of a bundle.
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
-        columns = {n: Column(getattr(self, n), *said) for n, said in self.stored().items()}
+        columns = {n: Column(getattr(self, n), *facts) for n, facts in self.stored().items()}
         write_product(place, self.name, columns, described)
 
     @classmethod
@@ -460,23 +460,23 @@ class Method:
 
     @classmethod
     def stored(cls) -> Mapping[str, tuple[str, str]]:
-        """Arrays of a fit, with unit and meaning; none of a method that leaves no file."""
+        """Return unit and meaning of each array of a fit; none if the method leaves no file."""
         return cls.storage.arrays if cls.storage else {}
 
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:
-        """The resolved configuration of a fit."""
+        """Return the resolved configuration of a fit."""
         return read_product(place, cls.name, ()).config
 
     @classmethod
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """A fit from its arrays and the configuration that was saved with them."""
+        """Return a fit from its arrays and the configuration that was saved with them."""
         return cls(**arrays)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Arrays for a bundle, and fields of its `BundleInfo` that say what they are.
+        """Return the arrays for a bundle, and fields of its `BundleInfo` that describe them.
 
         `noise` is the least RMS per pixel, over the flux, that they are for.
         """
@@ -484,20 +484,20 @@ class Method:
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """Arrays that a bundle must have, with their shapes; None: any."""
+        """Return the arrays that a bundle must have, with their shapes; None: any."""
         return dict.fromkeys(cls.stored())
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
-        """A fit from a bundle."""
+        """Return a fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
 
 
 def with_free_flux(fitted: Method) -> Method:
-    """The form of a fit for images whose flux and sky are estimates, or the fit if it has none."""
+    """Return the form of a fit for estimated flux and sky, or the fit itself if it has none."""
     return fitted.free_flux() if isinstance(fitted, FreesFlux) else fitted
 
 
 def facts_of(fitted: Method) -> list[str]:
-    """What a fit knows of the field, in sentences without a stop."""
+    """Return the facts that a fit knows about the field, in sentences without a full stop."""
     return [*fitted.facts().values()] if isinstance(fitted, KnowsField) else []

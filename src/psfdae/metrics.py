@@ -18,7 +18,7 @@ BLOCK = 256
 
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
-    """Mean squared error of every stamp, shape (n,)."""
+    """Return the mean squared error of every stamp, shape (n,)."""
     difference = estimates.astype(np.float64) - references
     return np.asarray((difference**2).mean(axis=(1, 2)))
 
@@ -26,7 +26,7 @@ def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
 def ssim(
     estimates: np.ndarray, references: np.ndarray, *data_ranges: float | np.ndarray
 ) -> np.ndarray:
-    """Structural similarity of every stamp, what scikit-image's defaults give.
+    """Return the structural similarity of every stamp, as scikit-image does by default.
 
     The mean over all places of the window inside the stamp of Wang et al. 2004 (IEEE Trans.
     Image Process. 13, 600), eq. 13, with sample covariances. Several dynamic ranges share
@@ -59,7 +59,7 @@ def ssim(
     inside = ((place >= 0) & (place < SSIM_WINDOW)) / SSIM_WINDOW
 
     def mean(images: np.ndarray) -> np.ndarray:
-        """Of every window, transposed: its sum over all places is wanted."""
+        """Return the mean of every window, transposed: only its sum over all places is used."""
         rows = (images.reshape(-1, side) @ inside).reshape(len(images), side, -1)
         columns = np.ascontiguousarray(rows.swapaxes(1, 2)).reshape(-1, side)
         return np.asarray((columns @ inside).reshape(len(images), *inside.shape[1:], -1))
@@ -85,14 +85,14 @@ def ssim(
 
 
 def peak_range(references: np.ndarray) -> np.ndarray:
-    """Maximum minus minimum of every reference, shape (n,)."""
+    """Return the maximum minus minimum of every reference, shape (n,)."""
     return np.asarray(references.max(axis=(1, 2)) - references.min(axis=(1, 2)))
 
 
 def all_metrics(
     estimates: np.ndarray, references: np.ndarray, data_range: float
 ) -> dict[str, np.ndarray]:
-    """Every metric of the tables for every star.
+    """Return every metric of the tables for every star.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def all_metrics(
 
 
 def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[str, np.ndarray]:
-    """Metrics of every star (n,); of a method that says how sure it is, whether that is true.
+    """Return metrics of every star (n,), of its PSF and of the stated uncertainty.
 
     Beside those of `all_metrics`: `coverage68`, the part of the pixels within ± σ, `evidence`, and
     whether the star is `explained`, 1 or 0.
@@ -125,17 +125,19 @@ def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[st
 def summarised(
     row: Mapping[str, object], metrics: Mapping[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Mean of each metric with its standard error by field, each added to a copy of `row`."""
+    """Return the mean of each metric with its standard error, clustered by field, as table rows.
+
+    Each is added to a copy of `row`.
+    """
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
-        found = {"metric": metric, "value": mean, "stderr": stderr}
-        rows.append({**row, **found, "n": values.size})
+        rows.append({**row, "metric": metric, "value": mean, "stderr": stderr, "n": values.size})
     return rows
 
 
 def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """Mean and its standard error when stars of a field are not independent.
+    """Return a mean and its standard error when stars of a field are not independent.
 
     SE² = G/(G − 1) Σ_g (Σ_{i∈g} (v_i − v̄))² / n², the cluster-robust variance of a
     mean (Liang & Zeger 1986) with G clusters.
@@ -164,9 +166,9 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
 def clustered_ratio(
     values: np.ndarray, others: np.ndarray, cluster: np.ndarray
 ) -> tuple[float, float]:
-    """Ratio R = v̄/w̄ of two means over the same stars, and its standard error.
+    """Return the ratio R = v̄/w̄ of two means over the same stars, and its standard error.
 
-    That of the linearised ratio, the mean of (v − R w)/w̄ (Cochran 1977, Sampling
+    The error is that of the linearised ratio, the mean of (v − R w)/w̄ (Cochran 1977, Sampling
     Techniques, sect. 6.4), clustered as in `clustered_mean`.
 
     Parameters
@@ -181,14 +183,10 @@ def clustered_ratio(
     return ratio, stderr
 
 
-LEAST_SAMPLES = 4
-"""Fisher's z has the standard error 1/√(n − 3): fewer samples have no interval."""
-
-
 def error_correlation(
     errors: np.ndarray, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pearson correlations of signed errors with intervals from Fisher's z.
+    """Return Pearson correlations of signed errors with intervals from Fisher's z.
 
     z = artanh r is nearly normal with the standard error 1/√(n − 3) for
     independent, jointly normal errors (Fisher 1921, Metron 1, 3).
@@ -228,21 +226,28 @@ def error_correlation(
     np.fill_diagonal(matrix, 1.0)
     with np.errstate(divide="ignore"):
         z = np.arctanh(matrix)
+    # Interval z ± q/√(n − 3); with fewer than four samples there is none.
     half = norm.isf(0.5 * (1.0 - confidence)) / np.sqrt(max(count - 3, 1))
     low, high = np.tanh(z - half), np.tanh(z + half)
-    if count < LEAST_SAMPLES:
-        off = ~np.eye(len(matrix), dtype=bool)
-        low[off] = high[off] = np.nan
+    if count < 4:
+        off_diagonal = ~np.eye(len(matrix), dtype=bool)
+        low[off_diagonal] = high[off_diagonal] = np.nan
     for array in (matrix, low, high):
         array[~varies, :] = array[:, ~varies] = np.nan
     return matrix, low, high
 
 
 def seed_stderr(scatter: float, metric: str, mean: float) -> float:
-    """Standard deviation of a mean error between seeds, from that of the MSE over the MSE.
+    """Return the standard deviation of a mean error between seeds of a training.
 
-    What SSIM misses of 1 is nearly proportional to the squared error; NaN for other metrics, and
-    where the scatter is NaN, not measured.
+    Parameters
+    ----------
+    scatter : float
+        Standard deviation of the MSE between seeds, over the MSE; NaN if it was not measured.
+    metric : str
+        "mse", or an SSIM, of which 1 − SSIM is nearly proportional to the MSE; NaN for others.
+    mean : float
+        Mean of the metric.
     """
-    lost = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
-    return scatter * lost
+    error = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
+    return scatter * error

@@ -1,21 +1,32 @@
-"""Sums over the laws of a mixture, and what all mixtures take a star's flux for."""
+"""Weights of the parts of a mixture, and the prior of a star's flux in all mixtures."""
 
 from __future__ import annotations
 
 import numpy as np
 
 LEAST_WEIGHT = 1e-3
-"""Least weight of a law that counts in the sum over a mixture."""
+"""Least weight of a part that counts in the sum over a mixture."""
 
 FLUX_SIGMA = 0.2
-"""Standard deviation of a star's flux over what it was found to be before."""
+"""Standard deviation of a star's flux over its first estimate."""
 
 
 def mixing_weights(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (n, K) of K laws from ln of their probabilities, and ln of these' sum, (n,).
+    """Return the weights of the parts of a mixture, such as its nodes or clusters.
 
-    Those below `LEAST_WEIGHT` are 0.
+    Parameters
+    ----------
+    log : ndarray, shape (n, K)
+        ln of prior times likelihood of each of K parts, for n stars.
+
+    Returns
+    -------
+    weight : ndarray, shape (n, K)
+        Weights of sum 1; those below `LEAST_WEIGHT` are 0.
+    evidence : ndarray, shape (n,)
+        ln of the sum of prior times likelihood over all parts.
     """
+    # Relative to the largest one, so that no exponential overflows.
     peak = log.max(axis=1)
     weight = np.exp(log - peak[:, None])
     total = weight.sum(axis=1)

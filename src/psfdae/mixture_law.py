@@ -1,33 +1,18 @@
-"""The law of stars of a Gaussian mixture, and the posterior mean under it.
+"""Posterior of a star under a Gaussian mixture: its PSF, flux and evidence.
 
-Noise-free images x and their references y come from clusters k of weight π_k, in each of
-which they are jointly normal. The posterior mean of a noisy image z is then a weighted
-sum of linear estimators (Zoran & Weiss 2011, ICCV, 479; Yu, Sapiro & Mallat 2012, IEEE
+Noise-free images x and their references y come from clusters k of training stars with probability
+π_k, in each of which they are jointly normal. The posterior mean of a noisy image z is then a
+weighted sum of linear estimators (Zoran & Weiss 2011, ICCV, 479; Yu, Sapiro & Mallat 2012, IEEE
 TIP 21, 2481),
 
-    ŷ = Σ w_k [μ_y,k + C_yx,k (C_k + s)⁻¹ (z − μ_k)],   w_k ∝ π_k N(z; μ_k, C_k + s),
+    ŷ = Σ w_k [μ_y,k + C_yx,k G_k⁻¹ (z − μ_k)],   w_k ∝ π_k N(z; μ_k, G_k),   G_k = C_k + s,
 
-with the noise variance s of a pixel: (κλ)², and the star's own photons spread evenly,
-which costs less than 1 % of the error. Linear MMSE is the case of one cluster.
+with the variance s of a pixel's noise. Equations are numbered as on the page docs/mixture.md, which
+has the shrinkage of the covariances, methods that are given positions, and images whose flux and
+sky are estimates.
 
-Where the images have noise of their own, as bright stars do, its covariance is taken off
-S and every XᵀX, and what would be negative is 0.
-
-All covariances of a cluster of n_k stars are shrunk towards those within all clusters:
-C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. The
-eigenvectors of C_k do not depend on the noise: along the leading ones C_k + s is diagonal for
-every star, and beyond them C_k is taken for even. Where all images have one noise, Woodbury's
-identity takes less than eigenvectors. Coordinates are the eigenvectors of S; only in the leading
-ones do clusters differ by more than the noise hides.
-
-A method that is given where the star stands has two more numbers p in the observed vector,
-without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
-follows p linearly, and X_k are the deviations that p leaves, with two rows more for what
-the slope of the cluster differs from that of all.
-
-An image whose flux and sky are estimates is a x + (1 − a)/P with a factor a about 1, for
-its sum is 1. Little is known of a; it is one more row of X_k, σ_a (μ_k − 1/P), and of
-Y_k, σ_a μ_y,k with σ_a = `FLUX_SIGMA`.
+Coordinates are the eigenvectors of S, the covariance within all clusters. In the leading ones,
+clusters have covariances of their own; in the others, noise hides how they differ.
 """
 
 from __future__ import annotations
@@ -45,30 +30,20 @@ from psfdae.mixing import mixing_weights
 from psfdae.noise import NoiseModel
 
 NOISE_BIN = 2.0
-"""Range of ln s of stars for which the same coordinates and axes of a cluster count."""
-
-DET_NODES = 41
-"""Of ln s in such a range, between which determinants are interpolated."""
+"""Range of ln s of stars for which the same coordinates and axes of a cluster are used."""
 
 NOISE_STEP = 0.4
-"""Step in ln s between stars that share the variance of their pixels over s."""
+"""Step in ln s between stars that share the posterior variance of their pixels over s."""
 
-NEAREST, LEADING = 32, 64
-"""Clusters that are looked at, and coordinates in which they are found; the others of 512
-hold less than 1 % of the weight."""
-
-OUTLIER_COORDINATES, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviation", "slope")
-"""Coordinates that tell outliers, and arrays whose last axis they are. More of them find
-more outliers that are bright, and fewer that are faint."""
+OUTLIER_COORDINATES = 40
+"""Number of leading coordinates that enter the outlier score. More of them detect more outliers
+that are bright, and fewer that are faint."""
 
 FLAT_VARIANCE = 0.005
-"""Variance of a coordinate over s below which all clusters share one normal law."""
+"""Variance of a coordinate over s below which all clusters share one normal distribution there."""
 
 LEAST_VARIANCE = 5e-4
-"""Variance over s of a cluster's axes; of smaller ones only the mean is known."""
-
-IMAGES_AT_ONCE = 4096
-"""Images that are restored together."""
+"""Variance over s of a cluster's axes; of axes with less, only the mean variance is used."""
 
 
 class Cluster(NamedTuple):
@@ -76,30 +51,30 @@ class Cluster(NamedTuple):
 
     Attributes
     ----------
-    own, own_reference : ndarray, shape (r, P)
-        Deviations X_k in the axes and Y_k in pixels, or rows of the same products if these
-        are fewer.
-    square : ndarray, shape (P,)
+    residuals, reference_residuals : ndarray, shape (r, P)
+        Residuals X_k in coordinates and Y_k in pixels, or rows of the same products if these are
+        fewer.
+    reference_square : ndarray, shape (P,)
         Diagonal of YᵀY.
-    slope, slope_reference : ndarray, shape (q, P)
+    slope, reference_slope : ndarray, shape (q, P)
         Change of the means per unit of the position.
-    spread : ndarray, shape (q, q)
-        Inverse of the Cholesky factor of P_k.
-    common, scale : float
-        Factors of S and of XᵀX in C_k.
+    position_whitening : ndarray, shape (q, q)
+        Inverse of the Cholesky factor of P_k, the covariance of the positions.
+    common_factor, residual_factor : float
+        Factors of S and of XᵀX in C_k: ν/(n_k + ν) and 1/(n_k + ν).
     """
 
-    own: np.ndarray
-    own_reference: np.ndarray
-    square: np.ndarray
+    residuals: np.ndarray
+    reference_residuals: np.ndarray
+    reference_square: np.ndarray
     slope: np.ndarray
-    slope_reference: np.ndarray
-    spread: np.ndarray
-    common: float
-    scale: float
+    reference_slope: np.ndarray
+    position_whitening: np.ndarray
+    common_factor: float
+    residual_factor: float
 
 
-class Axes(NamedTuple):
+class ClusterAxes(NamedTuple):
     """Eigenvectors of C_k in the leading w coordinates.
 
     Attributes
@@ -107,60 +82,66 @@ class Axes(NamedTuple):
     vectors : ndarray, shape (w, w), float32
         Columns, by descending variance.
     variance : ndarray, shape (w,)
-        Along them.
-    total : float
+        Variance along each.
+    total_variance : float
         Sum of the variances.
     """
 
     vectors: np.ndarray
     variance: np.ndarray
-    total: float
+    total_variance: float
 
 
-class Spectrum(NamedTuple):
-    """(C_k + s)⁻¹ of a cluster for any noise variance s (n, 1) above `Seen.least`, along its axes.
+class AxesInverse(NamedTuple):
+    """G_k⁻¹ of a cluster for any noise variance s above `StarBatch.least_variance` (eq. 4).
+
+    Noise variances s of n stars are arrays of shape (n, 1).
 
     Attributes
     ----------
     vectors : ndarray, shape (m, a), float32
-        Columns V.
+        Axes V, columns.
     variance : ndarray, shape (a,)
-        λ along them.
-    rest : float
-        Mean variance beyond them in the m coordinates; infinite if there is nothing beyond.
+        Variance λ along each axis.
+    variance_beyond : float
+        Mean variance λ₀ beyond the axes in the m coordinates; infinite if nothing is beyond.
     """
 
     vectors: np.ndarray
     variance: np.ndarray
-    rest: float
+    variance_beyond: float
 
     def _inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Along the axes (n, a) and beyond them (n, 1)."""
+        """Return 1/(λ + s) along the axes, (n, a), and 1/(λ₀ + s) beyond them, (n, 1)."""
         variance = self.variance.astype(s.dtype)
-        return 1 / (variance + s), 1 / (s.dtype.type(self.rest) + s)
+        return 1 / (variance + s), 1 / (s.dtype.type(self.variance_beyond) + s)
 
-    def solved(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Its product with rows (n, m)."""
+    def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return the product of rows (n, m) with G⁻¹, (n, m)."""
         along, beyond = self._inverse(s)
         axes = rows @ self.vectors
+        # One product with the axes for both: V (λ + s)⁻¹ Vᵀ and the projection V Vᵀ of the rows.
         both = np.vstack([along * axes, axes]) @ self.vectors.T
         return np.asarray(both[: len(rows)] + beyond * (rows - both[len(rows) :]))
 
-    def distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Its products with rows (n, m) on both sides, (n,)."""
+    def squared_distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ xᵀ of each of the rows x (n, m), with its own noise, (n,)."""
         along, beyond = self._inverse(s)
         squares = np.square(rows @ self.vectors)
-        left = np.square(rows).sum(axis=1) - squares.sum(axis=1)
-        return np.asarray((squares * along).sum(axis=1) + left * beyond[:, 0])
+        squares_beyond = np.square(rows).sum(axis=1) - squares.sum(axis=1)
+        return np.asarray((squares * along).sum(axis=1) + squares_beyond * beyond[:, 0])
 
-    def product(self, rows: np.ndarray, one: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Its products with rows (n, m) and another one (m,), (n,)."""
+    def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
         along, beyond = self._inverse(s)
-        axes, of_axes = rows @ self.vectors, one @ self.vectors
-        return np.asarray((along * axes) @ of_axes + beyond[:, 0] * (rows @ one - axes @ of_axes))
+        row_axes, vector_axes = rows @ self.vectors, vector @ self.vectors
+        return np.asarray(
+            (along * row_axes) @ vector_axes
+            + beyond[:, 0] * (rows @ vector - row_axes @ vector_axes)
+        )
 
-    def distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """As `distance`, of rows (r, m) for every s, (n, r)."""
+    def squared_distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ xᵀ of every row x (r, m) for every noise variance, (n, r)."""
         along, beyond = self._inverse(s)
         squares = np.square(rows @ self.vectors).T
         return np.asarray(
@@ -168,84 +149,90 @@ class Spectrum(NamedTuple):
         )
 
     def half_log_det(self, s: np.ndarray) -> np.ndarray:
-        """½ ln det(C_k + s) of some s (n,), in the m coordinates."""
-        more = len(self.vectors) - len(self.variance)
+        """Return ½ ln det G for noise variances s (n,), in the m coordinates, (n,)."""
+        dimensions = len(self.vectors) - len(self.variance)
         along = np.log(self.variance + s[:, None]).sum(axis=1)
-        return np.asarray(0.5 * (along + (more * np.log(self.rest + s) if more else 0.0)))
+        beyond = dimensions * np.log(self.variance_beyond + s) if dimensions else 0.0
+        return np.asarray(0.5 * (along + beyond))
 
 
-class LowRank(NamedTuple):
-    """The same for one noise variance, which takes far less to make (Woodbury's identity).
+class WoodburyInverse(NamedTuple):
+    """G_k⁻¹ for one noise variance, which takes far less to compute than axes (eq. 5).
+
+    Methods are those of `AxesInverse`; their argument s only says how many results are wanted.
 
     Attributes
     ----------
-    certain : ndarray, shape (m,)
-        D⁻¹, with C_k + s = D + UᵀU and a diagonal D.
+    diagonal : ndarray, shape (m,)
+        D⁻¹, with G_k = D + UᵀU and a diagonal D.
     rows : ndarray, shape (r, m), float32
-        L⁻¹ U D⁻¹, with L Lᵀ = 1 + U D⁻¹ Uᵀ; (C_k + s)⁻¹ is D⁻¹ less the products of these.
+        L⁻¹ U D⁻¹, with L Lᵀ = 1 + U D⁻¹ Uᵀ; G_k⁻¹ is D⁻¹ less the products of these.
     half_log : float
-        ½ ln det(C_k + s).
+        ½ ln det G_k.
     """
 
-    certain: np.ndarray
+    diagonal: np.ndarray
     rows: np.ndarray
     half_log: float
 
-    def solved(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """As `Spectrum`."""
-        certain = self.certain.astype(rows.dtype)
-        return np.asarray(rows * certain - (rows @ self.rows.T) @ self.rows)
+    def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return the product of rows (n, m) with G⁻¹, (n, m)."""
+        diagonal = self.diagonal.astype(rows.dtype)
+        return np.asarray(rows * diagonal - (rows @ self.rows.T) @ self.rows)
 
-    def distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """As `Spectrum`."""
-        known = np.square(rows @ self.rows.T).sum(axis=1)
-        return np.asarray(np.square(rows) @ self.certain.astype(rows.dtype) - known)
+    def squared_distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ xᵀ of each of the rows x (n, m), (n,)."""
+        explained = np.square(rows @ self.rows.T).sum(axis=1)
+        return np.asarray(np.square(rows) @ self.diagonal.astype(rows.dtype) - explained)
 
-    def product(self, rows: np.ndarray, one: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """As `Spectrum`."""
-        return np.asarray(rows @ (self.certain * one) - (rows @ self.rows.T) @ (self.rows @ one))
+    def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
+        return np.asarray(
+            rows @ (self.diagonal * vector) - (rows @ self.rows.T) @ (self.rows @ vector)
+        )
 
-    def distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """As `Spectrum`."""
-        known = np.square(rows) @ self.certain - np.square(rows @ self.rows.T).sum(axis=1)
-        return np.asarray(np.repeat(known[None], len(s), axis=0))
+    def squared_distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return x G⁻¹ xᵀ of every row x (r, m), the same for every s, (n, r)."""
+        distance = np.square(rows) @ self.diagonal - np.square(rows @ self.rows.T).sum(axis=1)
+        return np.asarray(np.repeat(distance[None], len(s), axis=0))
 
     def half_log_det(self, s: np.ndarray) -> np.ndarray:
-        """As `Spectrum`."""
+        """Return ½ ln det G, the same for every s (n,), (n,)."""
         return np.full(len(s), self.half_log)
 
 
-class Seen(NamedTuple):
-    """Images of about the same noise.
+class StarBatch(NamedTuple):
+    """Noisy images of stars whose noise is about the same.
 
     Attributes
     ----------
-    flat : ndarray, shape (n, P)
-    z : ndarray, shape (n, P), float32
-        In the axes of S.
-    where : ndarray, shape (n, q)
-        Positions, whitened.
-    s : ndarray, shape (n, 1), float32
-    node : ndarray, shape (n,)
-        s or what is near it, of which there are few.
-    least : float
-        Below every s.
-    alone : float or None
+    images : ndarray, shape (n, P)
+    coordinates : ndarray, shape (n, P), float32
+        The images z in the eigenvectors of S.
+    position : ndarray, shape (n, q)
+        Whitened positions p.
+    noise_variance : ndarray, shape (n, 1), float32
+        s of each star.
+    rounded_variance : ndarray, shape (n,)
+        s rounded to steps of `NOISE_STEP` in ln, so that few values differ.
+    least_variance : float
+        Lower end of the bin in which every s lies.
+    common_variance : float or None
         The noise variance of all images, if one level was given for all.
     """
 
-    flat: np.ndarray
-    z: np.ndarray
-    where: np.ndarray
-    s: np.ndarray
-    node: np.ndarray
-    least: float
-    alone: float | None
+    images: np.ndarray
+    coordinates: np.ndarray
+    position: np.ndarray
+    noise_variance: np.ndarray
+    rounded_variance: np.ndarray
+    least_variance: float
+    common_variance: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureLaw:
-    """A mixture of normal laws of stars and of their references.
+    """Mixture of normal distributions of stars and of their references.
 
     Attributes
     ----------
@@ -254,33 +241,34 @@ class MixtureLaw:
     variance : ndarray, shape (P,)
         Eigenvalues of S.
     count : ndarray of int, shape (K,)
-        Stars of each cluster.
+        Number of stars of each cluster.
     rows : ndarray of int, shape (K,)
-        Rows of `deviation` of each cluster: its stars, or fewer with the same products.
+        Number of rows of `deviation` of each cluster: its stars, or fewer with the same products.
     mean : ndarray, shape (K, P)
-        μ_x in the axes.
+        μ_x in coordinates.
     mean_reference : ndarray, shape (K, P), or (0, P)
         μ_y in pixels; none where the references are the images.
     deviation : ndarray, shape (n, P)
-        Stars less their cluster's mean, in the axes, cluster by cluster; in a bundle
-        the main axes of each, times the root of the sum of squares along them.
+        Residuals of the stars about their cluster's mean, in coordinates, cluster by cluster; in a
+        bundle the main axes of each, times the root of the sum of squares along them.
     deviation_reference : ndarray, shape (n, P), or (0, P)
         The same of the references in pixels; none where they are the images.
     cross : ndarray, shape (P, P), or (0, P)
-        Covariance within clusters of references (pixels) and images (axes).
+        Covariance within clusters of references (pixels) and images (coordinates).
     variance_reference : ndarray, shape (P,), or (0,)
         Variance of the references within clusters.
     whitening : ndarray, shape (q, q)
-        To positions of unit variance within clusters; q = 2 where they are given, else 0.
+        Matrix to positions of unit variance within clusters; q = 2 where positions are given,
+        else 0.
     center, deviation_center : ndarray, shape (K, q) and (n, q)
         Mean whitened position of each cluster, and each star's deviation from it.
     slope, slope_reference : ndarray, shape (q, P)
         Change with position that is common to all clusters; deviations are without it.
     shrinkage : ndarray, shape (1,)
-        ν.
+        ν: the number of stars for which S counts in each cluster.
     noise : NoiseModel
-    loose : float
-        Standard deviation of a, or 0 where fluxes are known.
+    flux_sigma : float
+        Standard deviation σ_a of the flux factor a, or 0 where fluxes are known (eq. 10).
     """
 
     axes: np.ndarray
@@ -300,344 +288,456 @@ class MixtureLaw:
     slope_reference: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
-    loose: float = 0.0
-    _spectra: dict[tuple[int, int], Axes] = field(default_factory=dict, init=False, repr=False)
-    _of_one: dict[tuple[int, float], list[LowRank]] = field(
+    flux_sigma: float = 0.0
+    _axes_cache: dict[tuple[int, int], ClusterAxes] = field(
         default_factory=dict, init=False, repr=False
     )
-    _doubts: dict[tuple[int, float, float], np.ndarray] = field(
+    _inverse_cache: dict[tuple[int, float], list[WoodburyInverse]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    _variance_cache: dict[tuple[int, float, float], np.ndarray] = field(
         default_factory=dict, init=False, repr=False
     )
 
-    def _parts(
+    @property
+    def _restores_images(self) -> bool:
+        """The references are the noise-free images themselves, y = x."""
+        return not len(self.cross)
+
+    # The posterior of stars.
+
+    def _batches(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
-    ) -> Iterator[tuple[np.ndarray, Seen]]:
-        """Images (n, d, d) of about the same noise, and their numbers."""
+    ) -> Iterator[tuple[np.ndarray, StarBatch]]:
+        """Yield the numbers of images of about the same noise, and these images.
+
+        Parameters
+        ----------
+        noisy : ndarray, shape (n, d, d)
+        level : float or ndarray, shape (n,)
+            Noise level λ.
+        position : ndarray, shape (n, q), optional
+
+        Raises
+        ------
+        ValueError
+            If a pixel is not finite.
+        """
         flat = noisy.reshape(len(noisy), math.prod(noisy.shape[1:]))
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
-        where = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
-        even = np.full(len(flat), 1.0 / flat.shape[1])
-        s = self.noise.variance(even, np.asarray(level))
-        # Not by how many there are: stars do not influence each other.
-        node = np.exp(np.rint(np.log(s) / NOISE_STEP) * NOISE_STEP) if np.ndim(level) else s
-        s, node = (np.broadcast_to(a, len(flat)) for a in (s, node))
-        alone = None if np.ndim(level) else float(s[0]) if len(s) else None
-        range_of = np.floor(np.log(s) / NOISE_BIN)
-        for number in np.unique(range_of):
-            (stars,) = (range_of == number).nonzero()
+        place = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
+        # Variance of a pixel if the star's photons are spread evenly over the stamp.
+        even_star = np.full(len(flat), 1.0 / flat.shape[1])
+        s = self.noise.variance(even_star, np.asarray(level))
+        # Rounding depends on the value alone, not on the other stars: they do not influence
+        # each other.
+        rounded = np.exp(np.rint(np.log(s) / NOISE_STEP) * NOISE_STEP) if np.ndim(level) else s
+        s, rounded = (np.broadcast_to(a, len(flat)) for a in (s, rounded))
+        common = None if np.ndim(level) else float(s[0]) if len(s) else None
+        noise_bin = np.floor(np.log(s) / NOISE_BIN)
+        for number in np.unique(noise_bin):
+            (stars,) = (noise_bin == number).nonzero()
             least = float(np.exp(NOISE_BIN * number))
-            for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
+            # At most 4096 images together limit the memory.
+            for part in np.array_split(stars, -(-stars.size // 4096)):
                 images = flat.take(part, axis=0)
-                z = (images @ self.axes).astype(np.float32)
-                of_noise = s[part, None].astype(np.float32), node[part], least, alone
-                yield part, Seen(images, z, where[part], *of_noise)
+                yield (
+                    part,
+                    StarBatch(
+                        images=images,
+                        coordinates=(images @ self.axes).astype(np.float32),
+                        position=place[part],
+                        noise_variance=s[part, None].astype(np.float32),
+                        rounded_variance=rounded[part],
+                        least_variance=least,
+                        common_variance=common,
+                    ),
+                )
 
     def _estimate(
         self,
         noisy: np.ndarray,
         level: float | np.ndarray,
         position: np.ndarray | None,
-        sure: bool,
-        near: np.ndarray | None = None,
+        with_sigma: bool,
+        near_clusters: np.ndarray | None = None,
     ) -> Estimate:
-        """Estimates, from the clusters that are `near`, (n, K) of bool."""
+        """Return the posterior of images from the clusters that are near, (n, K) of bool."""
         psf, sigma = (np.empty(noisy.shape, np.float32) for _ in range(2))
         evidence, flux = np.empty((2, len(noisy)))
-        for part, seen in self._parts(noisy, level, position):
-            weight, evidence[part] = self._weights(seen, None if near is None else near[part])
-            own, doubt = self._posterior(seen, weight, sure)
-            if self.loose:
-                flux[part] = self._flux(seen, weight)
-                if not len(self.cross):  # the sky of the image is no part of the star
-                    own += ((flux[part] - 1.0) / own.shape[1])[:, None]
-            psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (own, doubt))
-        return Estimate(psf, sigma if sure else None, evidence, flux if self.loose else None)
+        for part, batch in self._batches(noisy, level, position):
+            near = None if near_clusters is None else near_clusters[part]
+            weight, evidence[part] = self._weights(batch, near)
+            mean, mean_sigma = self._posterior(batch, weight, with_sigma)
+            if self.flux_sigma:
+                flux[part] = self._flux(batch, weight)
+                # The image is a x + (1 − a)/P: its sky (1 − a)/P is no part of the star.
+                if self._restores_images:
+                    mean += ((flux[part] - 1.0) / mean.shape[1])[:, None]
+            psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (mean, mean_sigma))
+        return Estimate(
+            psf,
+            sigma if with_sigma else None,
+            evidence,
+            flux if self.flux_sigma else None,
+        )
 
-    def _weights(self, seen: Seen, near: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Weight of each cluster for each image, (n, K), and the images' evidence."""
-        weight, evidence = mixing_weights(self._log_densities(seen, near))
-        evidence -= 0.5 * seen.z.shape[1] * np.log(2 * np.pi)
+    def _weights(self, batch: StarBatch, near: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weight of each cluster for each image, (n, K), and the evidence (eq. 6)."""
+        weight, evidence = mixing_weights(self._log_densities(batch, near))
+        evidence -= 0.5 * batch.coordinates.shape[1] * np.log(2 * np.pi)
         return weight.astype(np.float32), evidence
 
     def _posterior(
-        self, seen: Seen, weight: np.ndarray, sure: bool
+        self, batch: StarBatch, weight: np.ndarray, with_sigma: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior mean and its σ, (n, P), NaN unless `sure`."""
-        same, m = not len(self.cross), self._known(seen.least)
-        # Noise of simulated stars may be far above the star, which cancels in second − first².
-        sums = np.float32 if seen.alone is None else np.float64
-        first, second = np.zeros((2, *seen.flat.shape), sums)
-        others = weight @ self.mean[:, m:]  # in the other coordinates
+        """Return the posterior mean (n, P) and its σ, NaN unless `with_sigma` (eq. 7 and 8)."""
+        same, m = self._restores_images, self._modelled_count(batch.least_variance)
+        # Noise of simulated stars may be far above the star: second − first² would cancel in
+        # single precision.
+        sum_type = np.float32 if batch.common_variance is None else np.float64
+        first, second = np.zeros((2, *batch.images.shape), sum_type)
+        # Weighted means of the clusters in the coordinates beyond the leading m.
+        mean_beyond = weight @ self.mean[:, m:]
         images = self.axes if same else self.cross
-        lead = np.zeros((len(weight), m), np.float32)  # sums over clusters, where no σ is asked
-        for k, rows, at, residual, cut in self._pairs(seen, weight > 0, m):
-            cluster, w, s = self._clusters[k], weight[rows, k, None], seen.s[rows]
-            g = cut.solved(residual, s)
-            if at.size:
-                others[rows] += w * (at @ cluster.slope[:, m:])
-            linear = (-s if same else cluster.common) * g
-            one = linear @ images[:, :m].T if sure else np.float32(0.0)
+        # Without σ, what is linear in the images is summed over the clusters in coordinates, and
+        # turned into pixels once.
+        linear_sum = np.zeros((len(weight), m), np.float32)
+        for k, rows, offset, residual, inverse in self._pairs(batch, weight > 0, m):
+            cluster, w, s = self._clusters[k], weight[rows, k, None], batch.noise_variance[rows]
+            # C_yx G⁻¹ (z − μ): with y = x, it is (z − μ) − s G⁻¹ (z − μ), and z is added at the
+            # end; otherwise C_yx has a common part and that of the cluster's own residuals.
+            gained = inverse.solve(residual, s)
+            if offset.size:
+                mean_beyond[rows] += w * (offset @ cluster.slope[:, m:])
+            linear = (-s if same else cluster.common_factor) * gained
+            restored = linear @ images[:, :m].T if with_sigma else np.float32(0.0)
             if not same:
-                mean = (g @ cluster.own[:, :m].T) @ cluster.own_reference
-                one = one + self.mean_reference[k] + cluster.scale * mean
-                one += at @ cluster.slope_reference if at.size else 0.0
-            if sure or not same:
-                first[rows] += w * one
-            if sure:
-                doubt = s * self._doubt(k, seen, seen.node[rows])
-                second[rows] += w * (doubt + np.square(one, dtype=sums))
+                by_residuals = (gained @ cluster.residuals[:, :m].T) @ cluster.reference_residuals
+                restored = restored + self.mean_reference[k]
+                restored = restored + cluster.residual_factor * by_residuals
+                restored += offset @ cluster.reference_slope if offset.size else 0.0
+            if with_sigma or not same:
+                first[rows] += w * restored
+            if with_sigma:
+                variance = s * self._variance_ratio(k, batch, batch.rounded_variance[rows])
+                second[rows] += w * (variance + np.square(restored, dtype=sum_type))
             else:
-                lead[rows] += w * linear
-        if not sure:
-            first += lead @ images[:, :m].T
-        gain = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
-        sigma = np.sqrt(np.maximum(second - np.square(first), 0.0)) if sure else second + np.nan
+                linear_sum[rows] += w * linear
+        if not with_sigma:
+            first += linear_sum @ images[:, :m].T
+        # Coordinates beyond the leading ones have one linear estimator, S (S + s)⁻¹.
+        gain = (batch.coordinates[:, m:] - mean_beyond) / (
+            self.variance[m:].astype(np.float32) + batch.noise_variance
+        )
+        sigma = (
+            np.sqrt(np.maximum(second - np.square(first), 0.0)) if with_sigma else second + np.nan
+        )
         if same:
-            first += seen.flat - seen.s * gain @ images[:, m:].T
+            first += batch.images - batch.noise_variance * gain @ images[:, m:].T
         else:
             first += gain @ images[:, m:].T
         return first, sigma
 
-    def _flux(self, seen: Seen, weight: np.ndarray) -> np.ndarray:
-        """Posterior mean of a, (n,)."""
-        flux, m = np.ones(len(weight)), self._known(seen.least)
-        others = self.variance[m:].astype(np.float32)
-        for k, rows, _, residual, cut in self._pairs(seen, weight > 0, seen.z.shape[1]):
-            s, lead, contrast = seen.s[rows], residual[:, :m], self._contrast[k]
-            found = cut.product(lead, contrast[:m], s)
-            found += (residual[:, m:] / (others + s)) @ contrast[m:]
-            flux[rows] += self.loose**2 * weight[rows, k] * found
+    def _flux(self, batch: StarBatch, weight: np.ndarray) -> np.ndarray:
+        """Return the posterior mean of the flux factor a, (n,) (eq. 11)."""
+        flux, m = np.ones(len(weight)), self._modelled_count(batch.least_variance)
+        variance_beyond = self.variance[m:].astype(np.float32)
+        width = batch.coordinates.shape[1]
+        for k, rows, _, residual, inverse in self._pairs(batch, weight > 0, width):
+            s, leading, contrast = batch.noise_variance[rows], residual[:, :m], self._contrast[k]
+            product = inverse.product(leading, contrast[:m], s)
+            product += (residual[:, m:] / (variance_beyond + s)) @ contrast[m:]
+            flux[rows] += self.flux_sigma**2 * weight[rows, k] * product
         return flux
 
     def _pairs(
-        self, seen: Seen, near: np.ndarray, width: int
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, Spectrum | LowRank]]:
-        """Clusters with the images (n, K) of bool that are near.
+        self, batch: StarBatch, is_near: np.ndarray, width: int
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, AxesInverse | WoodburyInverse]]:
+        """Yield each cluster with the images to which it is near, (n, K) of bool.
 
-        Their numbers, positions and leading coordinates less the cluster's, and its (C_k + s)⁻¹.
+        Yields
+        ------
+        k : int
+            Number of the cluster.
+        rows : ndarray of int, shape (r,)
+            Numbers of the images.
+        offset : ndarray, shape (r, q)
+            Their whitened positions less that of the cluster.
+        residual : ndarray, shape (r, width)
+            Their leading coordinates less the cluster's mean at this position (eq. 9).
+        inverse : AxesInverse or WoodburyInverse
+            G_k⁻¹.
         """
-        leading = np.ascontiguousarray(seen.z[:, :width])
-        for k, of in enumerate(np.ascontiguousarray(near.T)):
-            (rows,) = of.nonzero()
+        leading = np.ascontiguousarray(batch.coordinates[:, :width])
+        for k, mask in enumerate(np.ascontiguousarray(is_near.T)):
+            (rows,) = mask.nonzero()
             if rows.size:
-                at = (seen.where[rows] - self.center[k]).astype(np.float32)
+                offset = (batch.position[rows] - self.center[k]).astype(np.float32)
                 residual = leading.take(rows, axis=0)
                 residual -= self.mean[k, :width]
-                if at.size:
-                    residual -= at @ self._clusters[k].slope[:, :width]
-                yield k, rows, at, residual, self._cut(k, seen)
+                if offset.size:
+                    residual -= offset @ self._clusters[k].slope[:, :width]
+                yield k, rows, offset, residual, self._inverse(k, batch)
 
-    def _log_densities(self, seen: Seen, near: np.ndarray | None) -> np.ndarray:
-        """ln of the probability of images under each cluster that is near, (n, K).
+    def _log_densities(self, batch: StarBatch, is_near: np.ndarray | None) -> np.ndarray:
+        """Return ln of π_k N(z; μ_k, G_k) for each near cluster, (n, K) (eq. 6).
 
-        Without the term of 2π.
+        Without the term of 2π; −inf for the other clusters.
         """
-        near = self._near(seen) if near is None else near
-        log = np.full((len(seen.z), len(self.count)), -np.inf)
-        width, m = self._leading(seen.least), self._known(seen.least)
-        ln_s = np.log(seen.s[:, 0].astype(np.float64))
-        nodes = np.log(seen.least) + np.linspace(0.0, NOISE_BIN, DET_NODES)
-        for k, rows, at, residual, cut in self._pairs(seen, near, width):
-            cluster, s = self._clusters[k], seen.s[rows]
-            far = cut.distance(residual[:, :m], s)
-            det = cut.half_log_det(np.exp(nodes))
+        is_near = self._nearest_clusters(batch) if is_near is None else is_near
+        log = np.full((len(batch.coordinates), len(self.count)), -np.inf)
+        # Coordinates: the leading m have covariances of clusters, those up to `width` their means
+        # alone, and the others are common to all clusters.
+        width = self._distinct_count(batch.least_variance)
+        m = self._modelled_count(batch.least_variance)
+        # ½ ln det G as a function of ln s is interpolated between 41 values in the bin.
+        ln_s = np.log(batch.noise_variance[:, 0].astype(np.float64))
+        ln_grid = np.log(batch.least_variance) + np.linspace(0.0, NOISE_BIN, 41)
+        for k, rows, offset, residual, inverse in self._pairs(batch, is_near, width):
+            cluster, s = self._clusters[k], batch.noise_variance[rows]
+            distance2 = inverse.squared_distance(residual[:, :m], s)
+            half_log_det = inverse.half_log_det(np.exp(ln_grid))
             if width > m:
-                more = self.variance[m:width]
-                far += (np.square(residual[:, m:]) / (more + s)).sum(axis=1)
-                det += 0.5 * np.log(more + np.exp(nodes)[:, None]).sum(axis=1)
-            far = far.astype(np.float64)
-            if at.size:
-                far += np.square(at @ cluster.spread.T).sum(axis=1)
+                variance = self.variance[m:width]
+                distance2 += (np.square(residual[:, m:]) / (variance + s)).sum(axis=1)
+                half_log_det += 0.5 * np.log(variance + np.exp(ln_grid)[:, None]).sum(axis=1)
+            distance2 = distance2.astype(np.float64)
+            if offset.size:
+                distance2 += np.square(offset @ cluster.position_whitening.T).sum(axis=1)
             constant = np.log(self.count[k] / self.count.sum())
-            constant += np.log(cluster.spread.diagonal()).sum()
-            log[rows, k] = constant - np.interp(ln_s[rows], nodes, det) - 0.5 * far
-        # In the other coordinates all clusters have nearly one law.
-        variance = self.variance[width:] + seen.s
-        rest = np.square(seen.z[:, width:] - self._middle[width:])
-        log -= 0.5 * (rest / variance + np.log(variance)).sum(axis=1, keepdims=True)
+            constant += np.log(cluster.position_whitening.diagonal()).sum()
+            log[rows, k] = constant - np.interp(ln_s[rows], ln_grid, half_log_det) - 0.5 * distance2
+        # In the other coordinates all clusters have nearly one normal distribution.
+        variance = self.variance[width:] + batch.noise_variance
+        square = np.square(batch.coordinates[:, width:] - self._overall_mean[width:])
+        log -= 0.5 * (square / variance + np.log(variance)).sum(axis=1, keepdims=True)
         return log
 
     @cached_property
     def _contrast(self) -> np.ndarray:
-        """Mean of each cluster less an even sky of the same sum, in the axes, (K, P)."""
+        """Mean of each cluster less an even sky of the same sum, μ_k − 1/P, (K, P)."""
         return np.asarray(self.mean - self.axes.mean(axis=0))
 
-    def _near(self, seen: Seen) -> np.ndarray:
-        """Clusters that are nearest by the common covariance, (n, K) of bool."""
-        if len(self.count) <= NEAREST:
-            return np.ones((len(seen.z), len(self.count)), bool)
+    def _nearest_clusters(self, batch: StarBatch) -> np.ndarray:
+        """Return the 32 clusters that are nearest by the common covariance S, (n, K) of bool.
+
+        The other ones of 512 hold less than 1 % of the weight; 64 coordinates find them.
+        """
+        limit, leading = 32, 64
+        if len(self.count) <= limit:
+            return np.ones((len(batch.coordinates), len(self.count)), bool)
         star, mean = (
-            (a - p @ self.slope)[:, :LEADING]
-            for a, p in ((seen.z, seen.where), (self.mean, self.center))
+            (a - p @ self.slope)[:, :leading]
+            for a, p in ((batch.coordinates, batch.position), (self.mean, self.center))
         )
-        certain = 1.0 / (self.variance[:LEADING] + seen.s)
-        distance = certain @ np.square(mean).T - 2.0 * (certain * star) @ mean.T
-        distance += np.square(self.center).sum(axis=1) - 2.0 * seen.where @ self.center.T
-        nearest = np.argpartition(distance, NEAREST, axis=1)[:, :NEAREST]
-        near = np.zeros(distance.shape, bool)
-        np.put_along_axis(near, nearest, True, axis=1)
-        return near
+        # |z − μ_k|² with (S + s)⁻¹, less |z|², which is the same for all clusters.
+        precision = 1.0 / (self.variance[:leading] + batch.noise_variance)
+        distance2 = precision @ np.square(mean).T - 2.0 * (precision * star) @ mean.T
+        distance2 += np.square(self.center).sum(axis=1) - 2.0 * batch.position @ self.center.T
+        nearest = np.argpartition(distance2, limit, axis=1)[:, :limit]
+        is_near = np.zeros(distance2.shape, bool)
+        np.put_along_axis(is_near, nearest, True, axis=1)
+        return is_near
+
+    # The clusters.
 
     @cached_property
     def _clusters(self) -> list[Cluster]:
-        """Each cluster with its own slope, by the same shrinkage as its covariances."""
+        """Each cluster, its slope shrunk as its covariances are (eq. 9)."""
         p, nu, total = self.deviation_center, float(self.shrinkage[0]), self.count + self.shrinkage
         ends = self.rows.cumsum()
         parts = [slice(b - n, b) for b, n in zip(ends, self.rows, strict=True)]
         scatter = np.array([p[rows].T @ p[rows] for rows in parts]) + nu * np.eye(p.shape[1])
         inverse = np.linalg.inv(scatter)
-        spread = np.linalg.inv(np.linalg.cholesky(scatter / total[:, None, None]))
-        return [self._cluster(k, rows, inverse[k], spread[k]) for k, rows in enumerate(parts)]
+        whitening = np.linalg.inv(np.linalg.cholesky(scatter / total[:, None, None]))
+        return [self._cluster(k, rows, inverse[k], whitening[k]) for k, rows in enumerate(parts)]
 
-    def _cluster(self, k: int, rows: slice, inverse: np.ndarray, spread: np.ndarray) -> Cluster:
-        """`inverse` is that of the positions' scatter, (q, q), and ν."""
+    def _cluster(self, k: int, rows: slice, inverse: np.ndarray, whitening: np.ndarray) -> Cluster:
+        """Return one cluster.
+
+        Parameters
+        ----------
+        k : int
+        rows : slice
+            Rows of its residuals in `deviation`.
+        inverse : ndarray, shape (q, q)
+            (p pᵀ + ν)⁻¹ of the positions p of its stars.
+        whitening : ndarray, shape (q, q)
+            `Cluster.position_whitening`.
+        """
         p = self.deviation_center[rows]
         nu, total = float(self.shrinkage[0]), self.count[k] + float(self.shrinkage[0])
 
-        def sloped(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """Deviations without the slope of the cluster, and that slope.
+        def without_slope(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return residuals without the slope of the cluster, and that slope.
 
-            What it differs from that of all counts as rows of its own, of weight ν.
+            What it differs from that of all clusters counts as rows of its own, of weight ν.
             """
             if not (p.size and len(a)):
                 return a, common
-            own = (inverse @ (p.T @ a)).astype(np.float32)
-            rows = np.vstack([a - p.astype(np.float32) @ own, np.float32(np.sqrt(nu)) * own])
-            return rows, common + own
+            extra = (inverse @ (p.T @ a)).astype(np.float32)
+            rows = np.vstack([a - p.astype(np.float32) @ extra, np.float32(np.sqrt(nu)) * extra])
+            return rows, common + extra
 
-        own, slope = sloped(self.deviation[rows], self.slope)
-        own_reference, slope_reference = sloped(
-            self.deviation_reference[rows if len(self.cross) else slice(0)], self.slope_reference
+        residuals, slope = without_slope(self.deviation[rows], self.slope)
+        reference_residuals, reference_slope = without_slope(
+            self.deviation_reference[slice(0) if self._restores_images else rows],
+            self.slope_reference,
         )
-        if self.loose:
-            weight = np.float32(self.loose * np.sqrt(total))
-            own = np.vstack([own, weight * self._contrast[k, : own.shape[1]]])
-            if len(own_reference):
+        # An unknown flux is one row more (eq. 10).
+        if self.flux_sigma:
+            weight = np.float32(self.flux_sigma * np.sqrt(total))
+            contrast = weight * self._contrast[k, : residuals.shape[1]]
+            residuals = np.vstack([residuals, contrast])
+            if len(reference_residuals):
                 row = weight * self.mean_reference[k]
-                own_reference = np.vstack([own_reference, row])
-        square = np.square(own_reference).sum(axis=0)
-        if len(own) > own.shape[1]:
-            rotation, own = np.linalg.qr(own)
-            own_reference = rotation.T @ own_reference if len(own_reference) else own_reference
+                reference_residuals = np.vstack([reference_residuals, row])
+        square = np.square(reference_residuals).sum(axis=0)
+        # More rows than columns: rows of the same products, X = Q R.
+        if len(residuals) > residuals.shape[1]:
+            rotation, residuals = np.linalg.qr(residuals)
+            if len(reference_residuals):
+                reference_residuals = rotation.T @ reference_residuals
         return Cluster(
-            *(own, own_reference, square, slope, slope_reference, spread),
-            *(float(nu / total), float(1 / total)),
+            residuals=residuals,
+            reference_residuals=reference_residuals,
+            reference_square=square,
+            slope=slope,
+            reference_slope=reference_slope,
+            position_whitening=whitening,
+            common_factor=float(nu / total),
+            residual_factor=float(1 / total),
         )
 
-    def _cut(self, k: int, seen: Seen) -> Spectrum | LowRank:
-        """(C_k + s)⁻¹ of a cluster for the noise of some images."""
-        s, width = seen.least, self._known(seen.least)
-        if seen.alone is not None:
-            return self._factors(width, seen.alone)[k]
+    def _inverse(self, k: int, batch: StarBatch) -> AxesInverse | WoodburyInverse:
+        """Return G_k⁻¹ for the noise of some images, in the leading coordinates."""
+        s, width = batch.least_variance, self._modelled_count(batch.least_variance)
+        if batch.common_variance is not None:
+            return self._woodbury_inverses(width, batch.common_variance)[k]
         axes = self._axes(k, width)
         width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
-        more = width - len(variance)
-        rest = (axes.total - variance.sum()) / more if more else np.inf
-        return Spectrum(axes.vectors[:, : len(variance)], variance, float(rest))
+        dimensions = width - len(variance)
+        beyond = (axes.total_variance - variance.sum()) / dimensions if dimensions else np.inf
+        return AxesInverse(axes.vectors[:, : len(variance)], variance, float(beyond))
 
-    def _factors(self, width: int, s: float) -> list[LowRank]:
-        """(C_k + s)⁻¹ of all clusters, those with as many rows together; kept for the last s."""
-        if found := self._of_one.get((width, s)):
-            return found
-        made: dict[int, LowRank] = {}
-        for size in np.unique([len(cluster.own) for cluster in self._clusters]):
-            numbers = [k for k, cluster in enumerate(self._clusters) if len(cluster.own) == size]
-            some = [self._clusters[k] for k in numbers]
-            common, scale = (np.array([[getattr(c, n)] for c in some]) for n in ("common", "scale"))
+    def _woodbury_inverses(self, width: int, s: float) -> list[WoodburyInverse]:
+        """Return G_k⁻¹ of all clusters for one noise variance; those of the last one are kept."""
+        if cached := self._inverse_cache.get((width, s)):
+            return cached
+        inverses: dict[int, WoodburyInverse] = {}
+        # Clusters with as many rows are one stack of matrices.
+        for size in np.unique([len(cluster.residuals) for cluster in self._clusters]):
+            numbers = [
+                k for k, cluster in enumerate(self._clusters) if len(cluster.residuals) == size
+            ]
+            clusters = [self._clusters[k] for k in numbers]
+            common = np.array([[cluster.common_factor] for cluster in clusters])
+            factor = np.array([[cluster.residual_factor] for cluster in clusters])
+            # Eq. 5: D, U, U D⁻¹, L, ½ ln det G and L⁻¹ U D⁻¹.
             diagonal = common * self.variance[:width] + s
-            rows = np.stack([c.own[:, :width] for c in some]) * np.sqrt(scale)[..., None]
-            certain = rows / diagonal[:, None]
-            lower = np.linalg.cholesky(np.eye(size) + certain @ rows.transpose(0, 2, 1))
+            rows = np.stack([c.residuals[:, :width] for c in clusters])
+            rows = rows * np.sqrt(factor)[..., None]
+            weighted = rows / diagonal[:, None]
+            lower = np.linalg.cholesky(np.eye(size) + weighted @ rows.transpose(0, 2, 1))
             half_log = 0.5 * np.log(diagonal).sum(axis=1)
             half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-            factors = (np.linalg.inv(lower) @ certain).astype(np.float32)
-            made |= dict(zip(numbers, map(LowRank, 1.0 / diagonal, factors, half_log), strict=True))
-        self._of_one.clear()
-        found = self._of_one[width, s] = [made[k] for k in range(len(self.count))]
-        return found
+            solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
+            parts = map(WoodburyInverse, 1.0 / diagonal, solved, half_log)
+            inverses |= dict(zip(numbers, parts, strict=True))
+        self._inverse_cache.clear()
+        self._inverse_cache[width, s] = [inverses[k] for k in range(len(self.count))]
+        return self._inverse_cache[width, s]
 
-    def _axes(self, k: int, width: int) -> Axes:
-        """Axes of C_k, made once."""
-        if (k, width) not in self._spectra:
+    def _axes(self, k: int, width: int) -> ClusterAxes:
+        """Return the axes of C_k in the leading coordinates, which are computed once."""
+        if (k, width) not in self._axes_cache:
+            # C_k = (X_kᵀ X_k + ν S) / (n_k + ν), with S diagonal in these coordinates (eq. 2).
             cluster = self._clusters[k]
-            rows = cluster.own[:, :width].astype(np.float64)
-            covariance = cluster.scale * (rows.T @ rows)
-            covariance[np.diag_indices(width)] += cluster.common * self.variance[:width]
+            rows = cluster.residuals[:, :width].astype(np.float64)
+            covariance = cluster.residual_factor * (rows.T @ rows)
+            covariance[np.diag_indices(width)] += cluster.common_factor * self.variance[:width]
             variance, vectors = np.linalg.eigh(covariance)
-            self._spectra[k, width] = Axes(
+            self._axes_cache[k, width] = ClusterAxes(
                 np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
                 np.maximum(variance[::-1], 0.0),
                 float(np.trace(covariance)),
             )
-        return self._spectra[k, width]
+        return self._axes_cache[k, width]
 
-    def _leading(self, s: float) -> int:
-        """Coordinates in which clusters differ at a noise variance s.
+    def _distinct_count(self, s: float) -> int:
+        """Return the number of leading coordinates in which clusters differ at noise variance s.
 
-        That is by the largest variance of all stars along an axis or one after it.
+        They end where no later coordinate has a variance of all stars above `FLAT_VARIANCE` s.
         """
-        return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT_VARIANCE * s))
+        largest = np.maximum.accumulate(self._total_variance[::-1])
+        return int(np.count_nonzero(largest > FLAT_VARIANCE * s))
 
-    def _known(self, s: float) -> int:
-        """Leading coordinates in which clusters have covariances of their own."""
-        return min(self._leading(s), int(self.deviation.shape[1]))
+    def _modelled_count(self, s: float) -> int:
+        """Return the number of leading coordinates in which clusters have own covariances."""
+        return min(self._distinct_count(s), int(self.deviation.shape[1]))
 
     @cached_property
-    def _middle(self) -> np.ndarray:
-        """Mean of all stars in the axes, (P,)."""
+    def _overall_mean(self) -> np.ndarray:
+        """Mean of all stars in coordinates, (P,)."""
         return np.asarray(np.average(self.mean, axis=0, weights=self.count))
 
     @cached_property
-    def _total(self) -> np.ndarray:
-        """Variance of all stars along the axes."""
-        between = np.average(np.square(self.mean - self._middle), axis=0, weights=self.count)
-        loose = np.square(self.loose * self._contrast).max(axis=0)
-        return np.asarray(self.variance + between + np.square(self.slope).sum(axis=0) + loose)
+    def _total_variance(self) -> np.ndarray:
+        """Variance of all stars along each coordinate, (P,), of a free flux at least."""
+        between = np.average(np.square(self.mean - self._overall_mean), axis=0, weights=self.count)
+        by_flux = np.square(self.flux_sigma * self._contrast).max(axis=0)
+        return np.asarray(self.variance + between + np.square(self.slope).sum(axis=0) + by_flux)
 
-    def _doubt(self, k: int, seen: Seen, node: np.ndarray) -> np.ndarray:
-        """Variance over s of the pixels of images (n, P) once they are known, inside a cluster.
+    # The posterior variance of pixels.
 
-        Of those noise variances s (n,), of which few differ.
+    def _variance_ratio(self, k: int, batch: StarBatch, s: np.ndarray) -> np.ndarray:
+        """Return the posterior variance of pixels over s, (n, P), inside cluster k (eq. 8).
+
+        It is computed once for each of the noise variances s (n,), of which few differ.
         """
-        nodes, which = np.unique(node, return_inverse=True)
-        keys = [(k, seen.alone or seen.least, s) for s in nodes.tolist()]
-        if new := [key for key in keys if key not in self._doubts]:
-            found = self._doubts_of(k, seen, np.array([s for _, _, s in new]))
-            self._doubts.update(zip(new, found, strict=True))
-        return np.stack([self._doubts[key] for key in keys])[which]
+        unique, index = np.unique(s, return_inverse=True)
+        scale = batch.common_variance or batch.least_variance
+        keys = [(k, scale, variance) for variance in unique.tolist()]
+        if missing := [key for key in keys if key not in self._variance_cache]:
+            ratios = self._computed_variance_ratio(k, batch, np.array([v for _, _, v in missing]))
+            self._variance_cache.update(zip(missing, ratios, strict=True))
+        return np.stack([self._variance_cache[key] for key in keys])[index]
 
-    def _doubts_of(self, k: int, seen: Seen, s: np.ndarray) -> np.ndarray:
-        cluster, m, s = self._clusters[k], self._known(seen.least), s[:, None]
-        # Covariance of references with the leading coordinates; images are their own references.
-        lead = self.axes[:, :m]
-        if len(self.cross):
-            lead = cluster.common * self.cross[:, :m]
-            lead = lead + cluster.scale * cluster.own_reference.T @ cluster.own[:, :m]
-        known = self._cut(k, seen).distances(lead, s)
-        known += (1.0 / (self.variance[m:] + s)) @ self._squares[:, m:].T
-        if not len(self.cross):
-            return np.asarray(np.maximum(1.0 - s * known, 0.0))
-        prior = cluster.common * self.variance_reference + cluster.scale * cluster.square
-        return np.asarray(np.maximum(prior - known, 0.0) / s)
+    def _computed_variance_ratio(self, k: int, batch: StarBatch, s: np.ndarray) -> np.ndarray:
+        """Return the posterior variance of pixels over s, (n, P), inside cluster k (eq. 8)."""
+        m, s = self._modelled_count(batch.least_variance), s[:, None]
+        cluster = self._clusters[k]
+        # Covariance of references with the leading coordinates; images are their own references,
+        # for which it is s (1 − s G⁻¹).
+        leading = self.axes[:, :m]
+        if not self._restores_images:
+            leading = cluster.common_factor * self.cross[:, :m]
+            by_residuals = cluster.residual_factor * cluster.reference_residuals.T
+            leading = leading + by_residuals @ cluster.residuals[:, :m]
+        explained = self._inverse(k, batch).squared_distances(leading, s)
+        explained += (1.0 / (self.variance[m:] + s)) @ self._squares[:, m:].T
+        if self._restores_images:
+            return np.asarray(np.maximum(1.0 - s * explained, 0.0))
+        prior = cluster.common_factor * self.variance_reference
+        prior = prior + cluster.residual_factor * cluster.reference_square
+        return np.asarray(np.maximum(prior - explained, 0.0) / s)
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """Squares of the axes in pixels, or of the covariances with references, (P, P)."""
-        return np.asarray(np.square(self.cross if len(self.cross) else self.axes))
+        """Squares of the coordinate axes in pixels, or of their covariances with references."""
+        return np.asarray(np.square(self.axes if self._restores_images else self.cross))
 
     @cached_property
-    def _telling(self) -> Self:
-        """The law of the leading coordinates."""
-        none = np.empty((0, 0), np.float32)
-        cut: dict[str, Any] = {
-            n: np.ascontiguousarray(getattr(self, n)[..., :OUTLIER_COORDINATES])
-            for n in LEADING_ARRAYS
+    def _outlier_law(self) -> Self:
+        """The mixture in the leading `OUTLIER_COORDINATES` alone (eq. 12)."""
+        empty = np.empty((0, 0), np.float32)
+        # Arrays whose last axis are the coordinates.
+        arrays: dict[str, Any] = {
+            name: np.ascontiguousarray(getattr(self, name)[..., :OUTLIER_COORDINATES])
+            for name in ("axes", "variance", "mean", "deviation", "slope")
         }
         return replace(
-            self,
-            **cut,
-            cross=none,
-            deviation_reference=none,
-            slope_reference=none,
+            self, **arrays, cross=empty, deviation_reference=empty, slope_reference=empty
         )

@@ -28,26 +28,37 @@ LEAST_VARIANCE_PX2 = 0.08  # along an axis, that of the pixel itself
 
 
 def robust_scatter(values: np.ndarray) -> np.ndarray:
-    """Standard deviation along the first axis, from the median distance from the median."""
+    """Return the standard deviation along the first axis, from the median absolute deviation."""
     middle = np.median(values, axis=0)
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
 
 def moved(wide: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None) -> np.ndarray:
-    """Stamps (n, s, s) moved by (row, column) pixels (n, 2), the edges repeated.
+    """Return stamps shifted by cubic splines, their edge pixels repeated outside.
 
-    If `stamp` (m,) chooses some, once or several times, these by shifts (m, 2).
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    shift : ndarray, shape (m, 2)
+        (row, column) in pixels.
+    stamp : ndarray of int, shape (m,), optional
+        Stamp of each shift, once or several times; by default each stamp once, m = n.
+
+    Returns
+    -------
+    ndarray, shape (m, s, s)
     """
     from scipy import ndimage
 
-    side, around = wide.shape[-1], 12  # pixels around a stamp, beyond which no edge counts
-    some, stamp = np.unique(np.arange(len(wide)) if stamp is None else stamp, return_inverse=True)
+    # A margin of 12 px, beyond which an edge has no influence on a spline inside.
+    side, margin = wide.shape[-1], 12
+    used, stamp = np.unique(np.arange(len(wide)) if stamp is None else stamp, return_inverse=True)
     # Coefficients of the splines through the pixels of each stamp.
-    splines = np.pad(wide[some], ((0, 0), (around, around), (around, around)), mode="edge")
+    splines = np.pad(wide[used], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
     for axis in (1, 2):
         splines = ndimage.spline_filter1d(splines, SPLINE_ORDER, axis, mode="nearest")
     # The pixels of a moved stamp lie at −shift among the knots; R c Cᵀ are their values.
-    out, knots = np.empty((len(stamp), side, side)), side + 2 * around
+    out, knots = np.empty((len(stamp), side, side)), side + 2 * margin
     pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
     for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
         place = np.clip(pixels - shift[part, :, None], -farthest, farthest)
@@ -57,30 +68,43 @@ def moved(wide: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None) 
 
 
 def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
-    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots).
+    """Return the values of cubic B-splines at some places, or their slopes.
 
-    If asked for, their slopes per pixel.
+    Parameters
+    ----------
+    place : ndarray, shape (…)
+        Places in pixels.
+    knots : int
+        Number of equidistant knots, in the middle of which place 0 lies.
+    spacing : float
+        Distance of two knots in pixels.
+    slope : bool
+        Return slopes per pixel.
+
+    Returns
+    -------
+    ndarray, shape (…, knots)
     """
     # At a part t of the way from one knot to the next, only the two knots on each side count.
     u = place / spacing + (knots - 1) / 2
     first = np.floor(u)
     t = u - first
     if slope:
-        near = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
-        values = np.stack(near, axis=-1) / spacing
+        parts = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
+        values = np.stack(parts, axis=-1) / spacing
     else:
         last = 1 - t
-        near = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
-        values = np.stack(near, axis=-1) / 6
+        parts = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
+        values = np.stack(parts, axis=-1) / 6
     # Four knots more on each side take what is beyond the others.
     out = np.zeros((*place.shape, knots + 8))
-    before = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
-    np.put_along_axis(out, before[..., None] + np.arange(3, 7), values, axis=-1)
+    knot = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
+    np.put_along_axis(out, knot[..., None] + np.arange(3, 7), values, axis=-1)
     return out[..., 4:-4]
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
-    """Matrices (n, s, s) that move the pixels of an axis by n steps; beyond its ends is 0."""
+    """Return matrices (n, s, s) that shift the pixels of an axis by n steps; 0 beyond its ends."""
     from scipy import ndimage
 
     impulses = np.eye(side)
@@ -90,7 +114,7 @@ def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
 def windowed_centres(
     wide: np.ndarray, start: np.ndarray, window_px: np.ndarray, rounds: int, reach_px: float
 ) -> np.ndarray:
-    """Centroids under a Gaussian window that follows the star (Bertin's XWIN), shape (n, 2).
+    """Return centroids under a Gaussian window that follows the star (Bertin's XWIN), (n, 2).
 
     Parameters
     ----------
@@ -135,7 +159,7 @@ class Shapes:
     ellipticity : ndarray, shape (n,)
         1 − b/a of the axes of the ellipse.
     position_angle_deg : ndarray, shape (n,)
-        Of the major axis, from the columns' direction (+x) towards that of the
+        Angle of the major axis, from the columns' direction (+x) towards that of the
         rows (+y), −90 … 90.
     """
 
@@ -145,7 +169,7 @@ class Shapes:
 
 
 def measure_shapes(psf: np.ndarray) -> Shapes:
-    """Shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
+    """Return shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
     xx, xy, yy = _adaptive_moments(psf)
     with np.errstate(invalid="ignore"):
         determinant = xx * yy - xy**2
@@ -159,10 +183,11 @@ def measure_shapes(psf: np.ndarray) -> Shapes:
 
 
 def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
-    """M_xx, M_xy, M_yy, shape (3, n), float64."""
+    """Return the moments M_xx, M_xy, M_yy under a matched Gaussian weight, shape (3, n)."""
     count, side = len(psf), psf.shape[-1]
     light = np.maximum(psf.reshape(count, -1), 0.0).astype(np.float32)
     peak = light.max(axis=1, initial=0.0)
+    # PSFs without light are replaced by flat ones, and are NaN in the end.
     lit = np.isfinite(peak) & (peak > 0)
     light /= np.where(lit, peak, 1.0)[:, None]
     light[~lit] = 1.0
@@ -171,19 +196,22 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     moments = _bounded(*moments, side)
     weighted = np.empty_like(light)
     for _ in range(WEIGHT_UPDATES):
+        # Moments under a weight a little wider than the PSF; then those of the Gaussian that would
+        # have them.
         weight = (moments[0] + WEIGHT_WIDER_PX2, moments[1], moments[2] + WEIGHT_WIDER_PX2)
         np.matmul(_exponent(x, y, *weight), terms, out=weighted)
         np.exp(weighted, out=weighted)
         weighted *= light
-        x1, y1, seen = _centre_and_moments(weighted @ terms.T)
-        moments = _bounded(*_without_weight(seen, weight), side)
-        x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in _moved(x, y, x1, y1, seen, moments))
+        x1, y1, weighted_moments = _centre_and_moments(weighted @ terms.T)
+        moments = _bounded(*_without_weight(weighted_moments, weight), side)
+        centre = _without_weight_centre(x, y, x1, y1, weighted_moments, moments)
+        x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in centre)
     return np.where(lit, np.array(moments), np.nan)
 
 
 @cache
 def _monomials(side: int) -> np.ndarray:
-    """1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²)."""
+    """Return 1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²)."""
     y, x = (axis.ravel() for axis in np.indices((side, side)) - 0.5 * (side - 1))
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
 
@@ -193,36 +221,39 @@ Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matrix]:
-    """x, y and central second moments from the sums over `_monomials`, shape (n, 6)."""
+    """Return x, y and central second moments from the sums over `_monomials`, shape (n, 6)."""
     total = np.maximum(sums[:, 0].astype(np.float64), 1e-30)
     x, y, xx, xy, yy = sums[:, 1:].T / total
     return x, y, (xx - x * x, xy - x * y, yy - y * y)
 
 
-def _without_weight(seen: Matrix, weight: Matrix) -> Matrix:
-    """Moments T + T(W − T)⁻¹T of the Gaussian that shows the moments T under the weight W.
+def _without_weight(weighted: Matrix, weight: Matrix) -> Matrix:
+    """Return the moments T + T(W − T)⁻¹T of the Gaussian that has T under the weight W.
 
-    Twice the moments seen where no Gaussian does: the PSF is flat.
+    Twice the moments T where no Gaussian does: the PSF is flat.
     """
-    a, b, c = (w - t for w, t in zip(weight, seen, strict=True))
+    a, b, c = (w - t for w, t in zip(weight, weighted, strict=True))
     determinant = a * c - b * b
     gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
     determinant = np.where(gaussian, determinant, 1.0)
-    xx, xy, yy = seen
-    more = (
+    xx, xy, yy = weighted
+    correction = (
         (xx * xx * c - 2.0 * xx * xy * b + xy * xy * a) / determinant,
         (xx * xy * c - (xx * yy + xy * xy) * b + xy * yy * a) / determinant,
         (xy * xy * c - 2.0 * xy * yy * b + yy * yy * a) / determinant,
     )
-    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(seen, more, strict=True))
+    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(weighted, correction, strict=True))
     return xx, xy, yy
 
 
-def _moved(
-    x: np.ndarray, y: np.ndarray, x1: np.ndarray, y1: np.ndarray, seen: Matrix, moments: Matrix
+def _without_weight_centre(
+    x: np.ndarray, y: np.ndarray, x1: np.ndarray, y1: np.ndarray, weighted: Matrix, moments: Matrix
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centre c + M T⁻¹ (c₁ − c) of a Gaussian of moments M whose weighted centre is c₁."""
-    xx, xy, yy = seen
+    """Return the centre c + M T⁻¹ (c₁ − c) of a Gaussian of moments M.
+
+    Its centre under a weight about c is c₁ = (x1, y1), with the moments T = `weighted`.
+    """
+    xx, xy, yy = weighted
     determinant = np.maximum(xx * yy - xy * xy, 1e-12)
     u = (yy * (x1 - x) - xy * (y1 - y)) / determinant
     v = (xx * (y1 - y) - xy * (x1 - x)) / determinant
@@ -230,16 +261,16 @@ def _moved(
 
 
 def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
-    """Moments, limited to what makes sense for a stamp."""
+    """Return moments between those of a pixel and of a stamp, of an ellipse with real axes."""
     xx, yy = (np.clip(variance, LEAST_VARIANCE_PX2, (0.5 * side) ** 2) for variance in (xx, yy))
-    most = 0.99 * np.sqrt(xx * yy)
-    return xx, np.clip(xy, -most, most), yy
+    limit = 0.99 * np.sqrt(xx * yy)
+    return xx, np.clip(xy, -limit, limit), yy
 
 
 def _exponent(
     x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray
 ) -> np.ndarray:
-    """Coefficients of `_monomials` in the exponent of the weight, shape (n, 6)."""
+    """Return the coefficients of `_monomials` in the exponent of the weight, shape (n, 6)."""
     determinant = xx * yy - xy**2
     a, b, c = yy / determinant, -xy / determinant, xx / determinant
     constant = a * x * x + 2.0 * b * x * y + c * y * y

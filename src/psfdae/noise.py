@@ -37,20 +37,20 @@ class NoiseModel:
     background: float
 
     def flux(self, level: np.ndarray | float) -> np.ndarray:
-        """Flux F in photons inside the stamp of a star of noise level λ."""
+        """Return the flux F in photons inside the stamp of a star of noise level λ."""
         photons: np.ndarray = np.sqrt(self.background) / (
             self.kappa * np.asarray(level, np.float64)
         )
         return photons
 
     def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
-        """Pixel variance of a normalised image; `level` broadcasts against `psf`."""
+        """Return the pixel variance of a normalised image; `level` broadcasts against `psf`."""
         return np.asarray((self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level))
 
     def draw(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
     ) -> np.ndarray:
-        """Noisy images of stars, sky-subtracted and normalised by the true flux.
+        """Draw noisy images of stars, sky-subtracted and normalised by the true flux.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class NoiseModel:
     ) -> np.ndarray:
         """Draw images with Gaussian noise of the same variance as `draw`, for training only.
 
-        With 1e4 photons of sky in a pixel the two laws differ by 1 % in skewness,
+        With 1e4 photons of sky in a pixel the two distributions differ by 1 % in skewness,
         and the draw takes a tenth of the time.
         """
         sigma: np.ndarray = np.sqrt(self.variance(psf, _per_image(level, psf)))
@@ -82,29 +82,28 @@ class NoiseModel:
 
 
 def _per_image(values: np.ndarray | float, psf: np.ndarray) -> np.ndarray:
-    """One value for each of the images (B, ...), ready to be broadcast against them."""
+    """Return one value for each of the images (B, ...), with axes to broadcast against them."""
     return np.broadcast_to(values, len(psf)).reshape(-1, *[1] * (psf.ndim - 1))
 
 
 def mixed_levels(levels: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """A random noise level λ of a band for each of `count` stars, shape (count,)."""
+    """Draw a noise level λ of a band for each of `count` stars, shape (count,)."""
     return levels[rng.integers(levels.size, size=count)]
 
 
 def noise_equivalent_px(psf: np.ndarray) -> float:
-    """Noise-equivalent area A = 1/Σp² in pixels of a PSF p of sum 1 (King 1983, PASP 95, 163).
+    """Return the noise-equivalent area A = 1/Σp² in pixels of a PSF p of sum 1.
 
-    Of several, shape (n, d, d), that of their mean Σp². The mean of their images would be wider
-    than each of them, because they lie at different places in their stamps.
+    (King 1983, PASP 95, 163.) For several PSFs, shape (n, d, d), it is that of their mean Σp². The
+    mean of their images would be wider than each of them, because they lie at different places in
+    their stamps.
     """
     count = len(psf) if psf.ndim == 3 else 1
     return count / float(np.square(psf, dtype=np.float64).sum())
 
 
-TINY = 1e-300
-
-
-PHASES = 17  # from 0 to ½ pixel, at which the correlation of moved noise is known
+PHASES = 17
+"""Number of shifts from 0 to ½ pixel at which the correlation of shifted noise is tabulated."""
 
 
 @dataclass(frozen=True)
@@ -129,31 +128,46 @@ class OwnNoise:
     star: np.ndarray
 
     def __call__(self, images: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """What noise adds to the scatter (P, P) of some images about their mean (P,), of sum 1.
+        """Return what noise adds to the scatter of images about their mean, shape (P, P).
 
         Splines mix neighbouring pixels, along rows and columns alike, and dividing by the
         sum takes noise along the star away. Pixels have the variance of the sky and of the
-        star's photons (`psfdae_paper.stars.noise`), these of the mean image.
+        star's photons (`NoiseModel`), these of the mean image.
+
+        Parameters
+        ----------
+        images : ndarray of int
+            Indices of the images.
+        mean : ndarray, shape (P,)
+            Mean of these images, of sum 1.
         """
-        _, same, count = np.unique(self.star[images], return_inverse=True, return_counts=True)
-        part = 1.0 - count[same] / images.size  # the mean has its own share of each star's noise
+        # The mean has its own share of each star's noise, which is no scatter about it.
+        _, star, count = np.unique(self.star[images], return_inverse=True, return_counts=True)
+        part = 1.0 - count[star] / images.size
         noise, side = self.noise[images], round(mean.size**0.5)
         sky = part * noise**2
+        # Correlation of pixels: that of shifted white noise, averaged over the images' shifts, for
+        # pairs of pixels (a, c) along rows and (b, d) along columns.
         place = np.rint(2 * (PHASES - 1) * np.abs(self.phase[images])).astype(int)
         share = np.zeros((PHASES, PHASES))
-        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), TINY))
+        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), 1e-300))
         along = moved_noise(side)
         pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(share, along, 1))
+        # RMS of each pixel, by the sky and by the photons of the mean star.
         photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
         rms = np.sqrt(sky.sum() + photons)
         covariance = pairs.reshape(mean.size, mean.size) * rms * rms[:, None]
-        kept = np.eye(mean.size) - mean[:, None]
-        return np.asarray(kept @ covariance @ kept.T)
+        # Images have the sum 1: x − Σx m has lost the noise along the mean m.
+        projection = np.eye(mean.size) - mean[:, None]
+        return np.asarray(projection @ covariance @ projection.T)
 
 
 @cache
 def moved_noise(side: int) -> np.ndarray:
-    """Covariance of white noise along an axis that was moved by 0 … ½ pixel, (PHASES, d, d)."""
+    """Return the covariance of white noise along an axis that splines shift, (PHASES, d, d).
+
+    Shifts are 0 … ½ pixel. The axis is the middle third of a longer one, so that no edge counts.
+    """
     moving = moving_matrices(3 * side, np.linspace(0.0, 0.5, PHASES))
     rows = moving[:, side : 2 * side]
     return np.asarray(rows @ rows.transpose(0, 2, 1))

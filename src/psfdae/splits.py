@@ -10,12 +10,12 @@ from psfdae.rng import stream
 
 
 def draw_jitter(count: int, jitter_px: int, rng: np.random.Generator) -> np.ndarray:
-    """Centring error of every star in whole pixels (row, column), uniform in ±`jitter_px`."""
+    """Draw the centring error of every star in whole pixels (row, column), within ±`jitter_px`."""
     return rng.integers(-jitter_px, jitter_px + 1, size=(count, 2))
 
 
 def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Place of the pixel grid of every star (row, column), uniform in ± ½ pixel."""
+    """Draw the sub-pixel place of every star (row, column), uniform in ± ½ pixel."""
     return rng.uniform(-0.5, 0.5, size=(count, 2))
 
 
@@ -34,18 +34,18 @@ class Split:
 
 
 def random_split(count: int, train: int, test: int, validation_fraction: float, seed: int) -> Split:
-    """Stars at random, as in the paper: every test star's field was seen in training."""
+    """Split stars at random, as in the paper: training has stars of every test star's field."""
     order = stream(seed, "split", "random").permutation(count)
-    held = round(validation_fraction * train)
+    validation_count = round(validation_fraction * train)
     return Split(
-        fit=np.sort(order[held:train]),
-        validation=np.sort(order[:held]),
+        fit=np.sort(order[validation_count:train]),
+        validation=np.sort(order[:validation_count]),
         test=np.sort(order[train : train + test]),
     )
 
 
 def held_out_fields(grid: np.ndarray) -> np.ndarray:
-    """Fields never seen in training: (ix + 2·iy) mod 5 = 1, a knight's-move pattern, (F,).
+    """Return which fields are held out: (ix + 2·iy) mod 5 = 1, a knight's-move pattern, (F,).
 
     `grid`, shape (F, 2), holds (ix, iy) of every field.
     """
@@ -55,9 +55,9 @@ def held_out_fields(grid: np.ndarray) -> np.ndarray:
 def held_out_split(
     star_field: np.ndarray, grid: np.ndarray, validation_fraction: float, seed: int
 ) -> Split:
-    """Whole fields held out: the test part is all stars of `held_out_fields`.
+    """Split stars by whole fields: the test part is all stars of `held_out_fields`.
 
-    Validation takes whole fields of the rest, too, so that it asks the same
+    Validation takes whole fields of the others, too, so that it asks the same
     question as the test.
 
     Parameters
@@ -68,8 +68,10 @@ def held_out_split(
         (ix, iy) of every field.
     """
     test_field = held_out_fields(grid)
-    seen = stream(seed, "split", "held_out").permutation(np.flatnonzero(~test_field))
-    validation_field = seen[: max(1, round(validation_fraction * seen.size))]
+    training_field = stream(seed, "split", "held_out").permutation(np.flatnonzero(~test_field))
+    # At least one field is left for validation.
+    validation_count = max(1, round(validation_fraction * training_field.size))
+    validation_field = training_field[:validation_count]
     is_test = test_field[star_field]
     is_validation = np.isin(star_field, validation_field)
     return Split(

@@ -37,7 +37,7 @@ def method(name: str) -> type[Method]:
 
 @cache
 def known() -> tuple[type[Method], ...]:
-    """All methods, the package's own first."""
+    """Return all methods, the package's own first."""
     own = [_of_module(f"{OWN}.{name}") for name in _modules(OWN)]
     return (*filter(None, own), *_joined().values())
 
@@ -54,7 +54,7 @@ def _modules(package: str) -> list[str]:
 
 
 def _of_module(module: str) -> type[Method] | None:
-    """The method whose class a module defines; None if it defines none, or is absent."""
+    """Return the method that a module defines; None if it defines none, or is absent."""
     if not (module.rpartition(".")[2].isidentifier() and find_spec(module)):
         return None
     kinds = [k for k in vars(import_module(module)).values() if isinstance(k, type)]

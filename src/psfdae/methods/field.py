@@ -1,7 +1,7 @@
-"""A mixture over sub-pixel centres about a model of the field, for stars of an image.
+"""Method `field`: a model of the PSF over the field, and the posterior of stars given this model.
 
-The law of the stars is in `psfdae.field_law`; here it is fitted to bright stars, stored, and
-applied to stamps.
+The distribution of the stars is in `psfdae.field_law`; here it is fitted to bright stars, stored,
+and applied to stamps. Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 from psfdae.bright_stars import BrightStars
 from psfdae.field_law import (
     MARGIN_PX,
-    Asked,
     FieldLaw,
     FieldSettings,
-    parts_of,
+    FieldStamps,
+    StarPosterior,
+    batches_of,
+    node_step,
     phase_of,
     phases_of,
-    step_of,
 )
 from psfdae.field_psf import FieldFit, FieldModel, fit_field, refit_field
 from psfdae.method import (
@@ -41,28 +42,13 @@ from psfdae.noise import NoiseModel
 from psfdae.progress import steps
 from psfdae.rng import stream
 
-OWN_NOISE = 0.5
-"""Part of the variance of bright stars' own noise that is left when splines have moved them."""
-
-LEAST_LIST_ERROR_PX = 0.05
-"""Least RMS that listed centres are taken to have."""
-
-LEAST_DIAGONAL, LEAST_ERROR = 0.01, 1e-6
-"""Least diagonal of C over its mean, and least error of any pixel over the flux."""
-
-LEAST_LISTED = 5
-"""Stars with listed centres that are needed to measure the error of a list."""
-
-RANGE_SLACK = 0.02
-"""Part of the range of magnitudes or colours by which a star of the training may seem beyond it."""
-
-PACKED_BYTES = 3e6
-"""Largest size of the residuals in a bundle."""
+MAX_PACKED_BYTES = 3e6
+"""Largest size of the modes of the residuals in a bundle, in bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldMixture(FieldLaw, Method):
-    """A fitted field with the residuals of its stars.
+    """Fitted model of a field, with the residuals of its stars.
 
     Attributes
     ----------
@@ -100,7 +86,12 @@ class FieldMixture(FieldLaw, Method):
 
     @classmethod
     def fit(cls, data: TrainingSet, field: FieldSettings) -> Self:
-        """The field of the training stars, and what it leaves of them.
+        """Fit the field to the training stars, and the covariance of what it leaves of them.
+
+        Parameters
+        ----------
+        data : TrainingSet
+        field : FieldSettings
 
         Raises
         ------
@@ -115,8 +106,9 @@ class FieldMixture(FieldLaw, Method):
         fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines, rng)
         used = bright.of(fit.good)
         terms = fit.model.terms(used.place)
-        usual = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
-        step = step_of(float(measure_shapes(usual).fwhm_px[0]), field.step_px)
+        # Nodes are closer together where the mean star is narrow.
+        mean_star = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
+        step = node_step(float(measure_shapes(mean_star).fwhm_px[0]), field.step_px)
         offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field, step)
         return cls(
             coefficients=fit.model.coefficients.astype(np.float32),
@@ -136,7 +128,7 @@ class FieldMixture(FieldLaw, Method):
         )
 
     def of_exposure(self, bright: BrightStars, background: float) -> Self:
-        """This model for another exposure of the same field, by its few bright stars.
+        """Return this model for another exposure of the same field, refitted to its bright stars.
 
         The residuals of stars about the field stay those of the training, and so does the error of
         the star list if too few stars show that of the new one.
@@ -160,37 +152,44 @@ class FieldMixture(FieldLaw, Method):
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """Estimator of a bundle; noise and settings are those of the configuration.
+        """Return the method of a bundle; noise and settings are those of the configuration.
 
-        Settings that this release does not know change no number of a fit that is done.
+        Settings that this release does not know are ignored: they affect the fit alone.
         """
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
         named: dict[str, Any] = {**arrays, "modes": arrays["modes"].astype(np.float32)}
-        known = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
-        settings = FieldSettings.model_validate(known)
+        supported = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
+        settings = FieldSettings.model_validate(supported)
         return cls(**named, noise=noise, settings=settings)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Arrays for a bundle: of large stamps fewer modes, the others join the diagonal."""
-        arrays, said = super().pack(stamp_px, noise)
-        phases, most, pixels = self.modes.shape
-        kept = min(most, max(1, int(PACKED_BYTES // (2 * phases * pixels))))
-        arrays["diagonal"] = self.diagonal + np.square(self.modes[:, kept:]).sum(axis=1)
-        arrays["modes"] = self.modes[:, :kept].astype(np.float16)
-        # What no list said is left out: bundles hold numbers.
+        """Return the arrays for a bundle, and fields of its `BundleInfo`.
+
+        Large stamps have fewer modes, in half precision; the variance of the others joins the
+        diagonal.
+        """
+        arrays, info_fields = super().pack(stamp_px, noise)
+        phases, mode_count, pixels = self.modes.shape
+        packed_count = min(mode_count, max(1, int(MAX_PACKED_BYTES // (2 * phases * pixels))))
+        arrays["diagonal"] = self.diagonal + np.square(self.modes[:, packed_count:]).sum(axis=1)
+        arrays["modes"] = self.modes[:, :packed_count].astype(np.float16)
+        # Bundles hold finite numbers: without a star list, its error is left out.
         arrays["listed"] = self.listed if np.isfinite(self.listed).all() else np.empty((0, 2))
-        return arrays, said
+        return arrays, info_fields
 
     def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
-        """Conditions that any fit fulfils: a mean star of the sum 1, residuals smaller than it."""
+        """Yield the conditions that any fit fulfils: a mean star of sum 1, and smaller residuals.
+
+        Each is the name of an array, what it must have, and whether it has it.
+        """
         terms, spread = len(self.coefficients), self.spread
-        usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
-        yield "coefficients", "a mean star of the sum 1", abs(usual.sum() - 1) < 0.1
-        alike = self.low.shape == self.high.shape and 2 <= len(self.low) <= 4
-        yield "high", "at least low", alike and self.low <= self.high
+        mean_star = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
+        yield "coefficients", "a mean star of the sum 1", abs(mean_star.sum() - 1) < 0.1
+        has_shape = self.low.shape == self.high.shape and 2 <= len(self.low) <= 4
+        yield "high", "at least low", has_shape and self.low <= self.high
         yield "usual", "terms from -1 to 1", self.usual.shape == (terms,) and abs(self.usual) <= 1
-        least = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
-        yield "spread", "a covariance", (spread == spread.T) & (least > -1e-6)
+        eigenvalue = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
+        yield "spread", "a covariance", (spread == spread.T) & (eigenvalue > -1e-6)
         yield "modes", "squares below 1", np.square(self.modes, dtype=float).sum(axis=1) < 1
         yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
         yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
@@ -263,45 +262,59 @@ class FieldMixture(FieldLaw, Method):
         return max((error(models) for models in (self.redrawn, self.parted) if models), default=0.0)
 
     def free_flux(self) -> Self:
-        """The form that finds flux and sky."""
-        return replace(self, free=True)
+        """Return the form of this method that measures flux and sky."""
+        return replace(self, measures_flux=True)
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """The field's PSFs (n, m, m) at positions, as `FieldModel.images` draws them.
+        """Return the field's PSFs at positions, as `FieldModel.images` draws them.
 
-        Positions, which may have magnitudes and colours (n, 4), are meant as those of the list of
-        the training, and what is not known of them as usual. Stars lie in their sub-pixel phase
-        beside the middle, which is the pixel of their position. Their flux is that for which a
-        star in the middle of its pixel has the sum 1 in its stamp: a PSF keeps it where it moves
+        The star lies at its sub-pixel phase in the middle pixel. Its flux is that for which a star
+        in the middle of its pixel has the sum 1 in its stamp: a PSF keeps its flux where it moves
         with its star, as it does in photometry, though some light then crosses the stamp's edge.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n, 2) to (n, 4)
+            x, y, magnitude and colour, as in the star list of the training; the PSF is the mean
+            one with respect to what is NaN.
+        oversampling : int
+
+        Returns
+        -------
+        ndarray, shape (n, m, m)
         """
         terms = self._terms(position)[0]
         phase = (position - np.floor(position + 0.5))[:, 1::-1]
         images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
-        whole = self.model.images(terms, np.broadcast_to(self._list_offset, phase.shape), self.side)
-        return np.asarray(images / whole.sum(axis=(1, 2), keepdims=True))
+        centred = np.broadcast_to(self._list_offset, phase.shape)
+        total = self.model.images(terms, centred, self.side).sum(axis=(1, 2), keepdims=True)
+        return np.asarray(images / total)
 
-    def beyond(self, position: np.ndarray) -> np.ndarray:
-        """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars are brighter, fainter, bluer or redder than all training stars, (n,).
+
+        `position` has x, y, magnitude and colour (n, 4). Those count with which the PSF changes,
+        and 2 % of the range beyond its ends are allowed: a training star may be measured there.
+        """
         value, low, high = (a[..., self.model.of_star] for a in (position, self.low, self.high))
-        slack = RANGE_SLACK * (high - low)
+        slack = 0.02 * (high - low)
         return np.asarray(((value < low - slack) | (value > high + slack)).any(axis=1))
 
     def facts(self) -> dict[str, str]:
-        """The polynomial of the field."""
+        """Return titles and sentences about the field: how the PSF changes, and with what."""
         order = self.order
         changes = f"changes over the image by a polynomial of order {order}"
-        same = "is the same everywhere (order 0: more is not supported by stars left out)"
-        facts = {"Field": f"the PSF {changes if order else same}"}
+        constant = "is the same everywhere (order 0: more is not supported by stars left out)"
+        facts = {"Field": f"the PSF {changes if order else constant}"}
         names = {
             2: ("Brightness", "magnitude −2.5 log₁₀ (flux / counts)"),
             3: ("Colour", "colour of the star list"),
         }
         for coordinate in self.model.of_star.tolist():
-            name, what = names[coordinate]
+            name, quantity = names[coordinate]
             low, high = self.low[coordinate], self.high[coordinate]
             facts[name] = (
-                f"the PSF changes with the {what}, {low:.2f} to {high:.2f}; stars beyond this "
+                f"the PSF changes with the {quantity}, {low:.2f} to {high:.2f}; stars beyond this "
                 "range have the PSF of its end"
             )
         return facts
@@ -309,16 +322,24 @@ class FieldMixture(FieldLaw, Method):
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
-        """PSFs; raises as `estimate`."""
+        """Return the PSFs of `estimate`, which has parameters and errors."""
         return self.estimate(noisy, level, position).psf
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
-        """PSFs, their standard deviation, and the evidence of every image.
+        """Return PSFs, their standard deviation, and the evidence of every image.
 
-        Flux and sky are known unless `free_flux` says otherwise. Positions that are NaN are
-        not known.
+        The images have flux 1 and no sky, unless this is the form of `free_flux`, which measures
+        both.
+
+        Parameters
+        ----------
+        noisy : ndarray, shape (n, d, d)
+        level : float or ndarray, shape (n,)
+            Noise level λ.
+        position : ndarray, shape (n, 2) to (n, 4), optional
+            NaN where unknown.
 
         Raises
         ------
@@ -326,11 +347,12 @@ class FieldMixture(FieldLaw, Method):
             If a pixel is not finite.
         """
         count, pixels = len(noisy), noisy[0].size
-        even = np.full(count, 1.0 / pixels)
-        known = None if self.free else np.ones(count)
-        noise = np.sqrt(self.noise.variance(even, np.asarray(level)))
-        sky = None if self.free else np.zeros(count)
-        return self.measure(noisy, noise, position, flux=known, sky=sky)
+        # A star's photons count as if they were spread evenly over the stamp.
+        even_star = np.full(count, 1.0 / pixels)
+        noise = np.sqrt(self.noise.variance(even_star, np.asarray(level)))
+        flux = None if self.measures_flux else np.ones(count)
+        sky = None if self.measures_flux else np.zeros(count)
+        return self.measure(noisy, noise, position, flux=flux, sky=sky)
 
     def measure(
         self,
@@ -343,7 +365,7 @@ class FieldMixture(FieldLaw, Method):
         sky: np.ndarray | None = None,
         gain: np.ndarray | None = None,
     ) -> Estimate:
-        """PSF, flux, sky and centre of every star.
+        """Return the posterior of PSF, flux, sky and centre of every star.
 
         Parameters
         ----------
@@ -354,11 +376,11 @@ class FieldMixture(FieldLaw, Method):
         position : ndarray, shape (n, 2) to (n, 4), optional
             (x, y) in the field, magnitude and colour; NaN where unknown.
         centre : ndarray, shape (n, 2), optional
-            (row, column) that a list says, from pixel (d//2, d//2); NaN where none does.
+            (row, column) in a star list, from pixel (d//2, d//2); NaN where there is none.
         fixed : bool or ndarray of bool, shape (n,)
-            These are taken as they are, where there are any.
+            The listed centres of these stars are exact.
         flux, sky : ndarray, shape (n,), optional
-            Those that are known; NaN where they are to be found.
+            Known values; NaN where they are to be measured.
         gain : ndarray, shape (n,), optional
             Electrons per unit of the stamps, by which the errors have the star's photons where they
             are; NaN where unknown.
@@ -376,87 +398,124 @@ class FieldMixture(FieldLaw, Method):
             raise ValueError("stamps must be finite")
         unknown = np.full(count, np.nan)
         flux, sky = (unknown if a is None else a for a in (flux, sky))
+        # Centres of the list in the coordinates of the field's centres.
         listed = np.full((count, 2), np.nan) if centre is None else centre
         if len(self.listed) and np.isfinite(self.listed).all():
             listed = listed + self.listed[0]
-        terms, positioned = self._terms(position, count)
-        level = np.nan_to_num(sky)
-        stars = Asked(
-            *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
-            *(self._prior(listed), None, flux, np.isfinite(sky)),
-            np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
-            np.full(count, self.off_node_px),
+        terms, position_known = self._terms(position, count)
+        sky_level = np.nan_to_num(sky)
+        stars = FieldStamps(
+            images=images - sky_level[:, None],
+            noise=np.broadcast_to(noise, count),
+            terms=terms,
+            position_known=True,
+            log_prior=self._prior(listed),
+            centre=None,
+            flux=flux,
+            sky_known=np.isfinite(sky),
+            unit_per_electron=np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
+            cell_sigma_px=np.full(count, self.cell_sigma_px),
         )
-        known = np.isfinite(listed).all(axis=1) & fixed
-        found = np.empty((count, 6 + 2 * images.shape[1]))
-        covariance = np.empty((count, 4, 4))
-        for centred, located in np.ndindex(2, 2):
-            for part in parts_of(np.flatnonzero((known == centred) & (positioned == located))):
-                some = stars.of(part)._replace(positioned=bool(located))
-                if centred:
-                    at = listed[part]
-                    near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)
-                    alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
-                    some = some._replace(centre=at, prior=alone, off_node=np.zeros(len(part)))
-                found[part], covariance[part] = self._restored(some, *self._start(some))
-        values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
+        # Stars of known and unknown centre, and of known and unknown position, one after the other.
+        centre_known = np.isfinite(listed).all(axis=1) & fixed
+        posterior = StarPosterior.empty(count, images.shape[1])
+        for has_centre, has_position in np.ndindex(2, 2):
+            rows = np.flatnonzero((centre_known == has_centre) & (position_known == has_position))
+            for batch in batches_of(rows):
+                selected = stars.select(batch)._replace(position_known=bool(has_position))
+                if has_centre:
+                    # One node, the nearest one, which is taken to be at exactly this centre.
+                    known = listed[batch]
+                    nearest = np.square(self.places - known[:, None]).sum(axis=-1).argmin(axis=1)
+                    is_nearest = np.arange(len(self.places)) == nearest[:, None]
+                    selected = selected._replace(
+                        centre=known,
+                        log_prior=np.where(is_nearest, 0.0, -np.inf),
+                        cell_sigma_px=np.zeros(len(batch)),
+                    )
+                posterior.set(batch, self._posterior(selected))
         measured = Measured(
-            flux=values[:, 1],
-            background=values[:, 2] + level,
-            centre=values[:, 3:5] - self._list_offset,
-            covariance=covariance,
+            flux=posterior.measurement[:, 0],
+            background=posterior.measurement[:, 1] + sky_level,
+            centre=posterior.measurement[:, 2:] - self._list_offset,
+            covariance=posterior.covariance,
         )
         return Estimate(
-            psf=psf.reshape(stamps.shape).astype(np.float32),
-            sigma=sigma.reshape(stamps.shape).astype(np.float32),
-            evidence=values[:, 0],
+            psf=posterior.psf.reshape(stamps.shape).astype(np.float32),
+            sigma=posterior.psf_sigma.reshape(stamps.shape).astype(np.float32),
+            evidence=posterior.log_evidence,
             measured=measured,
-            outlier_score=values[:, 5],
+            outlier_score=posterior.mahalanobis2,
         )
 
 
 def _residuals(
     fit: FieldFit, noise: np.ndarray, settings: FieldSettings, step_px: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, modes and remaining variance of the residuals in every phase of a pixel.
+    """Return mean, modes and diagonal of the residual covariance C at every phase of a pixel.
 
-    Splines move them there. A star counts by how much of its residual is no `noise` (n,),
-    which is the RMS of a pixel of flux 1, and what noise adds to their scatter is taken off.
+    Parameters
+    ----------
+    fit : FieldFit
+    noise : ndarray, shape (n,)
+        RMS of a pixel of each good star, over its flux.
+    settings : FieldSettings
+    step_px : float
+        Distance of two nodes.
+
+    Returns
+    -------
+    offset : ndarray, shape (f², w²)
+        Mean residual at each of the f² phases, in frames of w² pixels.
+    modes : ndarray, shape (f², r, w²)
+    diagonal : ndarray, shape (f², w²)
     """
     residual, centre = fit.residual[fit.good], fit.centre[fit.good]
     side = residual.shape[-1]
-    inner = residual[:, 1:-1, 1:-1]
-    own = noise**2 * inner[0].size
-    signal = np.median(np.maximum(np.square(inner).sum(axis=(1, 2)) - own, 0.0))
-    weight = (signal + 1e-12) / (signal + 1e-12 + own)
+    # Weight of a star: which part of its residual is not noise, signal / (signal + noise).
+    core = residual[:, 1:-1, 1:-1]
+    noise_square = noise**2 * core[0].size
+    signal = np.median(np.maximum(np.square(core).sum(axis=(1, 2)) - noise_square, 0.0))
+    weight = (signal + 1e-12) / (signal + 1e-12 + noise_square)
     weight /= weight.sum()
-    left = OWN_NOISE * float(weight @ noise**2)
+    # Splines that move an image average its noise: half of the variance is left, which is no part
+    # of C.
+    noise_variance = 0.5 * float(weight @ noise**2)
+    # Matrices that move the star from its centre to each phase, along rows and columns.
     shifts = phases_of(step_px)[:, None, None] - centre
     rows, columns = (
         np.array([moving_matrices(side, row) for row in shifts[..., axis]]) for axis in (0, 1)
     )
     columns = columns.transpose(0, 1, 3, 2)
-    found = []
+    covariances = []
     for row in steps("residuals", rows):
-        half = row @ residual
+        shifted_rows = row @ residual
         for column in columns:
-            moved = (half @ column).reshape(len(residual), -1)
-            mean = weight @ moved
-            scatter = np.sqrt(weight)[:, None] * (moved - mean)
+            shifted = (shifted_rows @ column).reshape(len(residual), -1)
+            # Principal components of the residuals, their variances less that of noise.
+            mean = weight @ shifted
+            scatter = np.sqrt(weight)[:, None] * (shifted - mean)
             _, size, axes = np.linalg.svd(scatter, full_matrices=False)
-            modes = np.sqrt(np.maximum(size**2 - left, 0.0))[:, None] * axes
+            modes = np.sqrt(np.maximum(size**2 - noise_variance, 0.0))[:, None] * axes
+            # The leading ones are modes, a part of their variance and all other components the
+            # diagonal: of few stars, modes are not the directions of all stars.
             variance = np.square(modes).sum(axis=0)
             modes = np.sqrt(1.0 - settings.diagonal) * modes[: settings.modes]
             diagonal = variance - np.square(modes).sum(axis=0)
-            found.append((mean, modes, np.maximum(diagonal, LEAST_DIAGONAL * diagonal.mean())))
-    offset, all_modes, diagonals = (np.stack(arrays) for arrays in zip(*found, strict=True))
-    return offset, all_modes, np.maximum(diagonals, LEAST_ERROR**2)
+            # No pixel is much surer than the others: 1 % of their mean variance at least.
+            covariances.append((mean, modes, np.maximum(diagonal, 0.01 * diagonal.mean())))
+    offset, all_modes, diagonals = (np.stack(arrays) for arrays in zip(*covariances, strict=True))
+    # An error of 1e-6 of the flux in any pixel keeps C invertible.
+    return offset, all_modes, np.maximum(diagonals, 1e-6**2)
 
 
-def _list_error(off: np.ndarray) -> np.ndarray:
-    """Median and robust RMS of distances (n, 2) from a list; NaN if there was none."""
-    known = off[np.isfinite(off).all(axis=1)]
-    if len(known) < LEAST_LISTED:
+def _list_error(offset_px: np.ndarray) -> np.ndarray:
+    """Return median and robust RMS of fitted less listed centres (n, 2), shape (2, 2).
+
+    NaN if fewer than five stars have a listed centre. The RMS is at least 0.05 px.
+    """
+    offset_px = offset_px[np.isfinite(offset_px).all(axis=1)]
+    if len(offset_px) < 5:
         return np.full((2, 2), np.nan)
-    scatter = np.maximum(robust_scatter(known), LEAST_LIST_ERROR_PX)
-    return np.stack([np.median(known, axis=0), scatter])
+    scatter = np.maximum(robust_scatter(offset_px), 0.05)
+    return np.stack([np.median(offset_px, axis=0), scatter])

@@ -710,7 +710,7 @@ class Engine:
         flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
         raise_flag(flags, StarFlag.NO_FLUX, lost)
         raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
-        raise_flag(flags, StarFlag.BEYOND, method.beyond(place) & ~lost)
+        raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~lost)
         sky = start + own.background
         unit = np.where(lost, 1.0, flux)[:, None, None]
         images = (data - own.background[:, None, None]) / unit
@@ -775,7 +775,7 @@ class Engine:
         if free.any() and isinstance(self.free_flux, FindsFlux):
             images, noise = current()
             wider = np.hypot(noise, info.misfit) / info.kappa
-            flux, near["near"] = self.free_flux.flux(images, wider)
+            flux, near["near_clusters"] = self.free_flux.flux(images, wider)
             free &= np.isfinite(flux)  # a damaged model may find none
             found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
         if not lost.all():  # such as the stars of a catalogue that reaches far beyond the image

@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 
 LINEAR_STARS = 1500
-"""Training stars from which a network that begins as a linear estimator takes its weights."""
+"""Number of training stars that give the start of a network that begins as a linear estimator."""
 
 LINEAR_PX = 24_000
-"""Pixels of them all, at random, that its last layer is fitted to."""
+"""Number of random pixels of these stars to which the last layer of such a network is fitted."""
 
 LINEAR_BLOCK = 100
-"""Stars of which the sums of that fit are taken at once."""
+"""Number of stars whose sums for this fit are computed at once, which limits the memory."""
 
 DRAWN = 0.1
 """Part of the random draw in the inner layers of such a network."""
 
 RIDGE = 1e-6
-"""Of the mean of the fit's normal matrix's diagonal, added to it: a channel may be empty."""
+"""Ridge of this fit over the mean diagonal of its normal matrix: a channel may be all zero."""
 
 BLOCK_PX = 4
 """Side of the blocks of pixels that the last layer computes at once."""
