@@ -96,8 +96,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     """
     psfs, fwhm, side = PsfGrid.of(model), model.fwhm_px(), model.stamp_px
     x, y = np.rint(np.mean(model.field_range(), axis=0))
-    usual = model.psf_at(float(x), float(y), 1)
-    area_px = float(1.0 / np.square(usual).sum())  # noise-equivalent
+    middle_psf = model.psf_at(float(x), float(y), 1)
+    area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
     sky = observation.sky()
     image, bad = sky.flat + sky.level, sky.bad
     if observation.saturate is not None:
@@ -105,36 +105,36 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         sky = replace(sky, bad=bad)
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
-    light, far, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
+    light, wing_light, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
     for turn in range(ROUNDS):
-        flat = image - sky.level - far
+        flat = image - sky.level - wing_light
         error = np.sqrt(sky.noise**2 + (light / observation.gain if observation.gain else 0.0))
         limits = _box(fwhm), MOST_MOVED_FWHM * fwhm
         fit = fit_stars(psfs, flat, error, bad, place, flux, *limits, origin)
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
-        outer = outer_light(model.on_pixels, place)
-        sky, far, wings, doubt = around_stars(
-            image, sky, error, fit.light, place, flux, outer, side, wings
+        outer_parts = outer_light(model.on_pixels, place)
+        sky, wing_light, wings, sigma = around_stars(
+            image, sky, error, fit.light, place, flux, outer_parts, side, wings
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
-        light = np.maximum(fit.light + far, 0.0)
+        light = np.maximum(fit.light + wing_light, 0.0)
         if turn == 0 and observation.found is not None:
-            place, flux = _with_hidden(sky, doubt, place, flux, threshold, fwhm)
+            place, flux = _with_hidden(sky, sigma, place, flux, threshold, fwhm)
             origin = np.concatenate([origin, place[len(origin) :]])
         elif turn > 0:
             # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
             # or if it has moved to another star.
-            doubt = _psf_doubt(place, flux, side, area_px)
-            real = flux > LEAST_SEEN * np.hypot(fit.flux_error, doubt)
+            sigma = _psf_doubt(place, flux, side, area_px)
+            real = flux > LEAST_SEEN * np.hypot(fit.flux_error, sigma)
             real &= ~_beside_others(place, SAME_FWHM * fwhm)
             real[: observation.count] = True
             if real.all() or turn == ROUNDS - 1:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
-    seen = wings if wings is not None and wings.seen else model.wings
-    found = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + far, seen)
-    stars = found.stars
+    wings_used = wings if wings is not None and wings.seen else model.wings
+    result = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + wing_light, wings_used)
+    stars = result.stars
     # The error of the PSF is no noise, and is as large a part of each flux.
     stars["flux_error"] = np.hypot(stars["flux_error"], model.flux_error * stars["flux"])
     saturated = np.zeros(image.shape, dtype=bool)
@@ -149,7 +149,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if observation.found is None:
         stars["id"] = observation.identifiers
         stars["flags"] |= observation.list_flags
-    return found
+    return result
 
 
 def star_flags(
@@ -171,17 +171,17 @@ def star_flags(
     from scipy.spatial import cKDTree
 
     place = np.stack([stars["x"], stars["y"]], axis=1)
-    seen = np.isfinite(place).all(axis=1)
+    is_located = np.isfinite(place).all(axis=1)
     flags, photutils = np.zeros(len(stars), np.uint16), np.array(stars["photutils_flags"])
     # Pixels of the box about each star.
     height, width = bad.shape
-    column, row = np.rint(np.where(seen[:, None], place, -side)).astype(int).T
+    column, row = np.rint(np.where(is_located[:, None], place, -side)).astype(int).T
     half = side // 2
     edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
     for pixels, flag in ((bad, StarFlag.MASKED), (saturated, StarFlag.SATURATED)):
-        raise_flag(flags, flag, seen & maximum_filter(pixels, side, mode="constant")[at])
-    raise_flag(flags, StarFlag.TRUNCATED, edge & seen)
+        raise_flag(flags, flag, is_located & maximum_filter(pixels, side, mode="constant")[at])
+    raise_flag(flags, StarFlag.TRUNCATED, edge & is_located)
     # Flux, fit and neighbours.
     flux, error = np.array(stars["flux"]), np.array(stars["flux_error"])
     raise_flag(flags, StarFlag.NO_FLUX, ~np.isfinite(flux))
@@ -189,9 +189,9 @@ def star_flags(
     # Not at rest, or a place at its bound.
     raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > 10.0) | (photutils & 8 > 0))
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
-    known = np.flatnonzero(seen)
-    near = cKDTree(place[known]).query_pairs(fwhm, output_type="ndarray")
-    raise_flag(flags, StarFlag.BLENDED, known[near.ravel()])
+    located = np.flatnonzero(is_located)
+    pairs = cKDTree(place[located]).query_pairs(fwhm, output_type="ndarray")
+    raise_flag(flags, StarFlag.BLENDED, located[pairs.ravel()])
     return flags
 
 
@@ -208,13 +208,15 @@ def _with_hidden(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of photutils, if there is none
-        left = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
-    if not len(left["id"]):
+        residual_stars = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
+    if not len(residual_stars["id"]):
         return place, flux
-    new = np.stack([left["X_IMAGE"], left["Y_IMAGE"]], axis=1) - 1.0
-    known = place[np.isfinite(place).all(axis=1)]
-    alone = cKDTree(known).query(new)[0] > SAME_FWHM * fwhm
-    return np.concatenate([place, new[alone]]), np.append(flux, left["FLUX_ISO"][alone])
+    candidates = np.stack([residual_stars["X_IMAGE"], residual_stars["Y_IMAGE"]], axis=1) - 1.0
+    located = place[np.isfinite(place).all(axis=1)]
+    is_alone = cKDTree(located).query(candidates)[0] > SAME_FWHM * fwhm
+    return np.concatenate([place, candidates[is_alone]]), np.append(
+        flux, residual_stars["FLUX_ISO"][is_alone]
+    )
 
 
 def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
@@ -225,11 +227,11 @@ def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -
     """
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(place).all(axis=1) & (flux > 0))
-    pairs = known[cKDTree(place[known]).query_pairs(0.75 * side, output_type="ndarray")]
+    bright = np.flatnonzero(np.isfinite(place).all(axis=1) & (flux > 0))
+    pairs = bright[cKDTree(place[bright]).query_pairs(0.75 * side, output_type="ndarray")]
     square = np.zeros(len(place))
-    for one, other in ((0, 1), (1, 0)):
-        np.add.at(square, pairs[:, one], np.square(flux[pairs[:, other]]))
+    for first, second in ((0, 1), (1, 0)):
+        np.add.at(square, pairs[:, first], np.square(flux[pairs[:, second]]))
     return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))
 
 
@@ -237,17 +239,19 @@ def _beside_others(place: np.ndarray, distance_px: float) -> np.ndarray:
     """Whether another star is nearer than a distance to each of the places (n, 2)."""
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    beside = np.zeros(len(place), dtype=bool)
-    beside[known[cKDTree(place[known]).query_pairs(distance_px, output_type="ndarray")]] = True
-    return beside
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    has_neighbour = np.zeros(len(place), dtype=bool)
+    has_neighbour[
+        located[cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")]
+    ] = True
+    return has_neighbour
 
 
 def _described(
     model: FieldPsfs,
     fit: JointFit,
     group_px: float,
-    left: np.ndarray,
+    residual: np.ndarray,
     light: np.ndarray,
     wings: Wings | None,
 ) -> CrowdedPhotometry:
@@ -268,4 +272,4 @@ def _described(
     group = chains(fit.place, group_px)
     stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
     stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
-    return CrowdedPhotometry(model, stars, left, light, wings)
+    return CrowdedPhotometry(model, stars, residual, light, wings)

@@ -66,22 +66,22 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         raise PredictionError(
             f"the model {model.name!r} does not say how its stars were chosen"
         ) from None
-    wanted = settings.calibration_stars.model_copy(update={"stars_min": FEWEST_STARS})
-    observation = source.open(info.stamp_px, wanted.margin_px).assuming()
+    calibration = settings.calibration_stars.model_copy(update={"stars_min": FEWEST_STARS})
+    observation = source.open(info.stamp_px, calibration.margin_px).assuming()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
-    other = model.other_instrument(observation.instrument, observation.colour_column)
-    bright = collect(observation, wanted, settings.framing).bright
+    difference = model.other_instrument(observation.instrument, observation.colour_column)
+    bright = collect(observation, calibration, settings.framing).bright
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
-    said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
+    sentence = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
     off = list_offset(
         observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
     )
-    made = _adapted(model, field, observation, bright, name)
-    said = f"{said} ({other})" if other else said
-    return made, "\n".join([*observation.remarks, *filter(None, [off]), said])
+    adapted = _adapted(model, field, observation, bright, name)
+    sentence = f"{sentence} ({difference})" if difference else sentence
+    return adapted, "\n".join([*observation.remarks, *filter(None, [off]), sentence])
 
 
 def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
@@ -100,13 +100,13 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
         By the images' names without suffix, as `psfdae exposure` adapts a model to an exposure;
         `model` itself where its method knows no field, or an image has fewer than 5 bright stars.
     """
-    field, made = model.engine.estimator, {}
+    field, models = model.engine.estimator, {}
     for part in stars.exposures:
-        bright, own = part.candidates.bright, model
+        bright, exposure_model = part.candidates.bright, model
         if isinstance(field, FieldMixture) and len(bright) >= FEWEST_STARS:
-            own = _adapted(model, field, part.observation, bright, part.name)
-        made[part.name] = own
-    return made
+            exposure_model = _adapted(model, field, part.observation, bright, part.name)
+        models[part.name] = exposure_model
+    return models
 
 
 def _adapted(

@@ -63,7 +63,7 @@ class FieldPsfs(ABC):
     @property
     @abstractmethod
     def order(self) -> int:
-        """Of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
+        """Order of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
 
     @property
     @abstractmethod
@@ -132,21 +132,21 @@ class FieldPsfs(ABC):
             model has no PSF of a finite flux above 0 at a place.
         """
         stated = {"x": x, "y": y, "mag": mag, "colour": colour}
-        known = [value is not None for value in stated.values()]
-        count = 4 if known[3] else 3 if known[2] else 2
+        is_stated = [value is not None for value in stated.values()]
+        count = 4 if is_stated[3] else 3 if is_stated[2] else 2
         numbers = [
             real_numbers(name, np.nan if value is None else value) for name, value in stated.items()
         ]
         position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
-        if position.ndim > 2 or not np.isfinite(position[..., known[:count]]).all():
+        if position.ndim > 2 or not np.isfinite(position[..., is_stated[:count]]).all():
             raise PredictionError(
                 "positions, mag and colour must be finite, one of each or arrays of as many"
             )
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
         with np.errstate(all="ignore"):
-            found = self._drawn(position.reshape(-1, count), oversampling)
-        flux = found.sum(axis=(1, 2))
+            psfs = self._drawn(position.reshape(-1, count), oversampling)
+        flux = psfs.sum(axis=(1, 2))
         usable = np.isfinite(flux) & (flux > 0)
         if not usable.all():
             place = position.reshape(-1, count)[np.argmin(usable)]
@@ -154,7 +154,7 @@ class FieldPsfs(ABC):
                 f"the model {self.name!r}: damaged, or far outside its image: no PSF of a "
                 f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
             )
-        return found if position.ndim == 2 else found[0]
+        return psfs if position.ndim == 2 else psfs[0]
 
     def on_pixels(self, place: np.ndarray) -> np.ndarray:
         """PSFs (n, d, d) in the pixels of the image, at places (n, 2); see `psf_at`."""

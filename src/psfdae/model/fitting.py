@@ -1,4 +1,4 @@
-"""From the bright stars of an image to a model: `fit`, and its steps."""
+"""Fit of a model to the bright stars of an image, and its steps."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def fit(
     groups = [group for kind in kinds for group in kind.groups]
     stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
     fitted = {kind.name: fitted_to(stars, kind) for kind in kinds}
-    chosen = next(iter(fitted)) if len(fitted) == 1 else best(stars, fitted)[0]
-    return packed(stars, fitted[chosen], name or stars.name, licence)
+    best_name = next(iter(fitted)) if len(fitted) == 1 else best(stars, fitted)[0]
+    return packed(stars, fitted[best_name], name or stars.name, licence)
 
 
 def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
@@ -122,8 +122,8 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
     """Settings that decide a fit, as its product and its model say them."""
-    own = stars.settings.model_dump(include={*groups_of(kind.name)})
-    return described_by(kind, own, SPLIT, REFERENCE)
+    group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
+    return described_by(kind, group_settings, SPLIT, REFERENCE)
 
 
 def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
@@ -134,21 +134,21 @@ def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, flo
     """
     settings, product = stars.settings, stars.product
     judges = split_stars(product, SPLIT, settings).validation
-    truth, where = product["realisation"][judges], field_positions(product)[judges]
+    truth, positions = product["realisation"][judges], field_positions(product)[judges]
     errors = {}
     for name, fit_of_all in fitted.items():
-        found, kind = fit_of_all, type(fit_of_all)
+        fitted_kind, kind = fit_of_all, type(fit_of_all)
         data = training_set(settings, kind, product, SPLIT, REFERENCE)
         with fixed_threads(kind.threads(settings)):
             if not kind.needs.validation:
-                found = fit_apart(kind, data, product["field_index"], settings)
+                fitted_kind = fit_apart(kind, data, product["field_index"], settings)
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # As of the stars that the model is for.
-            free = with_free_flux(found)
+            with_free = with_free_flux(fitted_kind)
             logs = []
             for images, level in zip(noisy, data.levels, strict=True):
-                psf = free.restore(images, level, where)
+                psf = with_free.restore(images, level, positions)
                 psf = psf / psf.sum(axis=(1, 2), keepdims=True)
                 logs.append(np.log(np.square(psf - truth).mean()))
         errors[name] = float(np.exp(np.mean(logs)))
@@ -162,11 +162,11 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
         model = model_of(fitted, *of)
         if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
             return model
-        each = [
+        wings_of_each = [
             part.wings or wings_of_stars(model, part.observation.with_margin(MARGIN_PX))
             for part in stars.each
         ]
-    known = [wings for wings in each if wings is not None]
-    if not known:
+    known_wings = [wings for wings in wings_of_each if wings is not None]
+    if not known_wings:
         return model
-    return PsfModel(with_wings(model.bundle, Wings.joined(known)), model.engine.estimator)
+    return PsfModel(with_wings(model.bundle, Wings.joined(known_wings)), model.engine.estimator)

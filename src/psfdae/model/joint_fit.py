@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 PARAMETERS = 3
-"""Of a star: flux, and position x and y."""
+"""Number of parameters of a star: flux, and position x and y."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ def fit_stars(
         # taken back, and the next one is shorter the less this one was worth what was expected.
         squares = fit.squares()
         gain = np.bincount(group, cost - squares)
-        worse, poor = ((gain < part * expected)[group] & moving for part in (-0.5, 0.1))
-        back = np.flatnonzero(worse)
+        is_worse, is_poor = ((gain < part * expected)[group] & moving for part in (-0.5, 0.1))
+        back = np.flatnonzero(is_worse)
         fit.move(back, -step[back])
-        damping = np.where(poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
+        damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.squares() if len(back) else squares
     return fit.result(len(place), fit.design(), prior, moving, middle, range_px)
 
@@ -128,10 +128,10 @@ def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    pairs = known[cKDTree(place[known]).query_pairs(distance_px, output_type="ndarray")]
-    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
-    return np.asarray(connected_components(near, directed=False)[1])
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    pairs = located[cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")]
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1])
 
 
 class _Fit:
@@ -156,9 +156,11 @@ class _Fit:
         weight = np.pad(np.where(bad, 0.0, 1.0 / error), side)
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
-        near = np.isfinite(place).all(axis=1)
-        near[near] = ((place[near] > -1) & (place[near] < (width, height))).all(axis=1)
-        self.stars = np.flatnonzero(near)
+        on_image = np.isfinite(place).all(axis=1)
+        on_image[on_image] = ((place[on_image] > -1) & (place[on_image] < (width, height))).all(
+            axis=1
+        )
+        self.stars = np.flatnonzero(on_image)
         self._middle = np.rint(place[self.stars]).astype(int)
         pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
         fitted = pixels >= PARAMETERS
@@ -185,9 +187,9 @@ class _Fit:
         side = self.psfs.side_px
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
-            drawn = self.psfs.stamps(self.place[part], self._middle[part] - side // 2, side)
-            self._light[part] = drawn[:, 0]
-            self._derivatives[part] = drawn[:, :, edge : side - edge, edge : side - edge]
+            stamps = self.psfs.stamps(self.place[part], self._middle[part] - side // 2, side)
+            self._light[part] = stamps[:, 0]
+            self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Take the light of some stars with these fluxes from the residuals."""
@@ -218,8 +220,8 @@ class _Fit:
 
     def squares(self) -> np.ndarray:
         """Sums (m,) of the squared residuals in the boxes, in units of σ."""
-        left = self.weight * self.residual.ravel()[self.boxes]
-        return np.asarray(np.square(left).sum(axis=(1, 2)))
+        residual = self.weight * self.residual.ravel()[self.boxes]
+        return np.asarray(np.square(residual).sum(axis=(1, 2)))
 
     def solve(
         self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray | float = 0.0
@@ -229,10 +231,10 @@ class _Fit:
         from scipy.sparse.linalg import splu
 
         matrix, unit = _normal_matrix(design, self._rows, prior)
-        more = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
-        matrix = (matrix + diags_array(more)).tocsc()
-        left = self.weight * self.residual.ravel()[self.boxes]
-        gradient = np.einsum("mkrc,mrc->mk", design, left)
+        added = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
+        matrix = (matrix + diags_array(added)).tocsc()
+        residual = self.weight * self.residual.ravel()[self.boxes]
+        gradient = np.einsum("mkrc,mrc->mk", design, residual)
         if not len(unit):
             return gradient, gradient
         # It is positive definite: no pivots, and an order for symmetric matrices.
@@ -249,11 +251,11 @@ class _Fit:
         middle: np.ndarray,
         range_px: float,
     ) -> JointFit:
-        """What `count` stars are, of which these were fitted; `moving` ones were not at rest."""
+        """Return the fit of `count` stars, these among them; `moving` ones were not at rest."""
         error = _standard_errors(*_normal_matrix(design, self._rows, prior))
-        left = self.weight * self.residual.ravel()[self.boxes]
+        residual = self.weight * self.residual.ravel()[self.boxes]
         freedom = np.maximum(self.pixels - PARAMETERS, 1)
-        chi2 = np.square(left).sum(axis=(1, 2)) / freedom
+        chi2 = np.square(residual).sum(axis=(1, 2)) / freedom
         # Flags as photutils has them.
         height, width = self.image.shape
         outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
@@ -262,12 +264,12 @@ class _Fit:
         flags += 8 * moving + 32 * bound.any(axis=1)
 
         def of_all(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
-            whole = np.full((count, *values.shape[1:]), missing, values.dtype)
-            whole[self.stars] = values
-            return whole
+            column = np.full((count, *values.shape[1:]), missing, values.dtype)
+            column[self.stars] = values
+            return column
 
-        inner = np.s_[self.psfs.side_px : -self.psfs.side_px]
-        light = np.where(self.bad, 0.0, self.image) - self.residual[inner, inner]
+        core = np.s_[self.psfs.side_px : -self.psfs.side_px]
+        light = np.where(self.bad, 0.0, self.image) - self.residual[core, core]
         return JointFit(
             of_all(self.place),
             of_all(error[:, 1:]),
@@ -322,15 +324,15 @@ def _standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
     neighbours = np.diff(blocks.indptr)
     variance = np.empty((stars, parameters))
     for count in np.unique(neighbours):
-        chosen = np.flatnonzero(neighbours == count)
+        members = np.flatnonzero(neighbours == count)
         # Few at a time: matrices of (count · k)² numbers.
-        for part in np.array_split(chosen, len(chosen) * count**2 // 2**16 + 1):
-            near = blocks.indices[blocks.indptr[part, None] + np.arange(count)]
-            wanted = near[:, :, None] * stars + near[:, None, :]
-            where = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-            local = blocks.data[where] * (key[where] == wanted)[..., None, None]
+        for part in np.array_split(members, len(members) * count**2 // 2**16 + 1):
+            neighbour_rows = blocks.indices[blocks.indptr[part, None] + np.arange(count)]
+            block_keys = neighbour_rows[:, :, None] * stars + neighbour_rows[:, None, :]
+            block_rows = np.minimum(np.searchsorted(key, block_keys), len(key) - 1)
+            local = blocks.data[block_rows] * (key[block_rows] == block_keys)[..., None, None]
             side = count * parameters
             inverse = np.linalg.inv(local.transpose(0, 1, 3, 2, 4).reshape(-1, side, side))
             diagonal = np.einsum("nii->ni", inverse).reshape(-1, count, parameters)
-            variance[part] = diagonal[near == part[:, None]]
+            variance[part] = diagonal[neighbour_rows == part[:, None]]
     return np.asarray(np.sqrt(variance) / unit)

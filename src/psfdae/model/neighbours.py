@@ -46,7 +46,7 @@ class _Field(FieldPsfs):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low[:2], self.fitted.high[:2]
 
-    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+    def check_scale(self, pixel_scale_arcsec: float | None, purpose: str) -> None:
         """It is of the image that it is applied to."""
 
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
@@ -62,40 +62,42 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
     """
     observation, notes = stars.observation, stars.notes
     accepted = stars.settings.calibration_stars.neighbour_ratio
-    wanted = stars.settings.calibration_stars.model_copy(
+    calibration = stars.settings.calibration_stars.model_copy(
         update={"neighbour_ratio": neighbour_ratio}
     )
-    settings = stars.settings.model_copy(update={"calibration_stars": wanted})
+    settings = stars.settings.model_copy(update={"calibration_stars": calibration})
     assert observation.positions is not None
     for _ in range(2 if accepted > neighbour_ratio else 1):
         field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
         try:
-            found = crowded.photometry(field, observation, DETECTED_SIGMA)
-            near = NEAREST_FWHM * field.fwhm_px()
-            alone = replace(observation, others=light_of_others(found, observation.positions))
-            again = Stars.chosen(stars.source, alone, settings, near)
+            subtracted = crowded.photometry(field, observation, DETECTED_SIGMA)
+            isolation_px = NEAREST_FWHM * field.fwhm_px()
+            cleaned = replace(
+                observation, others=light_of_others(subtracted, observation.positions)
+            )
+            isolated = Stars.chosen(stars.source, cleaned, settings, isolation_px)
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"
             return replace(stars, notes=(*stars.notes, note))
-        said = (
-            f"neighbours: the light of {len(found.stars)} stars was subtracted in the others' "
+        message = (
+            f"neighbours: the light of {len(subtracted.stars)} stars was subtracted in the others' "
             f"stamps; {len(stars)} stars are good with no neighbour above {100 * accepted:g} % of "
-            f"their brightness within {wanted.isolation_px:g} px, {len(again)} with none above "
-            f"{100 * neighbour_ratio:g} % within {near:.2g} px"
+            f"their brightness within {calibration.isolation_px:g} px, {len(isolated)} with none "
+            f"above {100 * neighbour_ratio:g} % within {isolation_px:.2g} px"
         )
-        stars = replace(again, observation=observation, wings=found.wings)
-        notes = (*again.notes, said)
+        stars = replace(isolated, observation=observation, wings=subtracted.wings)
+        notes = (*isolated.notes, message)
     return replace(stars, notes=notes)
 
 
 def light_of_others(
-    found: crowded.CrowdedPhotometry, place: np.ndarray
+    photometry: crowded.CrowdedPhotometry, place: np.ndarray
 ) -> Callable[[slice, int, int], np.ndarray]:
     """Light of all stars of an image but the one in the middle, for stamps of stars of a list.
 
     Parameters
     ----------
-    found : CrowdedPhotometry
+    photometry : CrowdedPhotometry
     place : ndarray, shape (n, 2)
         Positions of the list, x and y.
 
@@ -107,20 +109,20 @@ def light_of_others(
     """
     from scipy.spatial import cKDTree
 
-    stars = found.stars
+    stars = photometry.stars
     fitted = np.stack([stars["x"], stars["y"]], axis=1)
-    known = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
-    off, nearest = cKDTree(fitted[known]).query(np.nan_to_num(place, nan=-np.inf))
-    psfs, flux = PsfGrid.of(found.model), np.array(stars["flux_model"])
+    measured = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
+    off, nearest = cKDTree(fitted[measured]).query(np.nan_to_num(place, nan=-np.inf))
+    psfs, flux = PsfGrid.of(photometry.model), np.array(stars["flux_model"])
 
     def light(part: slice, stamp_px: int, margin: int) -> np.ndarray:
         x, y = place[part].T
-        stamps = cut_image(found.light, found.light.shape, x, y, stamp_px, margin)[0]
+        stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]
         rows = np.flatnonzero(off[part] <= SAME_PX)
-        star = known[nearest[part][rows]]
+        star = measured[nearest[part][rows]]
         corner = np.rint(place[part][rows]).astype(int) - stamp_px // 2 - margin
-        drawn = psfs.stamps(fitted[star], corner, stamps.shape[-1])[:, 0]
-        stamps[rows] -= flux[star, None, None] * drawn
+        star_light = psfs.stamps(fitted[star], corner, stamps.shape[-1])[:, 0]
+        stamps[rows] -= flux[star, None, None] * star_light
         return stamps
 
     return light

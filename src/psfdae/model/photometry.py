@@ -63,7 +63,7 @@ TINY = 1.0 / float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class FluxModel:
-    """What a training set of PSFs looks like.
+    """Mean and covariance of the PSFs of a training set.
 
     Attributes
     ----------
@@ -189,12 +189,12 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
     unit = np.where(unit > 0, unit, modulus.max(axis=1))
     with np.errstate(over="ignore"):
         scaled = np.clip(x / unit[:, None], -LARGEST, LARGEST)
-    flux, error, sigma, kept, repaired = _robust_fit(scaled, usable_pixel, model)
-    fitted = possible & (kept.mean(axis=1) >= KEPT)
+    flux, error, sigma, is_used, repaired = _robust_fit(scaled, usable_pixel, model)
+    fitted = possible & (is_used.mean(axis=1) >= KEPT)
     usable = fitted & (flux > error)
     flags = np.zeros(len(images), np.uint16)
     raise_flag(flags, StarFlag.MASKED, ~finite.all(axis=1))
-    raise_flag(flags, StarFlag.OUTLIER, possible & (kept < usable_pixel).any(axis=1))
+    raise_flag(flags, StarFlag.OUTLIER, possible & (is_used < usable_pixel).any(axis=1))
     raise_flag(flags, StarFlag.FAINT, usable & (flux < FAINT_SNR * error))
     raise_flag(flags, StarFlag.NO_FLUX, ~usable)
     flux, error, sigma = (np.where(fitted, v * unit, np.nan) for v in (flux, error, sigma))
@@ -213,14 +213,14 @@ def _robust_fit(
     for _ in range(ROBUST_ROUNDS):
         positive = np.maximum(flux, 0.0)[:, None]
         noise = CLIP * sigma[:, None]
-        kept = finite & (x <= positive * (MARGIN * model.high + limit) + noise)
-        kept &= x >= positive * (model.low / MARGIN - limit) - noise
+        is_used = finite & (x <= positive * (MARGIN * model.high + limit) + noise)
+        is_used &= x >= positive * (model.low / MARGIN - limit) - noise
         # A star without enough pixels is given up; its numbers only have to be defined.
-        used = np.where((kept.mean(axis=1) >= KEPT)[:, None], kept, finite)
+        used = np.where((is_used.mean(axis=1) >= KEPT)[:, None], is_used, finite)
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
         flux, error, score, repaired = _generalised_least_squares(x, used, prior, sigma, model)
         sigma = np.maximum(sigma * np.clip(_scatter(score, used), 0.2, 1.5), NOISE_FLOOR)
-    return flux, error, sigma, kept, repaired
+    return flux, error, sigma, is_used, repaired
 
 
 def _least_absolute(x: np.ndarray, finite: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -235,8 +235,8 @@ def _least_absolute(x: np.ndarray, finite: np.ndarray, mean: np.ndarray) -> np.n
     order = np.argsort(ratio, axis=1)
     share = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
     middle = (share >= 0.5 * share[:, -1:]).argmax(axis=1)
-    chosen = np.take_along_axis(order, middle[:, None], axis=1)
-    return np.take_along_axis(ratio, chosen, axis=1)[:, 0]
+    median_index = np.take_along_axis(order, middle[:, None], axis=1)
+    return np.take_along_axis(ratio, median_index, axis=1)[:, 0]
 
 
 def _scatter(modulus: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -276,10 +276,10 @@ def _generalised_least_squares(
             mean[star, bad] = -mean[star] @ gain
             precision[star] -= (gain * columns).sum(axis=1)
         else:
-            fill, seen = _reduced(model.basis[bad], weight[star], common[star])
+            fill, is_visible = _reduced(model.basis[bad], weight[star], common[star])
             data[star, bad] = -(data[star] @ model.basis) @ fill
             mean[star, bad] = -(mean[star] @ model.basis) @ fill
-            precision[star] -= ((model.basis @ seen) * model.basis).sum(axis=1)
+            precision[star] -= ((model.basis @ is_visible) * model.basis).sum(axis=1)
     data_modes, mean_modes = data @ model.basis, mean @ model.basis
     information = (mean_modes**2 * weight).sum(axis=1) + common * (mean**2).sum(axis=1)
     signal = (mean_modes * data_modes * weight).sum(axis=1) + common * (mean * data).sum(axis=1)
@@ -301,9 +301,9 @@ def _reduced(rows: np.ndarray, weight: np.ndarray, common: float) -> tuple[np.nd
     gram = rows.T @ rows
     # Modes that lie in the unused pixels alone would make it singular, but for the last digits.
     system = common * (1.0 + 1e-12) * np.eye(weight.size) + weight[:, None] * gram
-    inner = np.linalg.solve(system, np.diag(weight))
-    left = weight[:, None] * (np.eye(weight.size) - gram @ inner) / common
-    return left @ rows.T, (left @ gram) * weight
+    solution = np.linalg.solve(system, np.diag(weight))
+    reduced = weight[:, None] * (np.eye(weight.size) - gram @ solution) / common
+    return reduced @ rows.T, (reduced @ gram) * weight
 
 
 # Many stars at once.
@@ -311,7 +311,7 @@ def _reduced(rows: np.ndarray, weight: np.ndarray, common: float) -> tuple[np.nd
 
 @dataclass(frozen=True)
 class Photometry:
-    """What n stamps say of their stars, in the unit of the stamps; NaN where they say nothing."""
+    """Photometry of n stamps, in the unit of the stamps; NaN where it is not possible."""
 
     flux: np.ndarray
     flux_error: np.ndarray  # NaN where the flux was given
@@ -322,12 +322,12 @@ class Photometry:
     flags: np.ndarray  # uint16
 
     def part(self, rows: slice) -> Photometry:
-        """Of a part of the stamps."""
+        """Return the photometry of a part of the stamps."""
         return Photometry(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @classmethod
     def joined(cls, parts: Sequence[Photometry]) -> Photometry:
-        """Of the stamps of several."""
+        """Return the photometry of the stamps of several, one after the other."""
         if len(parts) == 1:
             return parts[0]
         columns = ([getattr(p, field.name) for p in parts] for field in fields(cls))
@@ -365,13 +365,13 @@ class Photometer:
         self.pixels = pixels = model.mean.size
         self.side = round(pixels**0.5)
         # At least a quarter of the directions must be left to tell the noise.
-        kept = min(components, 3 * pixels // 4)
-        leading = model.basis[:, -kept:]
-        self._variance = model.variance[-kept:]
+        leading_count = min(components, 3 * pixels // 4)
+        leading = model.basis[:, -leading_count:]
+        self._variance = model.variance[-leading_count:]
         self._peak = float(model.mean @ model.mean)
-        unseen = model.variance[: pixels - kept] if model.whole else np.array([model.rest])
+        unseen = model.variance[: pixels - leading_count] if model.whole else np.array([model.rest])
         self._unseen = float(unseen.mean())
-        self._others = pixels - 1 - kept
+        self._others = pixels - 1 - leading_count
         contrast = model.mean - 1.0 / pixels
         # Double precision: OpenBLAS rounds single precision by the place of a star in its block.
         self._projector = np.column_stack([leading, contrast])
@@ -390,7 +390,7 @@ class Photometer:
         return self.model.with_free_sky()
 
     def measure(
-        self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, known: Stamps
+        self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, stated: Stamps
     ) -> Photometry:
         """Photometry of stamps (n, d, d) in any unit, sky included, finite.
 
@@ -400,8 +400,8 @@ class Photometer:
         """
         count = len(stamps)
         hidden = bad.reshape(count, -1)
-        flux_known, sky_known = np.isfinite(known.flux), np.isfinite(known.background)
-        sky = np.where(sky_known, known.background, start)
+        flux_known, sky_known = np.isfinite(stated.flux), np.isfinite(stated.background)
+        sky = np.where(sky_known, stated.background, start)
         x = (stamps.reshape(count, -1) - sky[:, None]).astype(np.float32)
         np.copyto(x, 0.0, where=hidden)
         scale = np.abs(x).max(axis=1).astype(np.float64)
@@ -409,13 +409,13 @@ class Photometer:
         scale = np.where(lit, scale, 1.0)
         x[~lit] = self.model.mean
         x /= scale.astype(np.float32)[:, None]
-        fit = self._fit(x, sky_known, known.flux / scale, known.noise / scale)
+        fit = self._fit(x, sky_known, stated.flux / scale, stated.noise / scale)
         images, fits_in = self._normalise(x, fit)
         measured = Photometry(
-            flux=np.where(flux_known, known.flux, fit.flux * scale),
+            flux=np.where(flux_known, stated.flux, fit.flux * scale),
             flux_error=np.where(flux_known, np.nan, fit.error * scale),
             background=np.where(sky_known, sky, sky + fit.sky * scale),
-            noise=np.where(np.isfinite(known.noise), known.noise, fit.noise * scale),
+            noise=np.where(np.isfinite(stated.noise), stated.noise, fit.noise * scale),
             images=images.reshape(stamps.shape),
             used=np.ones(stamps.shape, dtype=bool),
             flags=np.zeros(count, dtype=np.uint16),
@@ -423,7 +423,7 @@ class Photometer:
         clear = flux_known | (fit.flux > CLEAR * fit.error)
         careful = hidden.any(axis=1) | ~lit | ~clear | ~fits_in
         raise_flag(measured.flags, StarFlag.FAINT, measured.flux < FAINT_SNR * measured.flux_error)
-        self._carefully(np.flatnonzero(careful), stamps, hidden, sky, known, measured)
+        self._carefully(np.flatnonzero(careful), stamps, hidden, sky, stated, measured)
         return measured
 
     def _fit(
@@ -446,31 +446,41 @@ class Photometer:
         outside = along - modes @ self._modes
         energy = np.einsum("ij,ij->i", x, x) - (modes**2).sum(axis=1)
         # A known sky makes the mean of the stamp a measurement of the flux.
-        known = sky_known / self.pixels
+        sky_variance = sky_known / self.pixels
 
-        def flux_of(found: np.ndarray, sigma2: np.ndarray, unseen: float) -> tuple[np.ndarray, ...]:
-            prior = np.maximum(found, 0.0) ** 2 + sigma2 / self._peak
+        def flux_of(
+            fitted_flux: np.ndarray, sigma2: np.ndarray, unseen: float
+        ) -> tuple[np.ndarray, ...]:
+            prior = np.maximum(fitted_flux, 0.0) ** 2 + sigma2 / self._peak
             weight = 1.0 / (prior[:, None] * self._variance + sigma2[:, None])
-            rest = 1.0 / (prior * unseen + sigma2)
-            information = weight @ self._modes**2 + rest * self._left + known / sigma2
-            signal = (weight * modes) @ self._modes + rest * outside + known * total / sigma2
-            found = np.where(np.isfinite(flux), flux, signal / information)
-            return found, 1.0 / np.sqrt(information), weight
+            rest_weight = 1.0 / (prior * unseen + sigma2)
+            information = weight @ self._modes**2 + rest_weight * self._left + sky_variance / sigma2
+            signal = (
+                (weight * modes) @ self._modes
+                + rest_weight * outside
+                + sky_variance * total / sigma2
+            )
+            fitted_flux = np.where(np.isfinite(flux), flux, signal / information)
+            return fitted_flux, 1.0 / np.sqrt(information), weight
 
-        found = np.where(np.isfinite(flux), flux, along / (self._left + self._modes @ self._modes))
+        fitted_flux = np.where(
+            np.isfinite(flux), flux, along / (self._left + self._modes @ self._modes)
+        )
         for _ in range(UPDATES):
-            left = energy - 2.0 * found * outside + found**2 * self._left
-            sigma2 = np.maximum(left / self._others, NOISE_FLOOR**2)
+            rest_energy = energy - 2.0 * fitted_flux * outside + fitted_flux**2 * self._left
+            sigma2 = np.maximum(rest_energy / self._others, NOISE_FLOOR**2)
             sigma2 = np.where(np.isfinite(noise), noise**2, sigma2)
             # What the star has beyond the leading eigenvectors is in σ² here.
-            found, _, weight = flux_of(found, sigma2, 0.0)
-        score = self._border_scores(x, modes, total, found, weight, sigma2, sky_known)
+            fitted_flux, _, weight = flux_of(fitted_flux, sigma2, 0.0)
+        score = self._border_scores(x, modes, total, fitted_flux, weight, sigma2, sky_known)
         if used is not None:
             score[~used[:, self._ring]] = np.nan
         scatter = np.where(np.isfinite(noise), 1.0, _clipped_rms(score))
         sigma = np.maximum(np.sqrt(sigma2) * scatter, NOISE_FLOOR)
-        found, error, _ = flux_of(found, sigma**2, self._unseen)
-        return _Fit(found, error, sigma, np.where(sky_known, 0.0, (total - found) / self.pixels))
+        fitted_flux, error, _ = flux_of(fitted_flux, sigma**2, self._unseen)
+        return _Fit(
+            fitted_flux, error, sigma, np.where(sky_known, 0.0, (total - fitted_flux) / self.pixels)
+        )
 
     def _border_scores(
         self,
@@ -483,13 +493,13 @@ class Photometer:
         sky_known: np.ndarray,
     ) -> np.ndarray:
         """Leave-one-out residuals S⁻¹(x − Fm) of the border in units of their σ, (n, ring)."""
-        beyond = weight - 1.0 / sigma2[:, None]
-        pull = beyond * (modes - flux[:, None] * self._modes)
+        excess = weight - 1.0 / sigma2[:, None]
+        pull = excess * (modes - flux[:, None] * self._modes)
         mean = np.where(sky_known, (total - flux) / self.pixels, 0.0)[:, None]
         ring = x[:, self._ring] - flux[:, None] * self._ring_contrast + mean
         residual = ring / sigma2[:, None] + pull @ self._ring_basis
-        lost = np.where(sky_known, 0.0, 1.0 / self.pixels)
-        precision = beyond @ self._ring_basis**2 + ((1.0 - lost) / sigma2)[:, None]
+        sky_loss = np.where(sky_known, 0.0, 1.0 / self.pixels)
+        precision = excess @ self._ring_basis**2 + ((1.0 - sky_loss) / sigma2)[:, None]
         return np.asarray(residual / np.sqrt(precision))
 
     def _normalise(self, x: np.ndarray, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -510,12 +520,12 @@ class Photometer:
         stamps: np.ndarray,
         hidden: np.ndarray,
         sky: np.ndarray,
-        known: Stamps,
+        stated: Stamps,
         out: Photometry,
     ) -> None:
         """Fit some stars with `robust_flux` and overwrite their rows of `out`."""
-        free = ~np.isfinite(known.background[stars])
-        for is_free, members in ((True, stars[free]), (False, stars[~free])):
+        has_free_sky = ~np.isfinite(stated.background[stars])
+        for is_free, members in ((True, stars[has_free_sky]), (False, stars[~has_free_sky])):
             if not members.size:
                 continue
             model, nothing = self._free_sky if is_free else self.model, None
@@ -530,7 +540,7 @@ class Photometer:
                 if estimate is None:
                     estimate = robust_flux(x.reshape(-1, self.side, self.side), model)
                     nothing = estimate if blind else nothing
-                self._overwrite(out, group, x, estimate, sky[group], known)
+                self._overwrite(out, group, x, estimate, sky[group], stated)
 
     def _overwrite(
         self,
@@ -539,32 +549,38 @@ class Photometer:
         x: np.ndarray,
         estimate: FluxEstimate,
         sky: np.ndarray,
-        known: Stamps,
+        stated: Stamps,
     ) -> None:
         """Rows `group` of `out` from the estimate of the first stamps x (GROUP, P)."""
         count = group.size
-        known_flux, known_noise = known.flux[group], known.noise[group]
+        known_flux, known_noise = stated.flux[group], stated.noise[group]
         repaired = estimate.images.reshape(GROUP, -1)
         used = np.isclose(repaired, x, rtol=1e-9, atol=0.0)
-        given, fitted = np.isfinite(known_flux), np.isfinite(estimate.flux[:count])
-        flux = np.where(given, known_flux, estimate.flux[:count])
+        has_flux, fitted = np.isfinite(known_flux), np.isfinite(estimate.flux[:count])
+        flux = np.where(has_flux, known_flux, estimate.flux[:count])
         fit_flags = estimate.flags[:count].copy()
         peak = np.abs(repaired[:count]).max(axis=1)
-        lost = ~fitted | ~(flux > TINY * peak) | (~given & ((fit_flags & StarFlag.NO_FLUX) > 0))
-        fit_flags &= np.where(given, *(np.uint16(kept) for kept in (KEPT_IF_GIVEN, KEPT_OTHERWISE)))
-        raise_flag(fit_flags, StarFlag.NO_FLUX, lost)
-        left = repaired.mean(axis=1)[:count] - np.nan_to_num(estimate.flux[:count]) / self.pixels
-        left = np.where(np.isfinite(known.background[group]), 0.0, left)
-        images = (repaired[:count] - left[:, None]) / np.where(lost, 1.0, flux)[:, None]
-        images[lost] = 0.0
+        is_lost = (
+            ~fitted | ~(flux > TINY * peak) | (~has_flux & ((fit_flags & StarFlag.NO_FLUX) > 0))
+        )
+        fit_flags &= np.where(
+            has_flux, *(np.uint16(flag) for flag in (KEPT_IF_GIVEN, KEPT_OTHERWISE))
+        )
+        raise_flag(fit_flags, StarFlag.NO_FLUX, is_lost)
+        residual_sky = (
+            repaired.mean(axis=1)[:count] - np.nan_to_num(estimate.flux[:count]) / self.pixels
+        )
+        residual_sky = np.where(np.isfinite(stated.background[group]), 0.0, residual_sky)
+        images = (repaired[:count] - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
+        images[is_lost] = 0.0
         filled = np.tile(self.model.mean.astype(np.float32), (GROUP, 1))
         filled[:count] = images
-        ones = np.ones(GROUP)
-        noise = self._fit(filled, ones > 0, ones, np.nan * ones, used).noise[:count] * flux
-        noise = np.where(lost, estimate.noise[:count], noise)
+        unit = np.ones(GROUP)
+        noise = self._fit(filled, unit > 0, unit, np.nan * unit, used).noise[:count] * flux
+        noise = np.where(is_lost, estimate.noise[:count], noise)
         out.flux[group] = flux
-        out.flux_error[group] = np.where(given, np.nan, estimate.error[:count])
-        out.background[group] = sky + np.where(fitted, left, 0.0)
+        out.flux_error[group] = np.where(has_flux, np.nan, estimate.error[:count])
+        out.background[group] = sky + np.where(fitted, residual_sky, 0.0)
         out.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
         out.images[group] = images.reshape(count, self.side, self.side)
         out.used[group] = used[:count].reshape(count, self.side, self.side)
@@ -584,8 +600,8 @@ def _clipped_rms(score: np.ndarray) -> np.ndarray:
         median = np.take_along_axis(ascending, middle, axis=1)
     else:
         median = np.median(modulus, axis=1, keepdims=True)
-    kept = ~unused & (modulus <= SCATTER_CLIP * SIGMA_OF_MAD * median)
-    squares = np.where(kept, modulus, 0.0)
-    count = kept.sum(axis=1)
+    is_used = ~unused & (modulus <= SCATTER_CLIP * SIGMA_OF_MAD * median)
+    squares = np.where(is_used, modulus, 0.0)
+    count = is_used.sum(axis=1)
     total = np.einsum("ij,ij->i", squares, squares)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), 1.0))

@@ -45,8 +45,8 @@ def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observatio
     measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
     if measured is None:
         return observation
-    said = (measured[0], "about, by the scatter of the pixels of stars")
-    return replace(observation, camera=observation.camera | {"gain": said})
+    source = (measured[0], "about, by the scatter of the pixels of stars")
+    return replace(observation, camera=observation.camera | {"gain": source})
 
 
 def measure_gain(
@@ -96,18 +96,20 @@ def measure_gain(
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted = design / variance[..., None]
         inverse = np.linalg.inv(weighted.transpose(0, 2, 1) @ design)
-        found = (inverse @ (weighted.transpose(0, 2, 1) @ data[..., None]))[..., 0]
-        light = np.maximum(found[:, :1] * design[..., 0], 0.0)
+        fitted = (inverse @ (weighted.transpose(0, 2, 1) @ data[..., None]))[..., 0]
+        light = np.maximum(fitted[:, :1] * design[..., 0], 0.0)
         # A residual has the part 1 − h of its pixel's variance, with the leverage h of the fit.
         leverage = np.einsum("npi,nij,npj->np", design, inverse, weighted)
-        residual = data - (design @ found[..., None])[..., 0]
+        residual = data - (design @ fitted[..., None])[..., 0]
         residual /= np.sqrt(np.clip(1.0 - leverage, 0.05, 1.0))
         # Stars that are off by far more than others have neighbours that are on no list.
         chi2 = (residual**2 / variance).mean(axis=1)
-        usual = chi2 < 4.0 * np.median(chi2)
-        photons, error, off = _slopes_of_variance(light[usual], residual[usual], sigma[usual])
+        is_fitted = chi2 < 4.0 * np.median(chi2)
+        photons, error, off = _slopes_of_variance(
+            light[is_fitted], residual[is_fitted], sigma[is_fitted]
+        )
         # Centres stay in their pixel, whose stamp the PSF is drawn in.
-        move = np.clip(found[:, 1:3] / np.maximum(found[:, :1], 1e-12), -0.2, 0.2)
+        move = np.clip(fitted[:, 1:3] / np.maximum(fitted[:, :1], 1e-12), -0.2, 0.2)
         middle = np.floor(place + 0.5)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
     if not photons > 5.0 * error:
@@ -124,18 +126,18 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     from scipy.ndimage import maximum_filter
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    alone = np.zeros(len(place), dtype=bool)
-    if len(known) < 2:
-        return alone
-    distance = cKDTree(place[known]).query(place[known], k=2)[0][:, 1]
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    is_alone = np.zeros(len(place), dtype=bool)
+    if len(located) < 2:
+        return is_alone
+    distance = cKDTree(place[located]).query(place[located], k=2)[0][:, 1]
     # Beyond its edges, an image has only bad pixels.
     masked = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
-    column, row = np.floor(place[known] + 0.5).astype(int).T
+    column, row = np.floor(place[located] + 0.5).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < bad.shape[1]) & (row < bad.shape[0])
     masked = masked[np.where(inside, row, 0), np.where(inside, column, 0)]
-    alone[known] = inside & ~masked & (distance > distance_px)
-    return alone
+    is_alone[located] = inside & ~masked & (distance > distance_px)
+    return is_alone
 
 
 def _changes_of_star(model: FieldPsfs, place: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -176,12 +178,12 @@ def _slopes_of_variance(
         for values in zip(
             *(
                 (
-                    scaled[some].mean(),
-                    (light[some] * scaled[some]).mean(),
-                    (SIGMA_OF_MAD * np.median(np.abs(residual[some] / sigma[some]))) ** 2,
-                    len(some),
+                    scaled[members].mean(),
+                    (light[members] * scaled[members]).mean(),
+                    (SIGMA_OF_MAD * np.median(np.abs(residual[members] / sigma[members]))) ** 2,
+                    len(members),
                 )
-                for some in bins
+                for members in bins
             ),
             strict=True,
         )
@@ -190,9 +192,9 @@ def _slopes_of_variance(
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected)
         design = np.stack([linear, square], axis=1) * weight[:, None]
-        found, left = nnls(design, (variance - 1.0) * weight)
-        expected = 1.0 + found[0] * linear + found[1] * square
+        coefficients, residual_norm = nnls(design, (variance - 1.0) * weight)
+        expected = 1.0 + coefficients[0] * linear + coefficients[1] * square
     # Where the law does not hold, it is known as badly as that.
-    excess = max(left**2 / (len(bins) - 2), 1.0)
+    excess = max(residual_norm**2 / (len(bins) - 2), 1.0)
     error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])
-    return float(found[0]), float(error), float(np.sqrt(found[1]))
+    return float(coefficients[0]), float(error), float(np.sqrt(coefficients[1]))

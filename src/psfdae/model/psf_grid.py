@@ -109,10 +109,10 @@ class PsfGrid:
                 )
                 for kernel in (weights, slopes)
             )
-            for which, (values, kernel) in enumerate(
+            for derivative, (values, kernel) in enumerate(
                 ((smooth, weights), (steep, weights), (smooth, slopes))
             ):
-                light[rows, which] = sum(
+                light[rows, derivative] = sum(
                     kernel[rows, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
                 )
         # A star that moves by a pixel moves by −o knots under its pixels.
@@ -140,12 +140,12 @@ class PsfGrid:
         """Numbers (n, 4) of the nodes around each place, and their shares in the PSF there."""
         axes = []
         for nodes, value in ((self.columns, place[:, 0]), (self.rows, place[:, 1])):
-            before = np.clip(np.searchsorted(nodes, value) - 1, 0, max(len(nodes) - 2, 0))
-            after = np.minimum(before + 1, len(nodes) - 1)
-            width = np.maximum(nodes[after] - nodes[before], 1.0)
+            lower = np.clip(np.searchsorted(nodes, value) - 1, 0, max(len(nodes) - 2, 0))
+            upper = np.minimum(lower + 1, len(nodes) - 1)
+            width = np.maximum(nodes[upper] - nodes[lower], 1.0)
             # Beyond the grid the PSF is that at its edge.
-            part = np.clip((value - nodes[before]) / width, 0.0, 1.0)
-            axes.append((np.stack([before, after]), np.stack([1.0 - part, part])))
+            part = np.clip((value - nodes[lower]) / width, 0.0, 1.0)
+            axes.append((np.stack([lower, upper]), np.stack([1.0 - part, part])))
         (column, across), (row, down) = axes
         number = row[:, None] * len(self.columns) + column[None]
         share = down[:, None] * across[None]
@@ -154,7 +154,7 @@ class PsfGrid:
 
 def _cubic(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights (…, 4) of cubic B-splines at a part of the way between two knots, and slopes."""
-    t, left = part[..., None], 1.0 - part[..., None]
-    weights = [left**3, 3 * t**3 - 6 * t**2 + 4, 3 * left**3 - 6 * left**2 + 4, t**3]
-    slopes = [-(left**2), 3 * t**2 - 4 * t, 4 * left - 3 * left**2, t**2]
+    t, remainder = part[..., None], 1.0 - part[..., None]
+    weights = [remainder**3, 3 * t**3 - 6 * t**2 + 4, 3 * remainder**3 - 6 * remainder**2 + 4, t**3]
+    slopes = [-(remainder**2), 3 * t**2 - 4 * t, 4 * remainder - 3 * remainder**2, t**2]
     return np.concatenate(weights, axis=-1) / 6.0, np.concatenate(slopes, axis=-1) / 2.0

@@ -65,7 +65,7 @@ class Wings:
 
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> Self:
-        """From what `plain` gave.
+        """Inverse of `plain`.
 
         Raises
         ------
@@ -75,20 +75,20 @@ class Wings:
         names = ("radius_px", "profile", "covariance")
         try:
             arrays = {name: np.array(plain[name], dtype=np.float64) for name in names}
-            found = cls(**arrays, outer=float(plain["outer"]))
+            wings = cls(**arrays, outer=float(plain["outer"]))
         except (TypeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"wings without {error}") from None
-        radius, count = found.radius_px, found.profile.size
-        shapes = [a.shape for a in (found.profile, radius, found.covariance)]
+        radius, count = wings.radius_px, wings.profile.size
+        shapes = [a.shape for a in (wings.profile, radius, wings.covariance)]
         if count < 2 or shapes != [(count,), (count,), (count, count)]:
             raise ValueError("wings whose numbers do not fit together")
         rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < MOST_RADIUS_PX
         with np.errstate(all="ignore"):
-            light, doubt = found.light() if rising else (np.nan, np.nan)
-        scale = 0.0 < found.outer < np.inf
+            light, doubt = wings.light() if rising else (np.nan, np.nan)
+        scale = 0.0 < wings.outer < np.inf
         if not (scale and abs(light) < MOST_LIGHT and np.isfinite(doubt)):
             raise ValueError("wings whose light is no part of that of a star")
-        return found
+        return wings
 
     def plain(self) -> dict[str, Any]:
         """Lists and numbers, for a bundle."""
@@ -96,8 +96,8 @@ class Wings:
 
     def scale(self, outer: np.ndarray) -> np.ndarray:
         """s of stars by their `outer_light` (n,), 1 where that is NaN, of an unknown place."""
-        known = np.where(np.isfinite(outer), outer / self.outer, 1.0)
-        return np.asarray(np.clip(known, *OUTER_RANGE))
+        ratio = np.where(np.isfinite(outer), outer / self.outer, 1.0)
+        return np.asarray(np.clip(ratio, *OUTER_RANGE))
 
     def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both.
@@ -119,7 +119,7 @@ class Wings:
         return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
 
     def cards(self) -> list[Card]:
-        """What a FITS header says of them."""
+        """Return cards for a FITS header: radius of all light, and part of it in the stamp."""
         return [
             ("FLUXRAD", float(self.radius_px[-1]), "[pix] all light of a star is within it"),
             ("INMODEL", 1.0 / (1.0 + self.light()[0]), "part of it in the stamp, usual star"),
@@ -127,14 +127,16 @@ class Wings:
 
     def __str__(self) -> str:
         light, error = self.light()
-        said = (
+        sentence = (
             f"{100 * light:.2f} ± {100 * error:.2f} % of the flux in the stamp of a usual star, "
             f"out to {self.radius_px[-1]:.3g} px"
         )
         if light / (1.0 + light) > 0.2:
-            said += "; over a fifth of the flux: try wider stamps (--stamp-px), or a list without "
-            said += "sources that are no stars"
-        return said
+            sentence += (
+                "; over a fifth of the flux: try wider stamps (--stamp-px), or a list without "
+            )
+            sentence += "sources that are no stars"
+        return sentence
 
     @classmethod
     def joined(cls, several: Sequence[Wings]) -> Wings:
@@ -168,17 +170,17 @@ def aperture_correction(
     """
     from photutils.aperture import CircularAperture
 
-    most = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
-    if not 0 < radius_px <= most:
-        raise ValueError(f"radius {radius_px} px, expected above 0 up to {most:g}")
+    radius_max = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
+    if not 0 < radius_px <= radius_max:
+        raise ValueError(f"radius {radius_px} px, expected above 0 up to {radius_max:g}")
     psf = model.psf_at(x, y, 1)
     middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
     scale = float(wings.scale(outer_light(model.on_pixels, np.array([[x, y]])))[0])
-    whole, part = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
-    return (1.0 + whole) / (inside + part)
+    all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
+    return (1.0 + all_wings) / (inside + inner_wings)
 
 
 def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
@@ -186,25 +188,25 @@ def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> 
 
     `draw` makes PSFs (m, d, d) at m places, which are finite. NaN where a place is not known.
     """
-    found = np.full(len(place), np.nan)
-    known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    for part in (known[a : a + PSFS_AT_ONCE] for a in range(0, len(known), PSFS_AT_ONCE)):
+    outer_parts = np.full(len(place), np.nan)
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    for part in (located[a : a + PSFS_AT_ONCE] for a in range(0, len(located), PSFS_AT_ONCE)):
         psf = draw(np.rint(place[part]))
         side = psf.shape[-1]
         axis = np.arange(side) - side // 2
         ring = np.hypot(axis[:, None], axis)
-        found[part] = psf[:, (ring >= OUTER * side / 2) & (ring < side / 2)].sum(axis=1)
-    return found
+        outer_parts[part] = psf[:, (ring >= OUTER * side / 2) & (ring < side / 2)].sum(axis=1)
+    return outer_parts
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     """h_1 … at distances r, shape (K − 1, …), as they are outside of the stamp."""
     # ln of r over the first top; tops are equidistant in it.
     radius = radius_px.astype(r.dtype)
-    beyond = np.log(np.maximum(r / radius[0], 1.0))
+    log_radius = np.log(np.maximum(r / radius[0], 1.0))
     top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
-    off = np.abs(beyond / np.log(radius[1] / radius[0]) - top)
-    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-STEEPNESS * beyond))
+    off = np.abs(log_radius / np.log(radius[1] / radius[0]) - top)
+    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-STEEPNESS * log_radius))
 
 
 def star_tents(
@@ -213,22 +215,31 @@ def star_tents(
     """Windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
-    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
-    brightest = known[np.argsort(-light[known])[:WINGED]]
+    shining = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
+    brightest = shining[np.argsort(-light[shining])[:WINGED]]
     # The pixels within reach, as far as they are in these rows.
     middle = np.rint(place[brightest]).astype(int)
     low = np.maximum(middle - reach, [0, rows.start])
     high = np.minimum(middle + reach + 1, [width, rows.stop])
     for inside in np.flatnonzero((low < high).all(axis=1)):
-        star, (left, top), (right, end) = brightest[inside], low[inside], high[inside]
+        star, (first_column, first_row), (last_column, last_row) = (
+            brightest[inside],
+            low[inside],
+            high[inside],
+        )
         across, down = (
             (np.arange(*ends) - at).astype(np.float32)
-            for ends, at in zip(((left, right), (top, end)), place[star], strict=True)
+            for ends, at in zip(
+                ((first_column, last_column), (first_row, last_row)), place[star], strict=True
+            )
         )
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
         stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
         shape = np.concatenate([stamp[None], np.where(stamp, 0.0, tents(distance, radius))])
-        window = slice(top - rows.start, end - rows.start), slice(left, right)
+        window = (
+            slice(first_row - rows.start, last_row - rows.start),
+            slice(first_column, last_column),
+        )
         yield window, float(light[star]) * shape
 
 
@@ -253,11 +264,11 @@ def wing_light(
     wings: Wings | None,
 ) -> np.ndarray:
     """Light of the wings of stars in an image (h, w)."""
-    far = np.zeros(shape, np.float32)
+    image = np.zeros(shape, np.float32)
     if wings is not None:
         for window, light in star_tents(slice(0, shape[0]), shape[1], place, flux, outer, wings):
-            far[window] += np.tensordot(wings.profile, light, 1)
-    return far
+            image[window] += np.tensordot(wings.profile, light, 1)
+    return image
 
 
 def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, np.ndarray]:
@@ -280,19 +291,19 @@ def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, n
 
 
 def wings_of(
-    left: np.ndarray,
+    residual: np.ndarray,
     error: np.ndarray,
     bad: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
     outer: np.ndarray,
     stamp_px: int,
-    before: Wings | None = None,
+    earlier: Wings | None = None,
 ) -> Wings | None:
     """Wings of stars in what is left of an image (h, w) without sky and models; None without stars.
 
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
-    are far from the wings as they were known `before`.
+    are far from the wings of an `earlier` turn.
     """
     from scipy.ndimage import uniform_filter
 
@@ -303,23 +314,23 @@ def wings_of(
         return None
     count = len(radius)
     blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
-    normal, right, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
+    normal, projection, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
     blocks = []
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
-    even = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
-    for band, tented in tented_light(left.shape, place, flux, outer, blank):
+    even_error = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
+    for band, tented in tented_light(residual.shape, place, flux, outer, blank):
         used = ~bad[band]
-        if before is not None:
-            off = left[band] - np.tensordot(before.profile, tented, 1)
+        if earlier is not None:
+            off = residual[band] - np.tensordot(earlier.profile, tented, 1)
             used &= np.abs(off) < CLIPPED_SIGMA * error[band]
-        weight = np.where(used, 1.0 / even[band], 0.0)
+        weight = np.where(used, 1.0 / even_error[band], 0.0)
         design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
-        flat, seen = design.reshape(count + 1, -1), (left[band] * weight).ravel()
-        normal, right = normal + flat @ flat.T, right + flat @ seen
-        square, pixels = square + float(seen @ seen), pixels + int(np.count_nonzero(weight))
-        each = np.concatenate([design, [left[band] * weight, weight > 0]])
-        blocks.append(block_sums(each, stamp_px).reshape(len(each), -1))
+        flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
+        normal, projection = normal + flat @ flat.T, projection + flat @ data
+        square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
+        summands = np.concatenate([design, [residual[band] * weight, weight > 0]])
+        blocks.append(block_sums(summands, stamp_px).reshape(len(summands), -1))
     if not normal[-1, -1] > 0:
         return None
     *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
@@ -329,17 +340,19 @@ def wings_of(
     # sees, are residuals that neighbouring pixels share, and wings are as wide as these.
     expected, sigma = expected_profile(radius, mean)
     unit = np.append(sigma, normal[-1, -1] ** -0.5)
-    normal, right = normal * unit * unit[:, None], right * unit
-    known, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
+    normal, projection = normal * unit * unit[:, None], projection * unit
+    prior, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
     chi2 = 1.0
     for _ in range(3):
-        inverse = np.linalg.inv(normal / chi2 + known)
-        found = inverse @ (right / chi2 + start)
-        of_pixels = (square - 2.0 * found @ right + found @ normal @ found) / max(pixels, 1)
-        shared = block_light - (found * unit) @ np.array(block_design)
+        inverse = np.linalg.inv(normal / chi2 + prior)
+        parameters = inverse @ (projection / chi2 + start)
+        of_pixels = (
+            square - 2.0 * parameters @ projection + parameters @ normal @ parameters
+        ) / max(pixels, 1)
+        shared = block_light - (parameters * unit) @ np.array(block_design)
         chi2 = max(of_pixels, float(shared @ shared) / max(block_pixels.sum(), 1.0), 1.0)
-    found, inverse = found * unit, inverse * unit * unit[:, None]
-    return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
+    parameters, inverse = parameters * unit, inverse * unit * unit[:, None]
+    return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean)
 
 
 def block_sums(values: np.ndarray, side: int) -> np.ndarray:
@@ -353,7 +366,7 @@ def block_sums(values: np.ndarray, side: int) -> np.ndarray:
 
 
 class Around(NamedTuple):
-    """What is beside the models of stars in an image: sky, light of wings (h, w), and these."""
+    """Sky, light of wings (h, w), wings and σ of an image beside the models of its stars."""
 
     sky: Sky
     far: np.ndarray
@@ -365,44 +378,48 @@ def around_stars(
     image: np.ndarray,
     sky: Sky,
     error: np.ndarray,
-    drawn: np.ndarray,
+    star_light: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
     outer: np.ndarray,
     stamp_px: int,
-    before: Wings | None = None,
+    earlier: Wings | None = None,
 ) -> Around:
-    """Wings and sky of an image (h, w), by turns, where models of its stars are `drawn`.
+    """Return wings and sky of an image (h, w), found by turns beside the models of its stars.
 
     A map of the sky takes wings that are wider than its meshes for sky, until these are known.
 
     Parameters
     ----------
-    image, error, drawn : ndarray, shape (h, w)
+    image, error, star_light : ndarray, shape (h, w)
         Sky included, σ of its pixels, and light of the stars.
     sky : Sky
         As it is known so far; its `bad` pixels do not count.
     place, flux, outer : ndarray, shape (n, 2) and (n,)
         Of the stars, and their `outer_light`.
     stamp_px : int
-    before : Wings, optional
+    earlier : Wings, optional
     """
-    doubt, beside, light = np.hypot(error, FOLLOWED * drawn), image - drawn, (place, flux, outer)
-    wings = _wings_beside(beside, sky.level, doubt, sky.bad, *light, stamp_px, before)
-    far = wing_light(image.shape, *light, wings)
+    sigma, without_stars, stars = (
+        np.hypot(error, FOLLOWED * star_light),
+        image - star_light,
+        (place, flux, outer),
+    )
+    wings = _wings_beside(without_stars, sky.level, sigma, sky.bad, *stars, stamp_px, earlier)
+    light_of_wings = wing_light(image.shape, *stars, wings)
     mapped = np.isfinite(sky.noise_scale)
-    sky = sky_of(beside - far, sky.bad, sky.noise if mapped else None)
+    sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if mapped else None)
     # The map has the most frequent value of the pixels, which is below the mean where noise is that
     # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
-    left = beside - sky.level - far
-    weight = np.where(sky.bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
-    even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
-    sky = replace(sky, level=sky.level + even, flat=sky.flat - even)
-    return Around(sky, far, wings, np.hypot(doubt, ROUND * far))
+    remainder = without_stars - sky.level - light_of_wings
+    weight = np.where(sky.bad | (np.abs(remainder) > CLIPPED_SIGMA * sigma), 0.0, sigma**-2.0)
+    even_light = float((weight * remainder).sum() / max(weight.sum(), np.finfo(float).tiny))
+    sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
+    return Around(sky, light_of_wings, wings, np.hypot(sigma, ROUND * light_of_wings))
 
 
 def _wings_beside(
-    beside: np.ndarray,
+    without_stars: np.ndarray,
     level: np.ndarray,
     doubt: np.ndarray,
     bad: np.ndarray,
@@ -410,21 +427,21 @@ def _wings_beside(
     flux: np.ndarray,
     outer: np.ndarray,
     stamp_px: int,
-    before: Wings | None = None,
+    earlier: Wings | None = None,
 ) -> Wings | None:
     """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
-    wings = before
-    shown = np.where(_like_stars(beside - level, doubt, bad, place), flux, np.nan)
+    wings = earlier
+    shown = np.where(_like_stars(without_stars - level, doubt, bad, place), flux, np.nan)
     for turn in range(ROUNDS):
-        known = wings
+        latest = wings
         if turn:
-            far = wing_light(beside.shape, place, flux, outer, known)
-            level = sky_level(np.where(bad, 0.0, beside - far), bad).level
-        wings = wings_of(beside - level, doubt, bad, place, shown, outer, stamp_px, known)
+            light_of_wings = wing_light(without_stars.shape, place, flux, outer, latest)
+            level = sky_level(np.where(bad, 0.0, without_stars - light_of_wings), bad).level
+        wings = wings_of(without_stars - level, doubt, bad, place, shown, outer, stamp_px, latest)
         if wings is None:
             break
         light, sigma = wings.light()
-        if known is not None and abs(light - known.light()[0]) < SAME * sigma:
+        if latest is not None and abs(light - latest.light()[0]) < SAME * sigma:
             break
     return wings
 
@@ -461,24 +478,24 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     sky, side = observation.sky(), model.stamp_px
     middles, fluxes, outers = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
-    drawn = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
-    for stamps, found in model.stream(observation, threads=1):
+    star_light = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
+    for stamps, prediction in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
-        shift = np.stack([found.shift_x, found.shift_y], axis=1)
+        shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
         corner = np.floor(np.nan_to_num(place) + 0.5).astype(int) + shift + side - side // 2
-        known = np.isfinite(place).all(axis=1) & np.isfinite(found.psf).all(axis=(1, 2))
-        for x, y, psf in zip(*corner[known].T, found.psf[known], strict=True):
+        is_restored = np.isfinite(place).all(axis=1) & np.isfinite(prediction.psf).all(axis=(1, 2))
+        for x, y, psf in zip(*corner[is_restored].T, prediction.psf[is_restored], strict=True):
             stamp = np.s_[y : y + side, x : x + side]
-            if min(x, y) >= 0 and drawn[stamp].shape == psf.shape:
-                drawn[stamp] += psf
+            if min(x, y) >= 0 and star_light[stamp].shape == psf.shape:
+                star_light[stamp] += psf
         outers.append(outer_light(model.on_pixels, place))
         # Wings begin where the stamps end: they are those about the middles of the stamps.
-        middles.append(np.where(known[:, None], corner - side + 0.5 * (side - 1), np.nan))
-        fluxes.append(np.where(known, found.flux, np.nan))
-    inner = np.s_[side:-side, side:-side]
-    light, gain = drawn[inner], observation.gain
+        middles.append(np.where(is_restored[:, None], corner - side + 0.5 * (side - 1), np.nan))
+        fluxes.append(np.where(is_restored, prediction.flux, np.nan))
+    core = np.s_[side:-side, side:-side]
+    light, gain = star_light[core], observation.gain
     middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
     photons = np.maximum(light, 0.0) / gain if gain else 0.0
-    doubt = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
-    beside = sky.flat + sky.level - light
-    return _wings_beside(beside, sky.level, doubt, sky.bad, middle, flux, outer, side)
+    sigma = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
+    without_stars = sky.flat + sky.level - light
+    return _wings_beside(without_stars, sky.level, sigma, sky.bad, middle, flux, outer, side)
