@@ -82,5 +82,5 @@ if not TYPE_CHECKING:  # for a type checker, a module with this function has eve
 
 
 def __dir__() -> list[str]:
-    """What there is, loaded or not."""
+    """List the public names, loaded or not."""
     return sorted({*globals(), *_MODULES})

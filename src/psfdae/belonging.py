@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
 STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
-"""What decides the static PSFs of a scene."""
+"""Configuration keys that decide the static PSFs of a scene."""
 
 DRAWN = ("framing.subpixel", "telescope.aberrations.jitter_waves", "stars.aberration_fraction")
 STARS = (*STATIC, *DRAWN)
-"""What decides of which kind stars are; others of the same kind have another seed or name."""
+"""Configuration keys that decide the kind of stars; sets of one kind differ by seed and name."""
 
 SAME_STARS = ("seed", "stars.name", "stars.count")
-"""What tells sets of stars of one kind apart."""
+"""Configuration keys that distinguish two star sets of the same kind."""
 
 SAME_IMAGE = ("image", "calibration_stars", "parts")
-"""What tells sets of stars of images apart, which are not simulated."""
+"""Keys that distinguish star sets of images, which are not simulated."""
 
 NO_PART = {"name", "jitter_waves"}
 """Keys that a group does not bring along: titles, and what static PSFs lack."""

@@ -1,4 +1,4 @@
-"""What a bundle says of itself: the text beside its arrays."""
+"""Description of a bundle: the text beside its arrays."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Architecture(_Described):
 
 
 class BundleInfo(_Described):
-    """What a bundle says of itself.
+    """Description of a bundle.
 
     Noise is the RMS of the sky noise in a pixel divided by the flux of the star
     inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
@@ -122,7 +122,7 @@ class BundleInfo(_Described):
 
     @property
     def adapted(self) -> str | None:
-        """To which exposure the model was adapted after its training, and by how many stars."""
+        """Exposure to which the model was adapted after its training, and number of stars used."""
         try:
             stars = self.config["stars"]
             return f"{stars['image']}, by {int(stars['adapted']['stars'])} of its stars"
@@ -138,6 +138,6 @@ class BundleInfo(_Described):
             return False
 
     def described(self) -> dict[str, Any]:
-        """What a file of its format says."""
+        """Return the description as a file of this format has it."""
         other = {*(OTHERS if self.dae else NETWORK), *(() if self.misfit else ("misfit",))}
         return self.model_dump(mode="json", exclude=other)

@@ -46,12 +46,12 @@ class Reader(Protocol):
     """Makes what a command's parameter `config` receives."""
 
     def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
-        """From the other options, a file of settings or words of the command line."""
+        """Return settings from the other options, a file, or words of the command line."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What `command` knows of a function: its command's words, and what reads its settings."""
+    """Command of a function: its words, and the reader of its settings."""
 
     name: str
     settings: Reader | None = None
@@ -98,7 +98,7 @@ class Careful(click.Group):
 
 
 def refusal(error: Exception) -> str | None:
-    """What to say of an error that is no bug; None if it is one."""
+    """Return the line for an error that is no bug; None if it is one."""
     if isinstance(error, MemoryError):
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):

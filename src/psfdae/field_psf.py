@@ -111,7 +111,7 @@ class FieldModel:
     def on_lattice(
         self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
     ) -> np.ndarray:
-        """As `images`, with the star at all pairs of rows (r,) and columns (c,), (n, r c, m, m)."""
+        """Return images (n, r c, m, m) of stars at all pairs of rows (r,) and columns (c,)."""
         splines = np.tensordot(terms, self.coefficients, 1)
         axis = np.arange(side) - side // 2
         down, across = (
@@ -590,7 +590,7 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
     place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
 
     def slope(values: np.ndarray, axis: int) -> np.ndarray:
-        """Of a polynomial through five knots."""
+        """Return the slope of a polynomial through five knots."""
         near, far = (np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2))
         return np.asarray((8.0 * near - far) / (12.0 * spacing))
 

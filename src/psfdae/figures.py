@@ -31,7 +31,7 @@ REFERENCES = {
     "realisation": "against the star's own noise-free image (realisation)",
     "template": "against the static PSF of the field (template)",
 }
-"""What each reference is, for titles."""
+"""Names of the references in titles."""
 
 RC: dict[str, Any] = {
     "figure.dpi": DPI,

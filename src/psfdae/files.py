@@ -33,7 +33,7 @@ class ProductError(Error, RuntimeError):
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""What the system says where a file has no space; libraries leave out which file."""
+"""Error numbers of a full disk; libraries leave out which file has no space."""
 
 
 @contextmanager
@@ -82,7 +82,7 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
 
 
 def _stem(path: Path) -> str:
-    """What names of temporary files of a path start with."""
+    """Return the start of the names of temporary files of a path."""
     # Of 255 bytes that a name may have; a character takes up to four.
     return f".{path.name[:40]}"
 
@@ -108,7 +108,7 @@ UNDIGESTED = ("reference",)
 
 
 def digest_path(path: Path) -> Path | None:
-    """Where the digest of a product belongs, if it lies in a folder with digests."""
+    """Return the place of the digest of a product, if it lies in a folder with digests."""
     path = Path(os.path.abspath(path))  # noqa: PTH100 - symbolic links are names here
     for root in path.parents:
         if (root / DIGESTS).is_dir():
@@ -120,7 +120,7 @@ def digest_path(path: Path) -> Path | None:
 
 
 def digest_line(path: Path, record: Path) -> str:
-    """What `sha256sum` would print of a file, in the folder of results, for its digest `record`."""
+    """Return the line of `sha256sum` for a file, in the folder of results, with digest `record`."""
     parts = record.parts
     place = Path(*parts[len(parts) - parts[::-1].index(DIGESTS) :]).with_suffix("")
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""What other packages bring: commands, methods and settings, by entry points."""
+"""Commands, methods and settings of other packages, by entry points."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def _plain(path: Path | None, tree: Any) -> None:
 
 
 def parse_yaml(path: Path | None) -> Any:
-    """What a YAML file holds; a key given twice is a mistake.
+    """Return the content of a YAML file; a key given twice is a mistake.
 
     Raises
     ------

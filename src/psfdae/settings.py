@@ -190,7 +190,7 @@ class OfTest(OfFit, Protocol):
 
 
 class CalibrationStars(Group):
-    """Which stars of an image become training data, and the noise that they get."""
+    """Choice of the stars of an image as training data, and the noise that they get."""
 
     snr_min: Positive | None = Field(
         None,

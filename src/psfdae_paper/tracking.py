@@ -61,7 +61,7 @@ class Point(NamedTuple):
 
 
 class Named(TypedDict):
-    """What a run is called; see `Run`."""
+    """Name of a run; see `Run`."""
 
     kind: str
     dataset: str
@@ -442,7 +442,7 @@ def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
 
 
 def _of_scene3(kind: str) -> Named:
-    """What the run of a network of scene 3 is called."""
+    """Return the name of the run of a network of scene 3."""
     return Named(
         kind=kind,
         dataset="alignment",

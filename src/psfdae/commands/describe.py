@@ -39,7 +39,7 @@ def describe(
 
 
 def description(packed: Bundle) -> str:
-    """What a bundle says of itself, for people."""
+    """Return the facts and the errors of a bundle as text."""
     facts = _facts(packed)
     width = max(len(name) for name in facts)
     lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]

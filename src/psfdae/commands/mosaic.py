@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from psfdae.commands.predict import Stated
 
 ALONE = ("extension", "origin", "mask", "weight", "variance", "error")
-"""What is stated of one image, and cannot be of several."""
+"""Options that belong to one image, and cannot be given for several."""
 
 
 class MosaicError(Error, RuntimeError):
@@ -31,7 +31,7 @@ class MosaicError(Error, RuntimeError):
 
 
 def images_of(path: Path, stated: Stated) -> dict[str, Stated]:
-    """What is stated of each image of a file by its name (`science_images`).
+    """Return the stated options of each image of a file by its name (`science_images`).
 
     Stars of the list that is stated belong to the image on which they are.
     """

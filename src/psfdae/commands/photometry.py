@@ -206,7 +206,7 @@ def photometry_table(
 
 
 def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
-    """What the table says of itself."""
+    """Return the header of the table."""
     return {
         "INFILE": ascii_line(image.name),
         "PSFMODEL": ascii_line(found.model.name),

@@ -30,7 +30,7 @@ from psfdae.progress import silence
 
 @dataclass(frozen=True)
 class Stated:
-    """What is said of an image beside its header."""
+    """Image options; each overrides the FITS header."""
 
     catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None
     detect: Annotated[bool, "Find the stars of an image; the list is written, too."] = False

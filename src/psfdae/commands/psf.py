@@ -86,7 +86,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _notes(model: FieldPsfs, places: np.ndarray) -> list[str]:
-    """What is to be said of places (n, 2); PredictionError if one is off the image."""
+    """Return notes on places (n, 2); PredictionError if one is off the image."""
     order, size, notes = model.order, model.image_px, []
     if size is not None:
         off = ((places < -0.5) | (places >= np.array(size) - 0.5)).any(axis=1)

@@ -224,7 +224,7 @@ def _by_row(found: Wavefronts, rows: Table) -> np.ndarray:
 
 
 def report(found: Wavefronts) -> list[str]:
-    """What is said of the stars and of the telescope, in lines."""
+    """Return lines on the stars and the state of the telescope."""
     terms, summary = found.terms, found.summary
     first = np.flatnonzero(np.diff(summary["star"], prepend=-1))
     error = np.sqrt(np.einsum("mkk->mk", summary["covariance"][first]))

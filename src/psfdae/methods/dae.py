@@ -127,7 +127,7 @@ class Dae(Method):
         return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
 
     def factor(self, stamp_px: int) -> float:
-        """From images of sum 1 to those that the network sees."""
+        """Return the factor from images of sum 1 to those that the network sees."""
         from psfdae.networks.dae import image_scale
 
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)

@@ -1,4 +1,4 @@
-"""What training leaves for use: one file with a network and all that it takes to apply it.
+"""The file of a model: a fitted method and all that it takes to apply it.
 
 A bundle is a safetensors file: arrays, and a JSON text that describes them. Reading
 it executes nothing. The text holds a SHA-256 of the description and the arrays, so a

@@ -1,4 +1,4 @@
-"""What a bundle has to know of its network: the errors that it makes on test stars.
+"""Errors of a fitted method on test stars, which its bundle states.
 
 Errors are per pixel and per noise level. They are not normally distributed: the core
 of a PSF, its wings and the rare star that is unlike all others share a pixel, and the
@@ -143,7 +143,7 @@ class Errors:
         return np.asarray(np.maximum(holds, HIDDEN * self.rms()))
 
     def ratio95(self) -> np.ndarray:
-        """By how much the interval that holds 95 % of all pixels is wider, shape (S,)."""
+        """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
         scaled = np.abs(self.error) / np.maximum(self.half_width, LEAST_SIGMA)[:, None]
         return np.array([np.quantile(node, WIDE) for node in scaled], np.float64)
 
@@ -152,7 +152,7 @@ class Errors:
         return np.asarray(np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error])))
 
     def strange_limit(self) -> np.ndarray | None:
-        """What 0.1 % of the stars exceed at every node, shape (S,).
+        """Return the outlier score that 0.1 % of the stars exceed at every node, shape (S,).
 
         The excess over a node's median is taken to be as usual at all of them. Few stars do not
         show what 0.1 % exceed: the limit is at least that of a further star beside n normal √score,
@@ -187,7 +187,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class StarFacts:
-    """What a bundle says of the stars of a training, whatever was fitted to them.
+    """Facts on the stars of a training that a bundle states, whatever was fitted to them.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class StarFacts:
     def of(
         cls, stars: Product, reference: str, config: Any, trained: Mapping[str, Any]
     ) -> StarFacts:
-        """From a product "stars"; the rest is as in `model_of`."""
+        """Return the facts of a product "stars"; the rest is as in `model_of`."""
         stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
         images, references = stars["realisation"], stars[reference]
         noise, levels = noise_model(config), np.asarray(config.noise.levels)
@@ -316,7 +316,7 @@ def _trained_on(product: Product, train: np.ndarray) -> int:
 
 
 def _kind_of_stamps(product: Product) -> dict[str, Any]:
-    """What the configuration of the stars says of their stamps."""
+    """Return the keys of a bundle on stamps, from the configuration of the stars."""
     config = product.config
     try:
         telescope, framing = config["telescope"], config["framing"]
@@ -339,7 +339,7 @@ def _kind_of_stamps(product: Product) -> dict[str, Any]:
 def packed(
     fitted: Method, stamp_px: int, noise: float, largest: float
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """What a fit packs for this noise, or for the least above it for which it takes few bytes.
+    """Return arrays of a fit for this noise, or for the least above it that takes few bytes.
 
     Raises
     ------
@@ -604,7 +604,7 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
 def _noisy(
     stars: HeldOutStars, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At least `FEW_STARS` noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
+    """Return at least `FEW_STARS` noisy images (n, d, d) of flux 1, and their stars, (n,)."""
     star = np.resize(np.arange(len(stars.images)), max(len(stars.images), FEW_STARS))
     return stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng), star
 

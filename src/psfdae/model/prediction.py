@@ -1,4 +1,4 @@
-"""What comes out of a model, in memory and as a FITS file that is written piece by piece.
+"""Predictions of a model, in memory and as a FITS file that is written piece by piece.
 
 | extension | content |
 |---|---|

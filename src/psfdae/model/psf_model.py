@@ -229,7 +229,7 @@ class PsfModel(FieldPsfs):
         position: ArrayLike | None,
         centre: ArrayLike | None,
     ) -> Stamps:
-        """What `predict` is given, checked."""
+        """Check the arguments of `predict`."""
         data = real_numbers("stamps", stamps)
         single = data.ndim == 2
         data = data[None] if single else data
@@ -318,7 +318,7 @@ class PsfModel(FieldPsfs):
     def other_instrument(
         self, instrument: Mapping[str, str], colour_column: str | None = None
     ) -> str:
-        """In words, what of another image's telescope, camera and filter is not the training's.
+        """Describe how an image's telescope, camera or filter differs from the training image.
 
         Parameters
         ----------
@@ -513,7 +513,7 @@ class Restored(NamedTuple):
 
 
 class Engine:
-    """What a bundle needs to be ready: the method and the photometry's matrices.
+    """A bundle that is ready to use: the method and the photometry's matrices.
 
     Safe to use from several threads.
     """
@@ -669,7 +669,7 @@ class Engine:
         return width, ratios * widest / wider, np.where(flux_too & sky_too, scales[2], of_flux)
 
     def _measured(self, seen: Seen, method: MeasuresStars) -> Restored:
-        """With what the method measures in place of the photometry.
+        """Restore stars with the fluxes that the method measures in place of the photometry.
 
         That repairs bad pixels and tells the noise.
         """
@@ -749,7 +749,7 @@ class Engine:
         return np.asarray(covariance + more[:, :, None] ** 2 * np.eye(4))
 
     def _estimated(self, seen: Sequence[Seen]) -> list[Restored]:
-        """With fluxes and sky that the method found first, if it can where both are unknown.
+        """Restore stars of unknown flux: estimate flux and sky first, if the method can.
 
         It takes the noise for larger then: what it does not know of a bright star would pass for
         flux. Parts are restored together, in which some stars have about the same noise.

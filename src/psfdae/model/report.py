@@ -115,7 +115,7 @@ def standing(errors: Table, method: str, label: str) -> str:
 
 @dataclass(frozen=True)
 class Quality:
-    """What the page tells of a model.
+    """Contents of the report page of a model.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Quality:
     facts: Sequence[str] = ()
 
     def has(self, flag: StarFlag) -> np.ndarray:
-        """Which stars carry one of these flags."""
+        """Return True for stars that carry one of these flags."""
         return (self.stars["flags"] & int(flag)) > 0
 
     def usable(self) -> np.ndarray:
@@ -349,7 +349,7 @@ def _errors_table(q: Quality) -> str:
 
 
 def _found_table(q: Quality) -> str:
-    """What `predict` measures of held-out stars of which nothing is given."""
+    """Return the table of `predict` on held-out stars of which nothing is given."""
     rows = [
         [
             f"{row['snr']:.3g}",
@@ -473,7 +473,7 @@ ACROSS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "x (px)": lambda stars: stars["x"],
     "y (px)": lambda stars: stars["y"],
 }
-"""What sizes and shapes are drawn against."""
+"""Axes against which sizes and shapes are drawn."""
 
 
 @styled

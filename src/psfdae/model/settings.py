@@ -34,7 +34,7 @@ CHOSEN = "dataset=from_stars"
 
 
 class Settings(Group):
-    """What a training on the bright stars of an image depends on, but for the methods' own."""
+    """Settings of a training on the bright stars of an image, but for those of the methods."""
 
     seed: Seed = 20200611
     # A network takes longer than the others together.

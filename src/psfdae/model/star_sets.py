@@ -34,7 +34,7 @@ def of_image(stars: Product) -> bool:
 
 
 def field_positions(stars: Product) -> np.ndarray:
-    """Where each star stands: in steps of the field's grid, shape (n, 2).
+    """Return the field position of each star, in steps of the field's grid, shape (n, 2).
 
     Of an image in pixels, NaN where its list does not say it, with two more columns: magnitude and
     colour of the bright star, which stay those of its noisy images.
@@ -98,7 +98,7 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
 def own_noise(
     stars: Product, images: np.ndarray, background: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the own noise of stars of a product "stars" does to images of them, of flux 1.
+    """Return the noise that stars of a product "stars" have themselves, in images of flux 1.
 
     Simulated stars have none.
 
@@ -136,7 +136,7 @@ def training_set(
     reference: str,
     **more: Any,
 ) -> TrainingSet:
-    """What a method learns from: the training part of a split, with a configuration's noise."""
+    """Return the training part of a split, with the noise of a configuration."""
     parts = split_stars(stars, split, config)
     if of_image(stars):
         more["own_noise"] = _own_noise(stars, config.noise.background_photons)

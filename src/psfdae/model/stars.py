@@ -187,7 +187,7 @@ class Stars:
 
     @classmethod
     def of(cls, sources: Sequence[Source], settings: Settings) -> Stars:
-        """As `from_image`, of images with what is stated about them, and settings."""
+        """Choose the stars of images with their options; errors are those of `from_image`."""
         _require_own_names(sources)
         margin = settings.calibration_stars.margin_px
         opened = [source.open(settings.framing.stamp_px, margin).assuming() for source in sources]
@@ -340,7 +340,7 @@ class Stars:
 
     @property
     def name(self) -> str:
-        """What a model of these stars is called by default."""
+        """Default name of a model of these stars."""
         return ALL if self.exposures else self.source.name
 
     def with_settings(self, settings: Settings) -> Stars:
@@ -390,7 +390,7 @@ class Stars:
         return single_psf(self.candidates.bright, self.held_out)
 
     def described(self) -> dict[str, Any]:
-        """What the product "stars" says of its stars."""
+        """Return the description of the product "stars"."""
         observation = self.observation
         kept = self.settings.model_dump(include={"seed", "calibration_stars", "framing", "parts"})
         scale = {"pixel_scale_arcsec": observation.pixel_scale_arcsec}
@@ -530,7 +530,7 @@ def _size(observation: Observation, found: Candidates) -> SourceSize | None:
 
 
 def few_stars(stars: Stars) -> list[str]:
-    """What is to be said of a model of few stars."""
+    """Return notes on a model of few stars."""
     count, held = len(stars), int(stars.held_out.sum())
     if count >= ENOUGH_STARS:
         return []

@@ -157,7 +157,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
 
 
 def _found(model: PsfModel, stars: Stars, degraded: Mapping[float, np.ndarray]) -> Table:
-    """What `predict` makes of held-out stars of flux 1 at each λ, given only their places.
+    """Predict held-out stars of flux 1 at each λ from their places alone.
 
     The bright star that is the truth has noise of its own, which counts in every error.
     """

@@ -36,7 +36,7 @@ ERRORS = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": 
 
 LEARNING = ("model", "optimiser", "scheduler")
 REACHED = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
-"""What a checkpoint has of a training: states of torch's own, and plain values."""
+"""Contents of a checkpoint: states of torch's own, and plain values."""
 
 
 class TrainingError(FitError):
@@ -305,7 +305,7 @@ def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
 
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
-    """What a training calls after each epoch: a bar, in a log a line."""
+    """Give the function that a training calls after each epoch: a bar, in a log a line."""
     terminal = sys.stderr.isatty()
 
     def report(row: Row) -> None:

@@ -23,7 +23,7 @@ ABOUT = "psfdae"
 """The one key of the metadata: safetensors would write several in random order."""
 
 MAGIC = b"psfdae checkpoint, sha256 "
-"""What a checkpoint starts with; the checksum of all that follows it comes next."""
+"""First bytes of a checkpoint; the checksum of all that follows it comes next."""
 
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:

@@ -400,7 +400,7 @@ class SampledStamps:
         )
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """As `ModalStamps.stamps`; raises as `samples`."""
+        """Return stamps as `ModalStamps.stamps` does; raises as `samples`."""
         out = np.empty((len(coefficients), self.stamp_px, self.stamp_px), self._dtype)
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:

@@ -87,7 +87,7 @@ class Broadening:
     profile: Profile
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """As `Profile.transfer`, 0 at 0."""
+        """Return the change of the transfer function, 0 at 0."""
         wide, narrow = (
             replace(self.profile, fwhm=self.profile.fwhm * np.exp(step)).transfer(frequency)
             for step in (STEP, -STEP)
@@ -185,7 +185,7 @@ class BlurredSampling(WholePeriod):
 
 
 class BlurredPropagator:
-    """From OPD maps to blurred stamps, as `StampPropagator` without a blur; its parameters.
+    """Propagator from OPD maps to blurred stamps, with the parameters of `StampPropagator`.
 
     Works with numpy only, in any number of threads.
     """
@@ -203,7 +203,7 @@ class BlurredPropagator:
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
 
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """As `StampPropagator`: (B, M, M) in waves and (B, 2) in pixels to (B, d, d)."""
+        """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, moved by (B, 2) pixels."""
         offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
         return np.stack([self._stamp(*star) for star in zip(opd, offset_px, strict=True)])
 

@@ -30,7 +30,7 @@ SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distorti
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""
 
 FIRST_NOLL = 4
-"""Of terms that are no piston and no tilt: those only move the image."""
+"""First Noll index of terms that are no piston and no tilt: those only move the image."""
 
 MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 """Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
@@ -187,7 +187,7 @@ def movable_modes(modes: Modes, pixel: float, x: np.ndarray, y: np.ndarray) -> n
 
 
 HIGHEST_DEGREE = 16
-"""Of modes, in either coordinate of the pupil."""
+"""Highest degree of modes, in either coordinate of the pupil."""
 
 
 def legendre(degrees: Sequence[int], x: np.ndarray) -> np.ndarray:

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""From the numbers of some starts, (a,), and parameters of each, (a, K), to the logarithm of the
+"""Function of the numbers of some starts, (a,), and their parameters, (a, K): logarithm of the
 posterior (a,), its slope (a, K), and the expected information with that of the prior (a, K, K)."""
 
 DAMPING_FACTOR = 10.0
-"""By which the damping falls after a good step and grows after a bad one."""
+"""Levenberg–Marquardt damping factor, down after a good step and up after a bad one."""
 
 
 class Steps(NamedTuple):
@@ -27,12 +27,12 @@ class Steps(NamedTuple):
 
     most: int = 12
     least_gain: float = 0.02
-    """In the logarithm of the posterior: a step that promises less is the last one."""
+    """Least gain in the logarithm of the posterior: a step that promises less is the last one."""
     decisive: int | None = None
     """First so many parameters, of which alone that gain is counted, whatever the others are."""
     first_damping: float = 1e-2
     most_damping: float = 1e6
-    """At which a climb is given up."""
+    """Damping at which a climb is given up."""
     rounding: float = 0.0
     """Relative fall of the posterior that rounding may cause."""
     depth: float = np.inf
@@ -45,7 +45,7 @@ STEPS = Steps()
 
 @dataclass
 class Peaks:
-    """Where climbs have come to.
+    """Local maxima that the climbs have found.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What is common to all stars of an image: the state of the telescope, by one fit.
+"""State of the telescope, common to all stars of an image, by one fit.
 
 All stars follow from a few numbers of the telescope (`psfdae.telescope.field.FieldModel`); each
 has its own place, flux and sky besides.
@@ -29,13 +29,13 @@ from psfdae.telescope.raytracing import RayTracingError
 from psfdae.telescope.settings import Seeing
 
 MOST_STARS = 500
-"""Of the most light, that take part; equations grow with their number."""
+"""Most stars that take part, the brightest ones; cost grows with their number."""
 
 CLIMB = Steps(most=30, least_gain=0.005, rounding=1e-7)
 
 ROUNDS = 4
-"""In which stars choose the mode nearest to the field, and the field follows them; and in which
-stamps are computed anew for a seeing that was found."""
+"""Rounds in which stars choose the mode nearest to the field, and the field follows them; and in
+which stamps are computed anew for a seeing that was found."""
 
 MOST_CHANGE, SEEING_ERROR = 0.5, 2e-3
 """Relative changes of the seeing's FWHM: the most that is allowed, from what is stated and
@@ -75,7 +75,7 @@ class Joint:
 
     @property
     def disagrees(self) -> np.ndarray:
-        """Which of these stars the state does not explain, (m,)."""
+        """True for stars that the state does not explain, (m,)."""
         return self.deviance > self.expected + POOR_FIT * self.scatter
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SAMPLES = 48
-"""Of a pupil, along its diameter."""
+"""Samples of a pupil along its diameter."""
 
 CELLS = 8
 """Pupils along a side of the field, at most."""

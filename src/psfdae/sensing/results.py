@@ -135,7 +135,7 @@ def _stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -
 
 @dataclass(frozen=True, eq=False)
 class Wavefronts:
-    """What stars say of a telescope.
+    """Wavefronts of stars and the state of their telescope.
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Wavefronts:
 
     @property
     def telescope(self) -> OwnTelescope:
-        """With the prior of its aberrations."""
+        """The telescope with the prior of its aberrations."""
         return self.search.optics.telescope
 
     @property
@@ -210,7 +210,7 @@ class Wavefronts:
 
     @cached_property
     def summary(self) -> dict[str, np.ndarray]:
-        """Of every mode with a draw, by star and from the likeliest on.
+        """Table of posterior modes per star, most probable first.
 
         `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
         """
@@ -269,7 +269,7 @@ class Wavefronts:
     def psf_and_error(
         self, oversampling: int = 1, side: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `psf`, and the standard deviation of every pixel over all wavefronts of the star."""
+        """Return `psf`, and the standard deviation of every pixel over all wavefronts of the star."""
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)

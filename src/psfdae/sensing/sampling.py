@@ -109,10 +109,10 @@ class Chains(NamedTuple):
 CHAINS = Chains()
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From posteriors' numbers (m,) and parameters (m, D) to the logarithms of the posteriors, (m,)."""
+"""Function of posteriors' numbers (m,) and parameters (m, D): their logarithms, (m,)."""
 
 Twin = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Likewise to the parameters (m, D) that have the same likelihood, and the gain (m,) in the
+"""The same, to the parameters (m, D) that have the same likelihood, and the gain (m,) in the
 logarithm of the posterior; the twin's twin is where one started."""
 
 

@@ -57,19 +57,19 @@ LEAST_PIXELS = 0.5
 """Part of the pixels that a star must have."""
 
 LEAST_LEFT = 0.01
-"""Of the sky's counts, that a pixel is expected to have at least."""
+"""Lower limit of the expected counts, as a fraction of the sky."""
 
 OUTSIDE = 1e100
-"""That the logarithm of the posterior falls by where a star is not near its stamp."""
+"""Fall of the logarithm of the posterior where a star is not near its stamp."""
 
 WEAK = 1e-9
 """Information on flux and sky besides that of the star, so that no matrix is singular."""
 
 STARS_AT_ONCE = 128
-"""Of 16 × 16 px that are worked on together, to bound the memory."""
+"""Stars of 16 × 16 px that are worked on together, to bound the memory."""
 
 CANDIDATES_AT_ONCE = 100
-"""Likewise of a star."""
+"""Candidates of a star that are evaluated at once."""
 
 
 class Round(NamedTuple):
@@ -203,7 +203,7 @@ class Photons:
 
     @classmethod
     def of(cls, stamps: Stamps) -> Photons:
-        """From stamps in counts; where no gain is known, the sky's noise alone counts."""
+        """Return photons of stamps in counts; without a gain, the sky's noise alone counts."""
         data = stamps.data.astype(np.float64)
         level = border_median(data, stamps.bad)
         level = np.where(np.isfinite(stamps.background), stamps.background, level)

@@ -144,7 +144,7 @@ class Seidel(Group):
 
     @property
     def coefficients(self) -> np.ndarray:
-        """In waves, in the order of `SEIDEL_TERMS`, shape (5,)."""
+        """Coefficients in waves, in the order of `SEIDEL_TERMS`, shape (5,)."""
         return np.array([getattr(self, term) for term in SEIDEL_TERMS])
 
 

@@ -188,7 +188,7 @@ class FieldModel:
 
 
 def field_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
-    """What is common to all stars at field angles (n, 2).
+    """Return the model of the field that is common to all stars at angles (n, 2).
 
     Seidel terms: the four coefficients that are no tilt. Zernike terms: the coefficients of their
     polynomials of the field. A ray trace: the detector's defocus, and decentre and tilt of the

@@ -1,4 +1,4 @@
-"""What the photons of a state's stamps tell about it: Fisher information and its bound.
+"""Fisher information of the photons of a state's stamps, and its bound.
 
 Photon counts are Poisson, n ~ Poisson(F p + B). Their Fisher information about
 the state t, per pixel F² ∂p ∂pᵀ / (F p + B), is that of a Gaussian with the
@@ -22,7 +22,7 @@ from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel
 
 Stamps = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Of parameters (n, K) stamps and derivatives, as `stamps_and_slopes` gives them."""
+"""Function of parameters (n, K): stamps and derivatives, as of `stamps_and_slopes`."""
 
 CHUNK = 64
 """States whose derivatives are in memory at a time."""

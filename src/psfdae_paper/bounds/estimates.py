@@ -100,7 +100,7 @@ class Estimates:
 
     @classmethod
     def over_bank(cls, sizes: dict[int, np.ndarray]) -> Estimates:
-        """From `measures_of` by number of draws, each twice that before."""
+        """Return estimates of `measures_of` by number of draws, each twice that before."""
         nested = list(sizes.values())
         quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
         return cls(nested[-1], quarter, nested[-1])
@@ -113,7 +113,7 @@ class Estimates:
         static: np.ndarray,
         stars: BoundedStars,
     ) -> Estimates:
-        """From sums over importance samples in four parts, and those with the truth's modes."""
+        """Return estimates of importance samples in four parts, and of those with the truth's modes."""
         measure = partial(measures_of, static=static, stars=stars)
         quarter, _, full = nested_means(parts, measure).values()
         return cls(full, quarter, measure(helped))
@@ -125,7 +125,7 @@ class Estimates:
         return size
 
     def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
-        """With another one of the stars `few` where it has more samples, and for how many."""
+        """Take another estimate of the stars `few` where it has more samples; and for how many."""
         if other is None:
             return self, 0
         better = (self.ess[few] < ENOUGH_ESS) & (other.ess > self.ess[few])

@@ -105,7 +105,7 @@ def jitters(jitter_px: int) -> list[tuple[int, int]]:
 
 
 def windows(jitter_px: int) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """Which stamps share a window: (row, column) → list of (symmetry, jitter) numbers."""
+    """Return the stamps that share a window: (row, column) → list of (symmetry, jitter) numbers."""
     margin = jitter_px + MIRROR_MARGIN
     found: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for s, symmetry in enumerate(SYMMETRIES):
@@ -179,7 +179,7 @@ class Likelihood:
         return signal + self.background
 
     def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What multiplies the residuals, and what is added to the product, for stamps (K, P).
+        """Return the factor of the residuals and the constant of the product, for stamps (K, P).
 
         That is ℓ − ℓ̄, shape (K, P), and n̄·ℓ − F Σp, shape (K,), in float64.
         """

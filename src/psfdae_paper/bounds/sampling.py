@@ -68,7 +68,7 @@ class TwinSearch(NamedTuple):
     sources: int = 3
     """Best modes of a star whose twins are sought."""
     offsets: int = 1
-    """That are tried in a field around every source."""
+    """Offsets that are tried in a field around every source."""
     most: int = 40
     """Twins that are tried in all."""
 
@@ -77,7 +77,7 @@ class Search(NamedTuple):
     """How many modes are sought: few, and more for stars that they do not explain."""
 
     fields: int = 4
-    """From the best matches in which modes are sought."""
+    """Fields with the best matches, in which modes are sought."""
     offsets: int = 3
     """The same in the star's own field, if it is given."""
     poor_fit: float = 3.0
@@ -92,7 +92,7 @@ class Search(NamedTuple):
     stars_at_once: int = 256
     """Whose matches are in memory together."""
     missed: float = 4.0
-    """As `poor_fit`, for a star to count as not explained in the end."""
+    """Like `poor_fit`, for a star to count as not explained in the end."""
 
 
 class Proposals(NamedTuple):
@@ -107,7 +107,7 @@ class Proposals(NamedTuple):
 TWINS, SEARCH, PROPOSALS = TwinSearch(), Search(), Proposals()
 
 THOROUGH = Search(fields=16, offsets=16, poor_fit=2.0)
-"""Of the error bounds."""
+"""Search of the error bounds."""
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
@@ -183,7 +183,7 @@ class StampModel:
         return out
 
     def directions(self, field: np.ndarray) -> np.ndarray:
-        """What z does to the monomials' coefficients at fields (n,), shape (n, 5, 8)."""
+        """Return the change of the monomials' coefficients by z at fields (n,), shape (n, 5, 8)."""
         return monomial_coefficients(np.diag(self.sd), self.field[field][:, None])
 
     def derivatives(
@@ -233,7 +233,7 @@ class StampModel:
 
 
 NOTHING, FIELD, TRUTH = range(3)
-"""What is given to the search for modes; who has more, has less, too."""
+"""Knowledge of the search for modes; a later one includes those before."""
 
 
 @dataclass(frozen=True)
@@ -532,7 +532,7 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
 
 
 def recentred(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel) -> Modes:
-    """Where matches climb to if the stamp may lie anywhere, at the pixel that is nearest.
+    """Refine modes with a free stamp offset, rounded to whole pixels.
 
     In whole pixels, a stamp that is one beside its place leads to another mode, mostly a wrong one.
     Parameters are those of `climb`.
@@ -620,7 +620,7 @@ def corners(modes: Modes, stars: np.ndarray) -> Modes:
 
 
 def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
-    """Where else nearly the same image can come from: other fields and offsets of every star.
+    """Return other fields and offsets of every star that give nearly the same image.
 
     An image depends on eight coefficients of pupil monomials, of which the offset of the
     stamp changes the tilts; in every field they are another function of the five Seidel

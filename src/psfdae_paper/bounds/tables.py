@@ -298,7 +298,7 @@ def compared(
 
 
 def paper_verdict(paper: Comparison, tight: bool) -> str:
-    """What a bound, which is tight or not, says of the paper's error, in words."""
+    """Return the verdict of a bound, tight or not, on the paper's error, in words."""
     if paper.difference >= 0:
         return "above"
     if not tight:

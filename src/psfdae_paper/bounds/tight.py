@@ -23,7 +23,7 @@ STANDARD_ERRORS = 2.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """What says whether a posterior mean is near the exact one.
+    """Evidence that a posterior mean is near the exact one.
 
     Attributes
     ----------

@@ -319,7 +319,7 @@ def ours_to_explain(error: Exception) -> bool:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says, without what follows."""
+    """Return the first line of an error."""
     return str(error).strip().split("\n", 1)[0]
 
 

@@ -85,7 +85,7 @@ def damaged(results: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _damage(path: Path, digest: Path) -> str:
-    """What is wrong with a product; empty if nothing is."""
+    """Return the damage of a product; empty if there is none."""
     if not path.is_file():  # such as a pipe, which would be read for ever
         return "a folder" if path.is_dir() else "no file"
     same = digest.is_file() and digest.read_bytes() == digest_line(path, digest).encode()
