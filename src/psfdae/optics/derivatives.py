@@ -423,7 +423,7 @@ class SampledStamps:
         samples: np.ndarray | None = None,
         places: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `ModalStamps.derivatives`, directions (B, K, J); raises as `samples`.
+        """Return derivatives along directions (B, K, J); raises as `samples`.
 
         `samples` (B,) are pupil samples, by default as many as the stamps need.
         """

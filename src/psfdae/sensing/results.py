@@ -269,7 +269,7 @@ class Wavefronts:
     def psf_and_error(
         self, oversampling: int = 1, side: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return `psf`, and the standard deviation of every pixel over all wavefronts of the star."""
+        """Return `psf`, and the standard deviation of its pixels over the star's wavefronts."""
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)

@@ -333,7 +333,7 @@ class PerceptronTraining(NetworkTraining):
         self.roots = self._roots()
 
     def _parts(self) -> np.ndarray:
-        """Return the part of each field in the components for each draw of its noise, (D, n, F, K)."""
+        """Return the part of each field in the components by draw of its noise, (D, n, F, K)."""
         stamps = self.data.stamps[(None,) * (5 - self.data.stamps.ndim)]
         draws, count, fields, side, _ = stamps.shape
         mean, axes = (

@@ -113,7 +113,7 @@ class Estimates:
         static: np.ndarray,
         stars: BoundedStars,
     ) -> Estimates:
-        """Return estimates of importance samples in four parts, and of those with the truth's modes."""
+        """Return estimates of importance samples in four parts, and with the truth's modes."""
         measure = partial(measures_of, static=static, stars=stars)
         quarter, _, full = nested_means(parts, measure).values()
         return cls(full, quarter, measure(helped))
