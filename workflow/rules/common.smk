@@ -17,7 +17,12 @@ from psfdae.settings import ConfigError, as_overrides
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir
-from psfdae_paper.configuration.compose import compose, dataset_names, decisive_settings, load
+from psfdae_paper.configuration.compose import (
+    compose,
+    dataset_names,
+    decisive_settings,
+    load,
+)
 from psfdae_paper.configuration.compose import (
     cache_compositions,
     load_groups,
