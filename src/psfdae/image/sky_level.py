@@ -58,7 +58,8 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
             if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part])
     pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
-    share, weight = structure(noise / pixel_sigma, bad)
+    # Single precision: of a large image, each map takes much memory.
+    share, weight = structure((noise / pixel_sigma).astype(np.float32), bad)
     around = _median_level(image - level, bad) if share > 0.05 else None
     if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
         level += weight * around
@@ -192,9 +193,13 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     from scipy import ndimage
 
     continued = _continued(mesh, 2, slope)
-    at = [(np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape]
-    grid = np.meshgrid(*at, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(continued, grid, order=3, mode="nearest"))
+    row, column = ((np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape)
+    values = np.empty(shape)
+    # A few rows at a time: their coordinates take twice the memory of the values.
+    for part in (slice(top, top + 256) for top in range(0, len(row), 256)):
+        grid = np.meshgrid(row[part], column, indexing="ij")
+        values[part] = ndimage.map_coordinates(continued, grid, order=3, mode="nearest")
+    return values
 
 
 def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
@@ -240,10 +245,11 @@ def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
 
     good = ratio[~bad & (ratio > 0)]
     if not good.size:
-        return 0.0, np.zeros(ratio.shape)
+        return 0.0, np.zeros(ratio.shape, ratio.dtype)
     typical_ratio = max(float(np.percentile(good, 25)), 1e-6)
     # Meshes beside those with structure are interpolated from these, and wrong, too.
-    weight = np.where(bad, 0.0, np.clip((ratio / typical_ratio - 1.25) / 0.5, 0.0, 1.0))
+    weight = np.clip((ratio / typical_ratio - 1.25) / 0.5, 0.0, 1.0)
+    weight[bad] = 0.0
     widened = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
     weight = ndimage.uniform_filter(widened, MESH_PX, mode="nearest")
     return float(np.mean(good > 1.5 * typical_ratio)), weight

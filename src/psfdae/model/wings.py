@@ -456,8 +456,9 @@ def _like_stars(
     """
     from scipy.ndimage import uniform_filter
 
-    squares = uniform_filter(np.where(bad, 0.0, np.square(residual / sigma)), 5, mode="constant")
-    part_good = uniform_filter(np.where(bad, 0.0, 1.0), 5, mode="constant")
+    deviation = np.where(bad, 0.0, residual / sigma).astype(np.float32)
+    squares = uniform_filter(np.square(deviation), 5, mode="constant")
+    part_good = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
     height, width = bad.shape
     column, row = np.rint(np.nan_to_num(place, nan=-9.0)).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
