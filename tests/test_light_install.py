@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 PAGES = ("README", "docs/first_session", "docs/tutorial", "docs/own_stars", "docs/predict")
 PAGES += ("docs/python",)
 
-WITH_EXTRA = ("simulate", "train")
+WITH_EXTRA = ("simulate", "fit")
 """Commands of these pages that need the extra `paper`; another environment runs them."""
 
 OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
