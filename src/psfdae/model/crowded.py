@@ -105,12 +105,17 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         sky = replace(sky, bad=bad)
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
-    light, wing_light, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
+    light, wings = np.maximum(sky.flat, 0.0), None
+    wing_light: np.ndarray | float = 0.0
     for turn in range(ROUNDS):
-        flat = image - sky.level - wing_light
-        error = np.sqrt(sky.noise**2 + (light / observation.gain if observation.gain else 0.0))
+        # σ² = sky noise² + photons of the stars.
+        photon_sigma = np.sqrt(light / observation.gain) if observation.gain else 0.0
+        error = np.hypot(sky.noise, photon_sigma)
         limits = _box(fwhm), MOST_MOVED_FWHM * fwhm
-        fit = fit_stars(psfs, flat, error, bad, place, flux, *limits, origin)
+        without_wings = image - sky.level - wing_light
+        fit = fit_stars(psfs, without_wings, error, bad, place, flux, *limits, origin)
+        # Of a large image, each map takes much memory.
+        del light, photon_sigma, without_wings, wing_light
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         outer_parts = outer_light(model.on_pixels, place)
