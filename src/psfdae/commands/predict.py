@@ -23,7 +23,7 @@ from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
+from psfdae.model.psf_model import PsfModel, load_model
 from psfdae.options import File, NameOrNumber
 from psfdae.progress import silence
 
@@ -193,12 +193,12 @@ def restored(
     check_outputs((out, plot, found), (*source.files(), model))
     check_targets(out, plot, found, overwrite)
     loaded = load_model(model)
-    observation = source.open(loaded.info.stamp_px, MARGIN_PX)
+    observation = source.open(loaded.info.stamp_px, loaded.margin_px)
     if loaded.info.source == "stars":  # which may have been trained without knowing it, too
         observation = observation.assuming()
     assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
     loaded.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
-    measures = isinstance(loaded.engine.estimator, MeasuresStars)
+    measures = isinstance(loaded.method, MeasuresStars)
     if fixed_positions and not (measures and observation.shape):
         raise PredictionError(
             f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
@@ -226,7 +226,7 @@ def restored(
     other = loaded.other_instrument(observation.instrument, observation.colour_column)
     unlike = f"{source.path}: {other}" if other else None
     alone = None
-    if observation.shape and isinstance(loaded.engine.estimator, KnowsField) and not loaded.wings:
+    if observation.shape and isinstance(loaded.method, KnowsField) and not loaded.wings:
         alone = (
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{loaded.stamp_px} px; flux is the light in the stamp"
@@ -285,7 +285,7 @@ def _off(stamps: Stamps, found: Prediction) -> np.ndarray:
     centre = np.stack([found.x_fit - stamps.x, found.y_fit - stamps.y], axis=1)
     lost = (found.flags & int(StarFlag.OFF_CENTRE)) > 0
     shift = np.stack([found.shift_x, found.shift_y], axis=1)
-    moved = np.where(lost[:, None], MARGIN_PX + 1.0, shift)
+    moved = np.where(lost[:, None], PsfModel.margin_px + 1.0, shift)
     unclear = (found.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
     unclear |= ~np.isfinite(stamps.listed).all(axis=1)
     return np.where(unclear[:, None], np.nan, np.where(np.isfinite(centre), centre, moved))
