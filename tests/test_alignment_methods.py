@@ -86,7 +86,7 @@ def test_mirrored_states_have_the_mirrored_stamps(model, operator, states, stamp
         expected = operator(model(symmetry.states(states[:3])))[0]
         # The fit of the quadratic model to rays is symmetric to 1e-6 waves.
         assert symmetry.stamps(stamps[:3]) == pytest.approx(expected, abs=1e-5)
-        assert symmetry.state @ symmetry.state.T == pytest.approx(np.eye(4))
+        assert symmetry.state_matrix @ symmetry.state_matrix.T == pytest.approx(np.eye(4))
 
 
 # --- networks

@@ -28,6 +28,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -
     """
     from mlflow.entities import LoggedModelOutput
 
+    # A run without files of a model, such as a sweep, has nothing to log.
     files = {name: path for name, path in record.files.items() if name.startswith(MODEL)}
     if not files:
         return None
@@ -35,6 +36,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -
     logged = client.create_logged_model(experiment, name, run_id, model_type=record.kind)
     model_id: str = logged.model_id
     client.log_outputs(run_id, [LoggedModelOutput(model_id, 0)])
+    # MLflow copies a folder; links in it save a copy of large files.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, "files")
         link(files, folder, MODEL)
@@ -96,6 +98,7 @@ def choose_best(client: MlflowClient, name: str) -> None:
 
 def forget(client: MlflowClient, run_id: str) -> None:
     """Delete a run with its models."""
+    # Registered versions, logged models, then the run itself.
     for version in client.search_model_versions(f"run_id = '{run_id}'"):
         client.delete_model_version(version.name, version.version)
     outputs = client.get_run(run_id).outputs
@@ -128,6 +131,7 @@ def _loadable(files: Path, stamp: np.ndarray, run_id: str, model_id: str) -> Pat
     example = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
     text = json.dumps(stamp.tolist())
     (folder / example["artifact_path"]).write_text(text, encoding="utf-8")
+    # Stamps in, PSFs of the same size out.
     stamps = Schema([TensorSpec(np.dtype(np.float32), (-1, side, side))])
     signature = ModelSignature(stamps, stamps)
     model = Model(

@@ -7,11 +7,11 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
@@ -44,18 +44,6 @@ class Point(NamedTuple):
     value: float
     epoch: int
     time_ms: int
-
-
-class RunName(TypedDict):
-    """Attributes that name a run; see `Run`."""
-
-    kind: str
-    dataset: str
-    split: str
-    reference: str
-    source: str
-    name: str
-    experiment: str
 
 
 class Fit(NamedTuple):
@@ -116,10 +104,10 @@ class Run:
     source: str
     name: str
     experiment: str
-    files: Mapping[str, Path]
-    config: Mapping[str, Any]
-    end_ms: int
-    metrics: Mapping[str, float]
+    files: Mapping[str, Path] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    end_ms: int = 0
+    metrics: Mapping[str, float] = field(default_factory=dict)
     epochs: Sequence[Mapping[str, float]] = ()
     seconds: float | None = None
     status: str = "FINISHED"
@@ -183,6 +171,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
         if not evaluations:
             raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
         for path in evaluations:
+            # Every method in the table of errors that leaves files is a run.
             split, reference = path.stem.split("-", 1)
             key = {"dataset": dataset, "split": split, "reference": reference}
             figures = _figures(results / "figures" / dataset, split, reference)
@@ -217,6 +206,7 @@ def _run_of_fit(
     figures : mapping of str to Path
         Figures by their names within the run.
     """
+    # The model must have been trained on the stars of the dataset.
     model = results / fits.place_of(kind, **key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
@@ -239,11 +229,12 @@ def _run_of_fit(
         values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
         if values:
             metrics[f"test_{metric}"] = fmean(values)
+    # Methods that are trained in epochs have a history.
     epochs: Sequence[Mapping[str, float]] = ()
     if HISTORY in fits.storage_of(kind).diagnostics:
         epochs = _epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
-    return Run(
-        **_name_of_fit(kind, **key, experiment=experiment),
+    return replace(
+        _named_after_fit(kind, **key, experiment=experiment),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
         config={**product.config, **settings},
         end_ms=_time_ms(fits.outputs(kind, model)[0]),
@@ -254,12 +245,12 @@ def _run_of_fit(
     )
 
 
-def _name_of_fit(
+def _named_after_fit(
     kind: type[Method], dataset: str, split: str, reference: str, experiment: str
-) -> RunName:
-    """Return the name of the run of a fit to the stars of a dataset."""
+) -> Run:
+    """Return a run with the name of a fit to the stars of a dataset, and nothing else."""
     run_kind = fits.storage_of(kind).run or kind.name
-    return RunName(
+    return Run(
         kind=run_kind,
         dataset=dataset,
         split=split,
@@ -281,6 +272,7 @@ def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:
     """List figures of a dataset, without those whose path names another split or reference."""
     labels = [f"{s}-{r}" for s in ("random", "held_out") for r in ("realisation", "template")]
     labels += ["random", "held_out"]
+    # Longer labels first, because "random" begins "random-template", too.
     figures = {}
     for path in sorted(folder.rglob("*.png")):
         name = path.relative_to(folder).as_posix()
@@ -301,6 +293,7 @@ def runs_of_alignment(results: Path) -> list[Run]:
     errors = results / "tables/alignment_errors.csv"
     if not errors.is_file():
         raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
+    # All networks share the table of errors and the figures of the scene.
     figures = sorted((results / "figures/alignment").glob("*.png"))
     shared = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
     runs = []
@@ -318,10 +311,11 @@ def runs_of_alignment(results: Path) -> list[Run]:
                     metrics[name] = number(errors, row[statistic])
         if not metrics:
             raise ProductError(f"{errors}: no rows of method {kind!r}")
+        # The set of states on which it was trained.
         states = "grid" if kind == "dae" else ALIGNERS[kind].states
         runs.append(
-            Run(
-                **_name_in_scene3(kind),
+            replace(
+                _named_after_network(kind),
                 files={**_network_files(folder, weights), **shared},
                 config=config,
                 end_ms=_time_ms(folder / weights),
@@ -351,6 +345,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
+    # A row of the summary for each point.
     rows = list(read_csv(summary, "point", "status"))
     points = [_run_of_point(results, name, row["point"]) for row in rows]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
@@ -395,6 +390,7 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
     tables = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
     files = {file: folder / file for file in tables} | model_files
     history = folder / HISTORY
+    # The run is named by the values of the point on the axes of the sweep.
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
     return Run(
         kind=model,
@@ -429,17 +425,17 @@ def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
     if len(folders) == 2:
         (kind, dataset), (split, reference) = folders, stem.split("-", 1)
         experiment = load((f"dataset={dataset}", f"preset={preset}")).scene.experiment
-        name = _name_of_fit(method(kind), dataset, split, reference, experiment)
+        run = _named_after_fit(method(kind), dataset, split, reference, experiment)
     elif network in WEIGHTS and network != stem:
-        name = _name_in_scene3(network)
+        run = _named_after_network(network)
     else:
         return None
-    return Run(**name, files={}, config={}, metrics={}, end_ms=0, status="RUNNING")
+    return replace(run, status="RUNNING")
 
 
-def _name_in_scene3(kind: str) -> RunName:
-    """Return the name of the run of a network of scene 3."""
-    return RunName(
+def _named_after_network(kind: str) -> Run:
+    """Return a run with the name of a network of scene 3, and nothing else."""
+    return Run(
         kind=kind,
         dataset="alignment",
         split="uniform and grid",
@@ -513,6 +509,7 @@ def epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[P
 
     `start_ms` is the start of the training in ms since 1970.
     """
+    # Other columns of the history are counters and times, not metrics.
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))
         for row in epochs

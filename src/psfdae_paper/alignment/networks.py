@@ -48,6 +48,7 @@ class AlignmentCnn(nn.Module):
 
     def __init__(self, config: Cnn, fields: int, stamp_px: int) -> None:
         super().__init__()
+        # Every stride s divides the side of the images by s, rounded up.
         layers: list[nn.Module] = []
         channels, side = fields, stamp_px
         for width, kernel, step in zip(config.widths, config.kernels, config.strides, strict=True):
@@ -83,6 +84,7 @@ class AlignmentPerceptron(nn.Module):
 
     def __init__(self, config: Perceptron, fields: int, stamp_px: int) -> None:
         super().__init__()
+        # Buffers belong to the stored network, but no training changes them.
         pixels = fields * stamp_px**2
         self.register_buffer("mean", torch.zeros(pixels))
         self.register_buffer("axes", torch.zeros(pixels, config.components))
@@ -114,6 +116,7 @@ class AlignmentPerceptron(nn.Module):
         noisy : Tensor, shape (n, fields, d, d)
             Scaled stamps as the network receives them, whose components get variance 1.
         """
+        # Deviations from the mean stamps, all fields of a state in one row.
         flat = clean.flatten(1)
         self.mean.copy_(flat.mean(dim=0))
         flat = flat - self.mean
@@ -122,8 +125,10 @@ class AlignmentPerceptron(nn.Module):
         # empty make the matrix singular.
         products, last = (flat.T @ flat).double().numpy(), flat.shape[1] - 1
         leading = eigh(products, subset_by_index=[last + 1 - count, last], overwrite_a=True)[1]
+        # The largest eigenvalues are last.
         axes = torch.from_numpy(leading[:, ::-1].astype(np.float32))
         del flat, products  # the noisy stamps take as much memory
+        # An axis divided by the standard deviation of its component gives it the variance 1.
         spread = ((noisy.flatten(1) - self.mean) @ axes).std(dim=0)
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
@@ -197,7 +202,9 @@ def predict_states(
     model.eval()
     if mirrors:
         # The inverse of an orthogonal matrix is its transpose.
-        estimates = [predict_states(model, m.stamps(stamps), batch) @ m.state for m in mirrors]
+        estimates = [
+            predict_states(model, m.stamps(stamps), batch) @ m.state_matrix for m in mirrors
+        ]
         return np.asarray(np.mean(estimates, axis=0))
     parts = [
         model(scale_stamps(stamps[start : start + batch])).numpy()
@@ -263,6 +270,7 @@ class NetworkTraining(Training):
         self.data, self.seed, self.name = data, seed, name
         fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
         self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
+        # First weights, and principal components, from streams of the network's name.
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
         model = build_network(network, fields, side, generator)
@@ -288,6 +296,7 @@ class NetworkTraining(Training):
         """Yield stamps (B, fields, d, d) and states (B, 4) of every batch of an epoch."""
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
         for numbers in self._shuffled(rng):
+            # Noise, then a mirror image: all states of a batch are mirrored alike.
             images, truth = self._draw_stamps(numbers, rng), self.data.states[numbers]
             if self.data.noise is not None:
                 images = self.data.noise(images, rng)
@@ -301,6 +310,7 @@ class NetworkTraining(Training):
         stamps = self.data.stamps
         if stamps.ndim == 4:
             return np.asarray(stamps[numbers])
+        # Every field of every state has a draw of its own.
         fields = np.arange(stamps.shape[2])
         draw = rng.integers(len(stamps), size=(numbers.size, fields.size))
         return np.asarray(stamps[draw, numbers[:, None], fields])
@@ -349,6 +359,7 @@ class PerceptronTraining(NetworkTraining):
             buffer.numpy().reshape(fields, side**2, *buffer.shape[1:])
             for buffer in (self.model.mean, self.model.axes)
         )
+        # (x_f − mean_f)·axes_f of every field f; the sum over fields are the components.
         parts = np.empty((draws, count, fields, axes.shape[-1]), np.float32)
         for draw, field in np.ndindex(draws, fields):
             scaled = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
@@ -375,6 +386,7 @@ class PerceptronTraining(NetworkTraining):
         """R of each λ, shape (K, K), for which RᵀR is the covariance of noise in components."""
         if self.data.noise is None:
             return []
+        # Standard deviation of every pixel of the mean stamps, in their scale of mean 1.
         law, to_mean = self.data.noise.noise, self.data.stamps.shape[-1] ** 2
         mean, axes = (a.double().numpy() for a in (self.model.mean, self.model.axes))
         psf = np.maximum(mean / to_mean, 0.0)
@@ -389,6 +401,7 @@ class PerceptronTraining(NetworkTraining):
         draws, _, fields, _ = self.parts.shape
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
         for numbers in self._shuffled(rng):
+            # As in the base class: a draw for every field, then a mirror image of the batch.
             draw = rng.integers(draws, size=(numbers.size, fields))
             components = self.parts[draw, numbers[:, None], np.arange(fields)].sum(axis=1)
             truth = self.data.states[numbers]

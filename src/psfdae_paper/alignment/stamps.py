@@ -69,6 +69,7 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
     """
     modes = []
     for j in range(FIRST_NOLL, highest + 1):
+        # A wavefront Z moves the centroid by its mean slope s: −Z + s·(x, y) leaves it.
         slope_x, slope_y = mean_slope(j, obscuration)
         modes.append(slope_x * x + slope_y * y - zernike(j, x, y))
     return np.stack(modes)
@@ -100,11 +101,13 @@ class AlignmentStamps:
         self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
         self.movable = movable
+        # Pupil modes whose sum is the OPD of a centred stamp.
         self._modes: Modes = partial(
             centred_modes, alignment.highest_zernike, telescope.obscuration
         )
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
+        # Stamps are nearly as wide as the period of the image, which is transformed whole.
         side, pixel = alignment.stamp_px, telescope.pixel
         self.propagation = SampledStamps(
             telescope.obscuration,
@@ -177,6 +180,7 @@ class AlignmentStamps:
         # An emulator may give all derivatives.
         if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
+        # One list of wavefronts, whatever the leading axes are.
         zernikes, directions = (
             array.reshape(prod(shape), *array.shape[len(shape) :])
             for array in (zernikes, directions)

@@ -86,19 +86,19 @@ class Mirror:
     ----------
     symmetry : Symmetry
         Symmetry of a stamp, whose rows run along y.
-    state : ndarray, shape (4, 4)
+    state_matrix : ndarray, shape (4, 4)
         Signed permutation of the four numbers of a state.
     fields : ndarray of int, shape (F,)
         The mirrored telescope's stamp at field k is that of field `fields[k]`.
     """
 
     symmetry: Symmetry
-    state: np.ndarray
+    state_matrix: np.ndarray
     fields: np.ndarray
 
     def states(self, states: np.ndarray) -> np.ndarray:
         """Mirror states, shape (n, 4)."""
-        return np.asarray(states @ self.state.T)
+        return np.asarray(states @ self.state_matrix.T)
 
     def stamps(self, stamps: np.ndarray) -> np.ndarray:
         """Return the stamps of the mirrored states, shape (n, F, d, d)."""
@@ -110,6 +110,7 @@ def mirror_symmetries(points: int) -> list[Mirror]:
 
     They are eight, fewer if the number of points on the circle is not a multiple of 4.
     """
+    # Any radius will do: symmetries depend on the angles of the points alone.
     fields, mirrors = field_points(45.0, points), []
     for symmetry in SYMMETRIES:
         matrix = symmetry.matrix
@@ -117,9 +118,10 @@ def mirror_symmetries(points: int) -> list[Mirror]:
         distance = np.linalg.norm((fields @ matrix)[:, None] - fields, axis=2)
         if distance.min(axis=1).max() < 1e-9:  # no field point maps between two
             # A decentre moves as a vector, a tilt as an axial vector: with the determinant ±1.
-            state = np.zeros((4, 4))
-            state[:2, :2], state[2:, 2:] = matrix, np.round(np.linalg.det(matrix)) * matrix
-            mirrors.append(Mirror(symmetry, state, distance.argmin(axis=1)))
+            state_matrix = np.zeros((4, 4))
+            state_matrix[:2, :2] = matrix
+            state_matrix[2:, 2:] = np.round(np.linalg.det(matrix)) * matrix
+            mirrors.append(Mirror(symmetry, state_matrix, distance.argmin(axis=1)))
     return mirrors
 
 
@@ -170,6 +172,7 @@ def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
     ModelError
         If the states do not determine all 15 terms.
     """
+    # Zernike coefficient j at field f: z_fj(t) = Σ_k terms_k(t) c_fkj, linear in c.
     count, fields, modes = zernikes.shape
     terms = quadratic_terms(states)
     fit, _, rank, _ = np.linalg.lstsq(terms, zernikes.reshape(count, -1), rcond=None)
@@ -188,7 +191,9 @@ def verify(
     ModelError
         If it exceeds `tolerance` anywhere; the message names the state, the field and the RMS.
     """
-    residual: np.ndarray = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
+    # Zernike polynomials are orthonormal: the RMS over the pupil is the norm of the coefficients.
+    residual = np.asarray(np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1)))
+    # Written so that NaN fails, too.
     if not residual.max() <= tolerance:
         state, field = np.unravel_index(residual.argmax(), residual.shape)
         raise ModelError(

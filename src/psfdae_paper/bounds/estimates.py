@@ -107,22 +107,19 @@ class Estimates:
     @classmethod
     def over_bank(cls, measures: dict[int, np.ndarray]) -> Estimates:
         """Return the estimates of `weigh_bank`, whose numbers of draws double."""
+        # A quarter is two doublings before the last; a bank has no modes from the truth.
         nested = list(measures.values())
         quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
         return cls(nested[-1], quarter, nested[-1])
 
     @classmethod
     def over_samples(
-        cls,
-        parts: list[PosteriorSums],
-        with_truth: PosteriorSums,
-        static: np.ndarray,
-        stars: BoundedStars,
+        cls, samples: SampledPosterior, static: np.ndarray, stars: BoundedStars
     ) -> Estimates:
-        """Return estimates of importance samples in four parts, and with the truth's modes."""
+        """Return the estimates of importance samples, which are in four parts."""
         measure = partial(star_measures, static=static, stars=stars)
-        quarter, _, full = nested_means(parts, measure).values()
-        return cls(full, quarter, measure(with_truth))
+        quarter, _, full = nested_means(samples.parts, measure).values()
+        return cls(full, quarter, measure(samples.with_truth))
 
     @property
     def ess(self) -> np.ndarray:
@@ -147,6 +144,7 @@ class Estimates:
         """
         if samples is None:
             return self, 0
+        # Only where the bank is too thin, and never by fewer samples than it has.
         is_better = (self.ess[stars] < ENOUGH_ESS) & (samples.ess > self.ess[stars])
         measures = {name: values.copy() for name, values in vars(self).items()}
         for name, values in measures.items():
@@ -235,6 +233,7 @@ def stamp_model(config: Config) -> StampModel:
     """
     if not isinstance(config.wavefront, Seidel):
         raise ConfigError(f"wavefront.kind = {config.wavefront.kind}: must be seidel")
+    # The standard deviation of each coefficient is a fraction of its mean.
     mean = config.wavefront.coefficients
     sd = config.stars.aberration_fraction * np.abs(mean)
     field = relative_field(config.grid)
@@ -260,14 +259,18 @@ def sample_stars(
     stars: BoundedStars,
     level: float,
     likelihood: Likelihood,
-) -> SampledPosterior:
-    """Draw importance samples around the modes of every star, from a stream of its own."""
+) -> tuple[SampledPosterior, SampledPosterior]:
+    """Draw importance samples around the modes of every star, from a stream of its own.
+
+    They are returned for an unknown and for a known field.
+    """
     model, noisy = stamp_model(config), stars.noisy[level]
     posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
     # Bounds need every mode: more starts than a method takes, and more for doubtful stars.
     effort = Search(fields=16, offsets=16, misfit_sigma=2.0)
     modes, _ = search(bank, noisy, likelihood, model, stars.field, effort=effort)
     modes = separate(modes + climb(true_modes(model, product, stars), posteriors))
+    # A star's draws do not depend on the other stars: each has a stream by its number.
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
     return sample_posterior(modes, posteriors, stars.field, config.bounds.star_draws, rngs)
@@ -340,6 +343,7 @@ def star_measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) 
     ndarray, shape (5, n)
         MSE against realisation and template, posterior variances of both, effective sample size.
     """
+    # The posterior has the mean of the noise-free image, and that of the static PSF.
     shape = stars.truth["realisation"].shape
     template, template_variance = sums.template(static)
     means = {"realisation": sums.mean_image, "template": template}

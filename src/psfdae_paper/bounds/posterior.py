@@ -162,6 +162,7 @@ class Likelihood:
     @classmethod
     def of(cls, noise: NoiseModel, level: float, images: np.ndarray) -> Likelihood:
         """Make the likelihood at noise level λ, around the mean of images of shape (n, d, d)."""
+        # The mean over its eight mirror images does not change under any symmetry.
         mean = images.mean(axis=0, dtype=np.float64)
         symmetric = np.mean([symmetry.image(mean) for symmetry in SYMMETRIES], axis=0)
         return cls(float(noise.flux(level)), noise.background, symmetric.ravel())
@@ -196,6 +197,8 @@ class Likelihood:
         offset : ndarray, shape (K,), float64
             n̄·ℓ − F Σ p.
         """
+        # ℓ̄ is ℓ of the mean image. Residuals and ℓ − ℓ̄ are small, and so is the error of their
+        # product in single precision.
         scale = self.flux / self.background
         ratio = np.log1p(scale * stamps)
         offset = ratio @ self.expected(self.mean_image) - self.flux * stamps.sum(axis=1)
@@ -293,6 +296,7 @@ class PosteriorSums:
     @property
     def effective_size(self) -> np.ndarray:
         """Effective sample size (Σw)²/Σw², shape (n,)."""
+        # 0 for a star without any possible image.
         square = np.maximum(self.weight_square_sum, np.finfo(float).tiny)
         return np.asarray(self.weight_sum**2 / square)
 
@@ -311,6 +315,7 @@ class PosteriorSums:
         ----------
         templates : ndarray, shape (F, J, d, d)
         """
+        # Posterior probability of every static PSF; their mixture has mean and variance.
         weight = self.template_weight.reshape(len(self.template_weight), -1)
         with np.errstate(invalid="ignore"):
             weight = weight / self.weight_sum[:, None]
@@ -324,6 +329,7 @@ class PosteriorSums:
         used = np.flatnonzero((part.scores > (log_scale - 30.0)[:, None]).any(axis=0))
         if not used.size:
             return
+        # Sums of stars that have a new best image go over to its scale.
         changed = np.flatnonzero(log_scale != self.log_scale)
         self.put(changed, self.take(changed).rescaled(log_scale[changed]))
         # A star of which no image is possible so far keeps weights of zero.
@@ -346,12 +352,14 @@ class PosteriorSums:
 
 def mixture_moments(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and variance, (n, P) both, of images (K, P) with weights (n, K) of sum 1."""
+    # E[p] and E[p²] − E[p]²; rounding must not make the variance negative.
     mean = weight @ images
     return mean, np.maximum(weight @ images**2 - mean**2, 0.0)
 
 
 def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
     """Return the sums over several sets of samples of the same stars; the parts stay unchanged."""
+    # All sums at the largest scale of every star, then added.
     log_scale = np.max([part.log_scale for part in parts], axis=0)
     total = parts[0].rescaled(log_scale)
     for part in parts[1:]:
@@ -383,6 +391,7 @@ def score_bank(
         with np.errstate(divide="ignore"):  # −∞ where a symmetry does not count
             log_prior = np.log(symmetry_weights(part.field, part.peak, part.points))
         for window, members in by_window.items():
+            # Factors in double precision, their product with the residuals in single.
             stamps = part.stamps(window).reshape(len(part), -1)
             ratio, offset = likelihood.factors(stamps)
             images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
@@ -417,6 +426,7 @@ def groups_by_field(
     """
     if star_field is None:
         return [(np.arange(count), np.arange(len(bank)))]
+    # An orbit is the set of fields to which symmetries take a field; its name is the lowest one.
     star_orbit, bank_orbit = orbit(star_field, bank.points), orbit(bank.field, bank.points)
     return [
         (np.flatnonzero(star_orbit == name), np.flatnonzero(bank_orbit == name))
@@ -449,6 +459,7 @@ def posterior_sums(
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
     for part in score_bank(bank, noisy, likelihood, chunk):
+        # Images in other fields are impossible if the field is known.
         if star_field is not None:
             part.scores[star_field[:, None] != part.field] = -np.inf
         sums.add(part)
@@ -487,6 +498,7 @@ def exact_posterior(
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(noisy) @ ratio.T + offset
+    # Templates of other fields are impossible if the field is known.
     if star_field is not None:
         scores[star_field[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
     # Bayes' rule with a flat prior; the largest score is subtracted against overflow.
@@ -523,6 +535,7 @@ def nested_means(
         means[len(parts) // len(banks)] = np.mean([measure(sums) for sums in banks], axis=0)
         if len(banks) == 1:
             return means
+        # Pairs of neighbours make banks of twice the size.
         banks = [merge(banks[i : i + 2]) for i in range(0, len(banks), 2)]
 
 
@@ -555,6 +568,7 @@ def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, fl
         limit, excess, exponent = parameters
         return np.asarray((limit + excess * size**-exponent) / ratio - 1.0)
 
+    # Least squares of relative residuals: small errors of large banks count as much as large ones.
     start = (0.9, max(ratio[-1] - 0.9, 1e-3), 0.7)
     fit = least_squares(misfit, start, bounds=((0.0, 0.0, 0.05), (1.0, np.inf, 3.0)), xtol=1e-12)
     return scale * fit.x[0], float(fit.x[2]), float(np.sqrt(np.mean(fit.fun**2)))

@@ -24,12 +24,7 @@ import numpy as np
 from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.propagation import Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import (
-    MONOMIALS,
-    SEIDEL_TERMS,
-    monomial_coefficients,
-    monomial_images,
-)
+from psfdae.optics.wavefronts import MONOMIALS, SEIDEL_TERMS, monomial_coefficients, monomial_images
 from psfdae.sensing.climbing import Peaks, Steps, best_of_group, poisson
 from psfdae.sensing.climbing import climb as climb_posterior
 from psfdae.sensing.sampling import Mixture
@@ -113,6 +108,7 @@ class StampModel:
 
     def standardised(self, seidel: np.ndarray) -> np.ndarray:
         """Return z of coefficients in waves, both (n, 5); 0 where they cannot vary."""
+        # z = (c − mean) / sd
         varies = self.sd > 0
         return np.where(varies, (seidel - self.mean) / np.where(varies, self.sd, 1.0), 0.0)
 
@@ -152,6 +148,7 @@ class StampModel:
 
             def propagate(draw: np.ndarray) -> None:
                 opd = (coefficients[draw] @ modes).reshape(-1, *images.shape[1:])
+                # Light beyond the stamp is lost: the sum is made 1 again, as for all stamps.
                 stamps[draw] = normalise_flux(kernel(opd, offset[draw]))[0]
 
             return propagate
@@ -189,6 +186,7 @@ class StampModel:
         stamps : ndarray, shape (n, P)
         derivatives : ndarray, shape (n, K, P)
         """
+        # The sum of a stamp depends on the parameters, too: normalising changes the derivatives.
         raw = self._operators[precision].derivatives(coefficients, directions, offset, samples)
         stamps, slopes, _ = normalise_with_derivatives(*raw)
         return (
@@ -281,6 +279,7 @@ class Modes:
 
     def __add__(self, added: Modes) -> Modes:
         """Return these modes, then the added ones."""
+        # All attributes are arrays with a row for every mode.
         pairs = zip(vars(self).values(), vars(added).values(), strict=True)
         return Modes(*(np.concatenate(pair) for pair in pairs))
 
@@ -342,10 +341,12 @@ class Modes:
         # A quarter at least in the star's own field: where the field is known, these alone count.
         in_field = self.field == star_field
         shortage = 0.25 - share[in_field].sum()
+        # The shares of all modes shrink, and what that frees goes to the modes in the field.
         if shortage > 0 and in_field.any():
             mass = np.exp(self.evidence[in_field] - self.evidence[in_field].max()) + 0.1
             share *= 1.0 - shortage
             share[in_field] += shortage * mass / mass.sum()
+        # Rounded up, so that every mode has a draw, whose weight may show that its mass is larger.
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
         return Place(self.field[mode], self.offset[mode], self.mixture.draws(mode, rng)), number
@@ -353,6 +354,7 @@ class Modes:
 
 def largest_of_groups(group: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
     """Return the numbers of the `count` members of every group that have the largest values."""
+    # Sorted by group, the largest first; then the rank of each member within its group.
     order = np.lexsort((-value, group))
     _, first, number = np.unique(group[order], return_index=True, return_counts=True)
     return order[np.arange(order.size) - np.repeat(first, number) < count]
@@ -397,9 +399,10 @@ def search(
 
     def match(stars: np.ndarray, fields: int, offsets: int) -> Modes:
         """Return the best matches of the stars with these numbers."""
-        known = None if star_field is None else star_field[stars]
+        fields_of_stars = None if star_field is None else star_field[stars]
+        group_fields = None if in_all_fields else fields_of_stars
         matches = []
-        for group, members in groups_by_field(stars.size, None if in_all_fields else known, bank):
+        for group, members in groups_by_field(stars.size, group_fields, bank):
             in_group = best_matches(
                 bank.take(members),
                 noisy[stars[group]],
@@ -407,7 +410,7 @@ def search(
                 model,
                 fields if in_all_fields else 0,
                 offsets,
-                None if known is None else known[group],
+                None if fields_of_stars is None else fields_of_stars[group],
             )
             matches.append(replace(in_group, star=stars[group][in_group.star]))
         return reduce(Modes.__add__, matches)
@@ -427,6 +430,7 @@ def search(
             starts = recentre(corners(modes, missed), posteriors)
             modes = climb(modes + starts, posteriors)
             missed = unexplained(modes, posteriors, effort.misfit_sigma)
+    # Last in other fields and at other offsets that give nearly the same image as the best modes.
     if in_all_fields:
         modes = climb(modes + find_twins(modes, likelihood, model), posteriors)
     # χ² four standard deviations above its mean: the star has no mode that explains it.
@@ -461,6 +465,7 @@ def best_matches(
     shape = (len(noisy), bank.points**2, len(SYMMETRIES) * len(shifts))
     best_score, best_star = np.full(shape, -np.inf), np.zeros(shape, int)
     for part in score_bank(bank, noisy, likelihood):
+        # Stars of the same field are adjacent: the best one of each run, for every image.
         start = np.flatnonzero(np.diff(part.field, prepend=-1))
         for first, end in zip(start, [*start[1:], part.field.size], strict=True):
             cell = (slice(None), part.field[first], part.symmetry * len(shifts) + part.jitter)
@@ -473,6 +478,7 @@ def best_matches(
     middle = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
     rows = []
     for star, scores in enumerate(best_score):
+        # Without knowledge of the field, the best frame in each of the best fields.
         best_fields = np.argsort(-scores.max(axis=1), kind="stable")[:fields]
         rows += [(star, field, scores[field].argmax(), Knowledge.NONE) for field in best_fields]
         if star_field is None:
@@ -504,6 +510,8 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
         Starts of the climbs.
     posteriors : StarPosteriors
     """
+    # At the mode, the covariance of z is the inverse of information + 1 (that of the prior). With
+    # its Cholesky factor L, ½ ln det(covariance) = Σ ln L_kk.
     peaks = _climb_along(modes, posteriors, np.empty((0, len(MONOMIALS))))
     factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
     evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
@@ -519,6 +527,7 @@ def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
     # Prior of the shift along rows and columns: normal, with this standard deviation.
     shift_sd_px = 1.5
     tilts = shift_sd_px * tilt_coefficients(posteriors.model, np.eye(2))
+    # A tilt that moves the image by +u replaces an offset of the stamp by −u.
     parameters = _climb_along(modes, posteriors, tilts).parameters
     shift_px = np.rint(shift_sd_px * parameters[:, TERMS:]).astype(int)
     offset = modes.offset - shift_px
@@ -531,38 +540,40 @@ def tilt_coefficients(model: StampModel, shift_px: np.ndarray) -> np.ndarray:
     A pixel is a tilt by half its width in λ/D (`StampPropagator`).
     """
     tilt = np.zeros((len(shift_px), len(MONOMIALS)))
+    # The last two monomials are x and y; columns run along x and rows along y.
     tilt[:, -2:] = 0.5 * model.telescope.pixel * shift_px[:, ::-1]
     return tilt
 
 
-def _climb_along(modes: Modes, posteriors: StarPosteriors, further: np.ndarray) -> Peaks:
-    """Climb to maxima over z and along `further` directions of the coefficients.
+def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.ndarray) -> Peaks:
+    """Climb to maxima over z and along more directions of the coefficients.
 
     Parameters
     ----------
     modes : Modes
         Starts of the climbs.
     posteriors : StarPosteriors
-    further : ndarray, shape (K, 8)
+    added_directions : ndarray, shape (K, 8)
         Directions of the monomials' coefficients, with a standard normal prior, as z has.
     """
     likelihood, model = posteriors.likelihood, posteriors.model
 
     def evaluate(rows: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        # Stamps and their slopes by z and along the further directions.
+        # Stamps and their slopes by z and along the added directions.
         field = modes.field[rows]
-        coefficients = model.coefficients(z[:, :TERMS], field) + z[:, TERMS:] @ further
+        coefficients = model.coefficients(z[:, :TERMS], field) + z[:, TERMS:] @ added_directions
         directions = np.concatenate(
-            [model.directions(field), np.tile(further, (rows.size, 1, 1))], axis=1
+            [model.directions(field), np.tile(added_directions, (rows.size, 1, 1))], axis=1
         )
         stamps, slopes = model.derivatives(coefficients, directions, modes.offset[rows])
         # Poisson likelihood times the prior N(0, 1): their logarithms and derivatives add up.
+        # ln posterior = −½ (deviance + |z|²), slope = score − z, information + 1.
         counts, expected = posteriors.counts[modes.star[rows]], likelihood.expected(stamps)
         deviance, score, information = poisson(counts, expected, likelihood.flux * slopes)
         height = -0.5 * (deviance + (z**2).sum(axis=1))
         return height, score - z, information + np.eye(z.shape[1])
 
-    start = np.hstack([modes.z, np.zeros((len(modes.z), len(further)))])
+    start = np.hstack([modes.z, np.zeros((len(modes.z), len(added_directions)))])
     steps = Steps(depth=MAX_EVIDENCE_DROP)
     return climb_posterior(evaluate, start, MAX_ABS_Z, steps, modes.group)
 
@@ -585,12 +596,12 @@ def unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -
     ndarray of int
         Numbers of the stars, ascending.
     """
-    best = modes.best_of_group
-    stamps = posteriors.model.stamps(best.z, best.field, best.offset).reshape(len(best.star), -1)
-    expected = posteriors.likelihood.expected(stamps.astype(np.float64))
-    misfit = ((posteriors.counts[best.star] - expected) ** 2 / expected).sum(axis=1)
+    modes = modes.best_of_group
+    stamps = posteriors.model.stamps(modes.z, modes.field, modes.offset).astype(np.float64)
+    expected = posteriors.likelihood.expected(stamps.reshape(len(stamps), -1))
+    chi2 = ((posteriors.counts[modes.star] - expected) ** 2 / expected).sum(axis=1)
     pixels = expected.shape[1]
-    return np.unique(best.star[misfit > pixels + misfit_sigma * np.sqrt(2.0 * pixels)])
+    return np.unique(modes.star[chi2 > pixels + misfit_sigma * np.sqrt(2.0 * pixels)])
 
 
 def corners(modes: Modes, stars: np.ndarray) -> Modes:
@@ -599,10 +610,11 @@ def corners(modes: Modes, stars: np.ndarray) -> Modes:
     They serve stars whose climbs have ended in local maxima: a climb from beside one mostly ends
     elsewhere. Starts are the 2⁵ corners of a cube around the mode, 0.5 away in every coefficient.
     """
-    best = modes.best_of_group
-    stuck = np.flatnonzero(np.isin(best.star, stars))
+    modes = modes.best_of_group
+    stuck = np.flatnonzero(np.isin(modes.star, stars))
+    # Every stuck mode with every combination of signs.
     signs = np.array(list(product((-1.0, 1.0), repeat=TERMS)))
-    start = best.take(np.repeat(stuck, len(signs)))
+    start = modes.take(np.repeat(stuck, len(signs)))
     z = start.z + 0.5 * np.tile(signs, (stuck.size, 1))
     return Modes.at(start.star, start.field, start.offset, start.knowledge, z)
 
@@ -648,10 +660,13 @@ def find_twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes
     shifts = np.array(jitters(1))
     tilt = tilt_coefficients(model, shifts)
     # Signs that negate the even part of a wavefront, which leaves its image unchanged.
-    even = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
+    even_signs = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
+    # Best log-mass and z by star, field and offset.
     places: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
     for m, star in enumerate(source.star):
-        for sign in (np.ones(len(MONOMIALS)), even):
+        for sign in (np.ones(len(MONOMIALS)), even_signs):
+            # Change of the coefficients that every field and offset needs to give this image, and
+            # z that comes nearest to it, weighed against the prior.
             gap = sign * coefficients[m] + tilt - static[:, None]
             log_mass, z = _best_coefficients(sign[:, None] * metric[m] * sign, directions, gap)
             log_mass += height[m]
@@ -696,6 +711,7 @@ def _best_coefficients(
     weighted = directions @ metric
     curvature = weighted @ directions.swapaxes(1, 2) + np.eye(TERMS)
     z = np.linalg.solve(curvature, weighted @ gap.swapaxes(1, 2)).swapaxes(1, 2)
+    # Integral of the Gaussian: its height at the maximum times det(curvature)^−½.
     residual = gap - z @ directions
     loss = ((residual @ metric) * residual).sum(axis=2) + (z**2).sum(axis=2)
     return -0.5 * (loss + np.linalg.slogdet(curvature)[1][:, None]), z
@@ -707,14 +723,15 @@ def separate(modes: Modes) -> Modes:
     Of modes of a star in the same field and offset that are less than one of their standard
     deviations apart, the best is kept. It is known by the least knowledge that led to any of them.
     """
-    best = best_of_group(modes.evidence, modes.group)
-    noticeable = np.flatnonzero(modes.evidence > best - MAX_EVIDENCE_DROP)
+    best_evidence = best_of_group(modes.evidence, modes.group)
+    noticeable = np.flatnonzero(modes.evidence > best_evidence - MAX_EVIDENCE_DROP)
     distinct: dict[tuple[int, ...], list[int]] = {}
     knowledge = modes.knowledge.copy()
     # From the best mode on, so that a mode meets those that are better.
     for m in noticeable[np.argsort(-modes.evidence[noticeable], kind="stable")]:
         at_place = distinct.setdefault((modes.star[m], modes.field[m], *modes.offset[m]), [])
         for k in at_place:
+            # Mahalanobis distance in the covariance L Lᵀ of the better mode.
             distance = np.linalg.solve(modes.factor[k], modes.z[m] - modes.z[k])
             if distance @ distance < 1.0:
                 knowledge[k] = min(knowledge[k], knowledge[m])
@@ -756,25 +773,21 @@ class Draws(NamedTuple):
     log_posterior: np.ndarray
 
 
-@dataclass(frozen=True)
-class SampledPosterior:
+class SampledPosterior(NamedTuple):
     """Posterior sums over importance samples around modes.
 
     Attributes
     ----------
-    unknown_field, known_field : list of PosteriorSums
-        Sums in `EQUAL_PARTS` equal parts: over all fields in which the search has found modes, and
-        over the star's own field, for estimators that know it.
-    unknown_field_with_truth, known_field_with_truth : PosteriorSums
-        The same in one part, with all modes that more knowledge leads to, those climbed from the
-        truth among them. The truth is one draw from the posterior, so the difference shows what
-        the search does not detect of the posterior.
+    parts : list of PosteriorSums
+        Sums in `EQUAL_PARTS` equal parts.
+    with_truth : PosteriorSums
+        Sums in one part, with all modes that more knowledge leads to, those climbed from the truth
+        among them. The truth is one draw from the posterior, so the difference shows what the
+        search does not detect of the posterior.
     """
 
-    unknown_field: list[PosteriorSums]
-    known_field: list[PosteriorSums]
-    unknown_field_with_truth: PosteriorSums
-    known_field_with_truth: PosteriorSums
+    parts: list[PosteriorSums]
+    with_truth: PosteriorSums
 
 
 def sample_posterior(
@@ -783,7 +796,7 @@ def sample_posterior(
     star_field: np.ndarray,
     draws: int,
     rngs: Sequence[np.random.Generator],
-) -> SampledPosterior:
+) -> tuple[SampledPosterior, SampledPosterior]:
     """Draw around modes, weigh the samples and adapt the mixture, in three rounds.
 
     Stars with a mode that only the truth leads to are sampled again with it.
@@ -798,6 +811,13 @@ def sample_posterior(
     draws : int
         Samples a star in all rounds; every mode has one at least in each round.
     rngs : sequence of n Generators
+
+    Returns
+    -------
+    unknown_field : SampledPosterior
+        Sums over all fields in which the search has found modes.
+    known_field : SampledPosterior
+        Sums over the star's own field, for estimators that know it.
     """
     # Most of the draws are left for the mixture that has been adapted twice.
     rounds = [round(share * draws) for share in (0.2, 0.3, 0.5)]
@@ -817,6 +837,8 @@ def sample_posterior(
             _run_round(samplers, count, posteriors)
         return samplers
 
+    # First around the modes that a search finds. Stars with a mode that only the truth leads to
+    # are sampled again with all modes; the random numbers go on where they were.
     detected = modes.take(np.flatnonzero(modes.knowledge != Knowledge.TRUTH))
     undetected = np.unique(modes.star[modes.knowledge == Knowledge.TRUTH])
     rows: list[tuple[PosteriorSums, ...]] = []
@@ -824,17 +846,22 @@ def sample_posterior(
         samplers = sample(stars, detected)
         resampled = stars[np.isin(stars, undetected)]
         with_truth = dict(zip(resampled, sample(resampled, modes), strict=True))
+        # A row for each star: its parts without and with the field, then both totals.
         for star, sampler in zip(stars, samplers, strict=True):
             totals = with_truth.get(star, sampler).totals(posteriors.model)
             rows.append((*sampler.parts(posteriors.model), *totals))
-    *parts, unknown, known = (PosteriorSums.stack(column) for column in zip(*rows, strict=True))
-    return SampledPosterior(parts[:EQUAL_PARTS], parts[EQUAL_PARTS:], unknown, known)
+    *parts, total, total_in_field = (
+        PosteriorSums.stack(column) for column in zip(*rows, strict=True)
+    )
+    unknown_field = SampledPosterior(parts[:EQUAL_PARTS], total)
+    return unknown_field, SampledPosterior(parts[EQUAL_PARTS:], total_in_field)
 
 
 def _run_round(samplers: list[_Sampler], count: int, posteriors: StarPosteriors) -> None:
     """Draw once for several stars; their stamps are propagated together."""
     places = [sampler.propose(count) for sampler in samplers]
     field, offset, z = (np.concatenate(column) for column in zip(*places, strict=True))
+    # Draws beyond the limit have no weight; they are propagated at the limit.
     stamps = posteriors.model.stamps(np.clip(z, -MAX_ABS_Z, MAX_ABS_Z), field, offset)
     stamps = stamps.reshape(len(stamps), -1)
     ends = np.cumsum([place.field.size for place in places])[:-1]
@@ -932,6 +959,7 @@ class _Sampler:
             sums = PosteriorSums.empty(1, self.counts.size, len(model.field), shifts)
             used = np.flatnonzero(selection & np.isfinite(log_weight))
             if used.size:
+                # Weights relative to the largest, as in `PosteriorSums`.
                 sums.log_scale[:] = log_weight[used].max()
                 weight = np.exp(log_weight[used] - sums.log_scale)
                 sums.weight_sum[:] = weight.sum()

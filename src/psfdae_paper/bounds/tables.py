@@ -92,6 +92,7 @@ class Tables:
         """
         import pandas as pd
 
+        # Columns that all metrics share.
         key: dict[str, object] = {"dataset": self.dataset, "split": SPLIT, "reference": reference}
         key |= {"method": method, "noise_level": level}
         has_estimate = np.isfinite(values["mse"])
@@ -104,6 +105,7 @@ class Tables:
             "tight": "yes" if tight else "no",
             "found": source,
         }
+        # A row for each metric: mean, standard error clustered by field, and confidence interval.
         for metric in [name for name in ("mse", "p_right") if name in values]:
             value = values[metric][has_estimate]
             mean, stderr = clustered_mean(value, field) if value.size else (np.nan, np.nan)
@@ -115,6 +117,7 @@ class Tables:
             if metric == "mse" and "variance" in values and value.size:
                 row["variance"] = values["variance"][has_estimate].mean()
             self.summary.append({**key, **row, **common})
+        # And all values by star.
         stars = {"star": self.stars.star, "field": self.stars.field}
         self.per_star.append(pd.DataFrame({**key, **stars, **values}))
 
@@ -173,6 +176,7 @@ def add_floor(config: Config, product: Product, tables: Tables) -> None:
         product["pupil_samples"][stars.star],
         "complex128",
     )
+    # They serve all noise levels.
     for level in config.noise.levels:
         variance = noise_model(config).variance(stamps, level)
         error = local_error(derivatives, model.sd, variance)
@@ -221,13 +225,9 @@ def add_means(
         sparse, over_samples = np.flatnonzero(is_sparse), {}
         if sparse.size:
             subset = stars.take(sparse)
-            samples = sample_stars(config, bank, product, subset, level, likelihood)
-            sums = (
-                (samples.unknown_field, samples.unknown_field_with_truth),
-                (samples.known_field, samples.known_field_with_truth),
-            )
-            for method, (parts, with_truth) in zip(POSTERIOR_MEANS, sums, strict=True):
-                over_samples[method] = Estimates.over_samples(parts, with_truth, static, subset)
+            posteriors = sample_stars(config, bank, product, subset, level, likelihood)
+            for method, samples in zip(POSTERIOR_MEANS, posteriors, strict=True):
+                over_samples[method] = Estimates.over_samples(samples, static, subset)
         # The better one for every star.
         for method, (draws, estimates) in over_bank.items():
             improved, replaced = estimates.improved(sparse, over_samples.get(method))
@@ -295,12 +295,14 @@ def compare_methods(
         is_tight = (key["dataset"], key["reference"], bound, level) in tight
         for method in methods["method"].unique():
             errors = methods[methods["method"] == method]
-            # A posterior mean bounds methods with the same knowledge of the field.
+            # A posterior mean bounds methods with the same knowledge of the field; the floor
+            # bounds all methods and both posterior means.
             if not is_floor and (
                 method in POSTERIOR_MEANS
                 or POSTERIOR_MEANS[bound] != method_named(method).needs.position
             ):
                 continue
+            # Errors and bounds of the same stars, which must lie in the same fields.
             paired = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")
             if len(paired) < len(limits):
                 missing = len(limits) - len(paired)

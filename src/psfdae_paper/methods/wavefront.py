@@ -204,8 +204,8 @@ class Wavefront(Method):
             rngs = [stream(*names, int(star)) for star in block]
             posteriors = StarPosteriors(likelihood.counts(noisy[block]), likelihood, self.model)
             no_field = np.full(len(block), -1)
-            samples = sample_posterior(modes, posteriors, no_field, DRAWS_PER_STAR, rngs)
-            sums.put(block, samples.unknown_field_with_truth)
+            samples, _ = sample_posterior(modes, posteriors, no_field, DRAWS_PER_STAR, rngs)
+            sums.put(block, samples.with_truth)
             explained[block[unexplained]] = False
         return sums, explained & (sums.weight_sum > 0)
 
