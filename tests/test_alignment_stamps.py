@@ -10,7 +10,7 @@ import pytest
 from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.telescope.raytracing import annulus_points, misaligned
+from psfdae.telescope.raytracing import annulus_points, misalign
 from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae_paper.alignment.telescope import uniform_states
 from psfdae_paper.configuration.alignment import CHOICE
@@ -172,8 +172,8 @@ def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
     import batoid
     from batoid.analysis import drdth
 
-    optic = misaligned(tracer.optic, np.array(state) * tracer.unit)
-    theta, wavelength = tracer.fields[field], telescope.wavelength_m
+    optic = misalign(tracer.optic, np.array(state) * tracer.misalignment_range)
+    theta, wavelength = tracer.field_rad[field], telescope.wavelength_m
     rays = batoid.RayVector.asGrid(
         optic=optic, wavelength=wavelength, theta_x=theta[0], theta_y=theta[1], nx=rays_across
     )

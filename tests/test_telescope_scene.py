@@ -154,7 +154,7 @@ def test_random_aberrations_have_both_spreads():
     assert drawn.coefficients.std(axis=0) == pytest.approx(
         np.hypot(0.2 * static[8], jitter), rel=0.03
     )
-    assert (drawn.drawn["zernike"][0] == drawn.coefficients).all()
+    assert (drawn.star_columns["zernike"][0] == drawn.coefficients).all()
     again = star_wavefronts(config, field)
     assert (again.coefficients == drawn.coefficients).all()
 

@@ -66,12 +66,12 @@ def fit_states(
         return -0.5 * deviance, score, fisher
 
     steps = Steps(
-        most=settings.iterations,
-        least_gain=0.5 * settings.tolerance**2,
-        decisive=len(DEGREES_OF_FREEDOM),
-        first_damping=settings.damping,
-        most_damping=np.inf,
-        rounding=ROUNDING,
+        max_steps=settings.iterations,
+        min_gain=0.5 * settings.tolerance**2,
+        counted_parameters=len(DEGREES_OF_FREEDOM),
+        initial_damping=settings.damping,
+        max_damping=np.inf,
+        relative_rounding=ROUNDING,
     )
     return climb(evaluate, start, settings.limit, steps)
 
@@ -99,6 +99,6 @@ def refit_twins(
     if tried.any():
         second = fit_states(likelihood, images[tried], twins[tried], settings)
         better = second.height > first.height[tried] * (1.0 - ROUNDING)
-        best.take(np.flatnonzero(tried)[better], second, better)
+        best.overwrite(np.flatnonzero(tried)[better], second, better)
         best.evaluations[tried] += second.evaluations
     return best, tried

@@ -17,7 +17,7 @@ from psfdae.errors import Error
 from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,
-    Modes,
+    PupilModes,
     movable_modes,
     noll_to_nm,
     radial_polynomial,
@@ -97,7 +97,7 @@ class AlignmentStamps:
         self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
         self.movable = movable
-        self._modes: Modes = partial(
+        self._modes: PupilModes = partial(
             centred_modes, alignment.highest_zernike, telescope.obscuration
         )
         if movable:
@@ -174,7 +174,7 @@ class AlignmentStamps:
         zernikes, directions = (
             a.reshape(prod(shape), *a.shape[len(shape) :]) for a in (zernikes, directions)
         )
-        raw = self.propagation.derivatives(zernikes, directions, places=self.movable)
+        raw = self.propagation.derivatives(zernikes, directions, by_position=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)
         self._check_energy(energy)
         return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])

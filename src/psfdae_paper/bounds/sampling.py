@@ -33,7 +33,7 @@ from psfdae.optics.wavefronts import (
     monomial_coefficients,
     monomial_images,
 )
-from psfdae.sensing.climbing import Peaks, Steps, best_of_group, poisson
+from psfdae.sensing.climbing import Peaks, Steps, group_maximum, poisson_information
 from psfdae.sensing.climbing import climb as climbed
 from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
@@ -122,7 +122,7 @@ limit leaves out modes that the draws then find to hold the mass.
 EQUAL_PARTS = 4
 """Equal parts of the draws, whose errors tell whether they are enough."""
 
-CLIMB = Steps(depth=FARTHEST_EVIDENCE)
+CLIMB = Steps(max_drop=FARTHEST_EVIDENCE)
 
 CLIMB_PX = 1.5
 """Standard deviation in pixels of where a stamp may lie while matches are recentred."""
@@ -299,7 +299,7 @@ class Modes:
     def log_density(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Log-density of Student's t around every mode, shape (M, n), of draws (n, 5)."""
         mixture = self.mixture
-        density: np.ndarray = mixture.log_density(mixture.distance(z)) + self._elsewhere(
+        density: np.ndarray = mixture.log_density(mixture.squared_distance(z)) + self._elsewhere(
             field, offset
         )
         return density
@@ -329,7 +329,7 @@ class Modes:
             share[own_field] += missing * inside / inside.sum()
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
-        return Draws(self.field[mode], self.offset[mode], self.mixture.draws(mode, rng)), number
+        return Draws(self.field[mode], self.offset[mode], self.mixture.draw(mode, rng)), number
 
 
 def sample(
@@ -571,7 +571,7 @@ def _climbed(
         )
         stamps, slopes = model.derivatives(coefficients, directions, modes.offset[some])
         mean = likelihood.flux * stamps + likelihood.background
-        deviance, score, information = poisson(
+        deviance, score, information = poisson_information(
             counts[modes.star[some]], mean, likelihood.flux * slopes
         )
         height = -0.5 * (deviance + (z**2).sum(axis=1))
@@ -694,7 +694,7 @@ def _projected(
 
 def _separate(modes: Modes) -> Modes:
     """Modes with any mass, each once."""
-    best = best_of_group(modes.evidence, modes.group)
+    best = group_maximum(modes.evidence, modes.group)
     near = np.flatnonzero(modes.evidence > best - FARTHEST_EVIDENCE)
     kept: dict[tuple[int, ...], list[int]] = {}
     given = modes.given.copy()
