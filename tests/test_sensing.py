@@ -19,7 +19,7 @@ from psfdae.optics.wavefronts import zernike_images
 from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson_information
-from psfdae.sensing.sampling import Chains, Mixture, sample_around
+from psfdae.sensing.sampling import Chains, sample_around
 from psfdae.sensing.stars import SensingError, StarOptics
 from psfdae.telescope.field import telescope_model, terms_of
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
@@ -154,9 +154,9 @@ def test_chains_draw_from_a_normal_whose_mode_is_known_badly():
     def twin(owner, at):
         return at, np.full(len(at), -np.inf)
 
-    modes = Mixture(np.array([[2.5, 3.2]] * 20), np.array([0.8 * np.eye(2)] * 20), np.zeros(20))
+    modes = np.array([[2.5, 3.2]] * 20), np.array([0.64 * np.eye(2)] * 20), np.zeros(20)
     rngs = [np.random.default_rng(i) for i in range(20)]
-    draws = sample_around(height, twin, np.arange(20), modes, rngs).reshape(-1, 2)
+    draws = sample_around(height, twin, np.arange(20), *modes, rngs).reshape(-1, 2)
     assert draws.mean(axis=0) == pytest.approx([3.0, 3.0], abs=0.1)
     assert np.cov(draws.T) == pytest.approx(covariance, abs=0.2)
 
@@ -170,9 +170,9 @@ def test_twins_are_drawn_by_their_probability():
     def twin(owner, at):
         return -at, -at[:, 0]
 
-    modes = Mixture(np.ones((8, 1)), np.full((8, 1, 1), 0.1), np.zeros(8))
+    modes = np.ones((8, 1)), np.full((8, 1, 1), 0.01), np.zeros(8)
     rngs = [np.random.default_rng(i) for i in range(8)]
-    draws = sample_around(height, twin, np.arange(8), modes, rngs)
+    draws = sample_around(height, twin, np.arange(8), *modes, rngs)
     assert np.mean(draws > 0) == pytest.approx(np.e / (1 + np.e), abs=0.03)
 
 
@@ -185,7 +185,7 @@ def test_blurred_modal_stamps_are_blurred_stamps_and_their_slopes_are_difference
     sampling = BlurredSampling(pupil, 12, 1.5, profile, "complex128")
     operator = ModalStamps(pupil, modes, sampling, 1.5)
     waves = np.array([[0.3, -0.2, 0.4, 0.25]])
-    stamp, slopes = operator.derivatives(waves)
+    stamp, slopes = operator.derivatives(waves, np.eye(4)[None])
     opd = operator.opd(waves)
     assert stamp == pytest.approx(BlurredPropagator(pupil, 12, 1.5, profile)(opd), abs=1e-12)
     for j, unit in enumerate(1e-5 * np.eye(4)):

@@ -44,6 +44,9 @@ from psfdae.optics.wavefronts import (
     slope_ranges,
 )
 
+StampsAndSlopes = tuple[np.ndarray, np.ndarray]
+"""Stamps (B, d, d), or intensities at points, and derivatives of the stamps, (B, K, d, d)."""
+
 
 class Sampling(Protocol):
     """Points of the image plane, and their contributions to the pixels of a stamp."""
@@ -110,9 +113,8 @@ class PointSampling(SeparableSampling):
         self._waves = np.stack([np.cos(angle), np.sin(angle)]) * multiplicity
         # Weights of the pixels above the chief ray, and mirrored ones of those below; the middle
         # pixel of an odd stamp is its own mirror image.
-        above = 0.5 * np.hstack(
-            [(even_weights - odd_weights)[::-1].T, (even_weights + odd_weights).T]
-        )
+        mirrored = (even_weights - odd_weights)[::-1]
+        above = 0.5 * np.hstack([mirrored.T, (even_weights + odd_weights).T])
         below = above[::-1, ::-1][: stamp_px // 2]
         self.pixel_weights = np.vstack([below, above]).astype(self.dtype)
         self._weighted_waves: dict[int, np.ndarray] = {}
@@ -247,18 +249,17 @@ class ModalStamps:
     def derivatives(
         self,
         coefficients: np.ndarray,
-        directions: np.ndarray | None = None,
+        directions: np.ndarray,
         offset_px: np.ndarray | None = None,
         by_position: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> StampsAndSlopes:
         """Compute stamps of a batch and their derivatives along directions of the coefficients.
 
         Parameters
         ----------
         coefficients : ndarray, shape (B, J)
-        directions : ndarray, shape (B, K, J) or (K, J), optional
-            Changes of the coefficients per unit parameter, the Jacobian's
-            transpose; by default the coefficients themselves, K = J.
+        directions : ndarray, shape (B, K, J), or (1, K, J) for all stamps
+            Changes of the coefficients per unit parameter, the Jacobian's transpose.
         offset_px : ndarray, shape (B, 2), optional
             As in `stamps`; kept fixed.
         by_position : bool
@@ -271,11 +272,7 @@ class ModalStamps:
         derivatives : ndarray, shape (B, K, d, d), or (B, K + 2, d, d) with `by_position`
             Per unit parameter.
         """
-        if directions is None:
-            directions = np.eye(len(self._modes))
         directions = directions.astype(self.dtype)
-        if directions.ndim == 2:
-            directions = directions[None]
         pupil_fields = self._pupil_fields(coefficients, offset_px)
         # The cheaper way: a field for each direction, or for each product of polynomials.
         if directions.shape[1] < self._sampling.product_cost * len(self._products):
@@ -287,9 +284,7 @@ class ModalStamps:
             slopes = np.concatenate([slopes, self._sampling.position_slopes(intensity)], axis=1)
         return self._sampling.to_pixels(intensity), slopes
 
-    def _by_direction(
-        self, pupil_fields: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _by_direction(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
         """Return intensities at the points and slopes of the pixels, by a field per direction."""
         sampling, (count, *shape) = self._sampling, pupil_fields.shape
         # Pupil fields, and those times the OPD of each direction: E and G with dE = 2πi G.
@@ -307,9 +302,7 @@ class ModalStamps:
             slopes[:, k] = image.imag * change.real - image.real * change.imag
         return image.real**2 + image.imag**2, (4.0 * np.pi) * sampling.to_pixels(slopes)
 
-    def _by_product(
-        self, pupil_fields: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _by_product(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
         """Return intensities and slopes as above, by a field per product of polynomials."""
         sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
@@ -355,11 +348,12 @@ class SampledStamps:
         Linear central obscuration of the pupil.
     modes : PupilModes
     sampling : callable
-        Function of a pupil that returns its `Sampling`.
+        Function of pupil, stamp_px, pixel and the keyword precision that returns a `Sampling`.
     stamp_px : int
         Pixels d along a side.
     pixel : float
         Pixel width in λ/D.
+    precision : "complex64" or "complex128"
     sizes : sequence of int
         Pupil samples N to choose from, ascending.
     reach : float
@@ -372,9 +366,10 @@ class SampledStamps:
         self,
         obscuration: float,
         modes: PupilModes,
-        sampling: Callable[[Pupil], Sampling],
+        sampling: Callable[..., Sampling],
         stamp_px: int,
         pixel: float,
+        precision: Precision,
         sizes: Sequence[int],
         reach: float = 0.0,
         batch: int = 16,
@@ -382,7 +377,8 @@ class SampledStamps:
     ) -> None:
         self.stamp_px, self.pixel, self.sizes, self.reach = stamp_px, pixel, tuple(sizes), reach
         self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
-        self._batch, self._threads = batch, threads
+        self._precision, self._batch, self._threads = precision, batch, threads
+        self._dtype = real_dtype_of(precision)
         self._slopes = mode_slopes(modes)
         self._operators: dict[int, ModalStamps] = {}
 
@@ -390,7 +386,7 @@ class SampledStamps:
         """Return the operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
             pupil = annular_pupil(samples, self._obscuration)
-            sampling = self._sampling(pupil)
+            sampling = self._sampling(pupil, self.stamp_px, self.pixel, precision=self._precision)
             self._operators[samples] = ModalStamps(pupil, self._modes, sampling, self.pixel)
         return self._operators[samples]
 
@@ -414,8 +410,7 @@ class SampledStamps:
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps as `ModalStamps.stamps` does; raises as `samples`."""
-        side, dtype = self.stamp_px, self.operator(self.sizes[0]).dtype
-        stamps = np.empty((len(coefficients), side, side), dtype)
+        stamps = np.empty((len(coefficients), self.stamp_px, self.stamp_px), self._dtype)
 
         def propagate(operator: ModalStamps, batch: np.ndarray) -> None:
             offset = None if offset_px is None else offset_px[batch]
@@ -431,16 +426,16 @@ class SampledStamps:
         offset_px: np.ndarray | None = None,
         samples: np.ndarray | None = None,
         by_position: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> StampsAndSlopes:
         """Return stamps and derivatives along directions (B, K, J), as `ModalStamps` does.
 
         `samples` (B,) are pupil samples, by default as many as the stamps need; raises as
         `samples` does.
         """
-        side, dtype = self.stamp_px, self.operator(self.sizes[0]).dtype
+        side = self.stamp_px
         count = directions.shape[1] + 2 * by_position
-        stamps = np.empty((len(coefficients), side, side), dtype)
-        slopes = np.empty((len(coefficients), count, side, side), dtype)
+        stamps = np.empty((len(coefficients), side, side), self._dtype)
+        slopes = np.empty((len(coefficients), count, side, side), self._dtype)
 
         def differentiate(operator: ModalStamps, batch: np.ndarray) -> None:
             offset = None if offset_px is None else offset_px[batch]

@@ -58,9 +58,7 @@ def pupil_axis(samples: int, guard: int = 0) -> np.ndarray:
     return (2.0 * np.arange(-guard, samples + guard) + 1.0) / samples - 1.0
 
 
-def disc_coverage(
-    samples: int, radius: float, guard: int = 0, oversampling: int = 64
-) -> np.ndarray:
+def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
     """Compute the fraction of each cell of a pupil grid that lies inside a centred disc.
 
     Only the cells that the rim crosses are subdivided, so the cost of a fine
@@ -72,8 +70,6 @@ def disc_coverage(
         Grid as in `pupil_axis`.
     radius : float
         Radius of the disc in pupil radii, 0 … 1.
-    oversampling : int
-        Sub-samples per axis inside a rim cell.
 
     Returns
     -------
@@ -86,10 +82,10 @@ def disc_coverage(
     low, high = np.maximum(x - half, 0), x + half
     nearest = np.hypot(low[:, None], low)
     farthest: np.ndarray = np.hypot(high[:, None], high)
-    # Cells are inside, outside, or crossed by the rim: of those, count sub-samples.
+    # Cells are inside, outside, or crossed by the rim: of those, count 64 × 64 sub-samples.
     coverage = (farthest <= radius).astype(np.float64)
     rows, columns = np.nonzero((nearest < radius) & (farthest > radius))
-    offset = pupil_axis(oversampling) * half
+    offset = pupil_axis(64) * half
     y = x[rows][:, None, None] + offset[None, :, None]
     x = x[columns][:, None, None] + offset[None, None, :]
     coverage[rows, columns] = (y**2 + x**2 <= radius**2).mean(axis=(1, 2))

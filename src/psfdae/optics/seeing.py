@@ -178,7 +178,7 @@ class BlurredSampling(WholePeriod):
         blur = profile.transfer(np.hypot(rows, columns) / pixel)
         weights = multiplicity * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
         self._transfer = (weights * blur).astype(self.dtype)
-        self._complex_dtype = np.dtype(precision)
+        self._complex = np.dtype(precision)
         self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
 
     def to_pixels(
@@ -191,9 +191,7 @@ class BlurredSampling(WholePeriod):
         spectrum = fft.rfft2(values) * self._transfer
         frequencies = (self._row_frequency, self._column_frequency)
         to_rows, to_columns = (
-            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(
-                self._complex_dtype
-            )
+            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self._complex)
             for offset, frequency in zip(offset_px, frequencies, strict=True)
         )
         return np.asarray(((to_rows @ spectrum) @ to_columns.T).real)

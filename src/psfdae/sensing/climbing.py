@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Function of the numbers of some starts, (a,), and their parameters, (a, K).
+Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
 
-It returns the logarithm of the posterior (a,), its slope (a, K), and the expected information of
-counts and prior (a, K, K).
-"""
+Evaluate = Callable[[np.ndarray, np.ndarray], Evaluation]
+"""Function of the numbers of some starts, (a,), and their parameters, (a, K), that evaluates the
+logarithm of their posterior."""
 
 
 class Steps(NamedTuple):
@@ -69,9 +69,7 @@ class Peaks:
             getattr(self, name)[rows] = getattr(peaks, name)[peak_rows]
 
 
-def poisson_information(
-    counts: np.ndarray, expected: np.ndarray, slopes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def poisson_information(counts: np.ndarray, expected: np.ndarray, slopes: np.ndarray) -> Evaluation:
     """Return deviance (n,), score (n, K) and Fisher information (n, K, K) of Poisson counts.
 
     Parameters

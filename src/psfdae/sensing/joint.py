@@ -14,10 +14,18 @@ import numpy as np
 
 from psfdae.optics.derivatives import SampledStamps
 from psfdae.optics.pupil import SamplingError
-from psfdae.sensing.climbing import Peaks, Steps, climb, combine_images, poisson_information
+from psfdae.sensing.climbing import (
+    Evaluation,
+    Peaks,
+    Steps,
+    climb,
+    combine_images,
+    poisson_information,
+)
 from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, WavefrontSearch
 from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
+from psfdae.telescope.settings import Seeing
 
 MAX_ROUNDS = 4
 """Rounds in which stars choose the mode nearest to the state and the state follows them, and in
@@ -92,23 +100,21 @@ class TelescopePosterior:
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
-    def _fwhm_arcsec(self) -> float:
-        """FWHM of the seeing of `optics`."""
+    def _seeing(self) -> Seeing:
         assert self.optics.telescope.seeing is not None, "the model has one"
-        return self.optics.telescope.seeing.fwhm_arcsec
+        return self.optics.telescope.seeing
 
     def relative_seeing(self, t: np.ndarray) -> float:
         """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
         fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
-        return float(fwhm / self._fwhm_arcsec)
+        return float(fwhm / self._seeing.fwhm_arcsec)
 
     def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
-        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._fwhm_arcsec
-        telescope = self.optics.telescope
-        assert telescope.seeing is not None
-        seeing = telescope.seeing.model_copy(update={"fwhm_arcsec": fwhm})
-        optics = replace(self.optics, telescope=telescope.model_copy(update={"seeing": seeing}))
+        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._seeing.fwhm_arcsec
+        seeing = self._seeing.model_copy(update={"fwhm_arcsec": fwhm})
+        telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
+        optics = replace(self.optics, telescope=telescope)
         return TelescopePosterior(self.search, self.model, self.stars, optics)
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
@@ -120,16 +126,27 @@ class TelescopePosterior:
         jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
         return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.stars])
 
-    def evaluate(
-        self, _: np.ndarray, parameters: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, _: np.ndarray, parameters: np.ndarray) -> Evaluation:
         """Evaluate the posterior as `psfdae.sensing.climbing.Evaluate`, at parameters (a, K).
 
         A telescope through which no rays pass, or whose wavefronts no grid can sample, is
         impossible.
         """
-        parts = [self._evaluate_at(row) for row in parameters]
-        height, score, information = (np.stack(part) for part in zip(*parts, strict=True))
+        q, (count, size) = self.number_count, parameters.shape
+        height, score = np.full(count, -np.inf), np.zeros((count, size))
+        information = np.tile(np.eye(size), (count, 1, 1))
+        for row, values in enumerate(parameters):
+            with suppress(RayTracingError, SamplingError):
+                deviance, star_score, star_information = self.evaluate_stars(values)
+                height[row] = -0.5 * (deviance.sum() + (values[:q] ** 2).sum())
+                (score[row],), (information[row],) = combine_images(
+                    star_score[None], star_information[None], q
+                )
+                # Normal prior of the numbers, and a trace of information on places, fluxes and
+                # skies, so that no matrix is singular.
+                score[row, :q] -= values[:q]
+                information[row, range(q), range(q)] += 1.0
+                information[row, range(q, size), range(q, size)] += 1e-9
         return height, score, information
 
     def evaluate_stars(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -148,25 +165,9 @@ class TelescopePosterior:
             broadened = self._broadening.stamps(modes).reshape(len(self.stars), -1)
             broadened = broadened.astype(np.float64)
             stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
-            slopes[:, q - 1] = self.model.sd[-1] / self._fwhm_arcsec * broadened
+            slopes[:, q - 1] = self.model.sd[-1] / self._seeing.fwhm_arcsec * broadened
         expected = self.search.expected_counts(self.stars, stamps, slopes, star_parameters)
         return poisson_information(self.search.photons.counts[self.stars], *expected)
-
-    def _evaluate_at(self, parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return ln of the posterior, its slope (K,) and the information (K, K), at one place."""
-        q = self.number_count
-        try:
-            deviance, star_score, star_information = self.evaluate_stars(parameters)
-        except (RayTracingError, SamplingError):
-            return -np.inf, np.zeros(parameters.size), np.eye(parameters.size)
-        (score,), (information,) = combine_images(star_score[None], star_information[None], q)
-        # Normal prior of the numbers, and a trace of information on places, fluxes and skies, so
-        # that no matrix is singular.
-        score[:q] -= parameters[:q]
-        information[range(q), range(q)] += 1.0
-        information[range(q, len(score)), range(q, len(score))] += 1e-9
-        height = -0.5 * (deviance.sum() + (parameters[:q] ** 2).sum())
-        return height, score, information
 
 
 def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeModel) -> Joint:

@@ -18,14 +18,7 @@ from psfdae.image.observation import central_pixel
 from psfdae.image.stamps import Stamps
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
-from psfdae.sensing.stars import (
-    PUPIL_SIZES,
-    Photons,
-    SensingError,
-    StarModes,
-    StarOptics,
-    WavefrontSearch,
-)
+from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
 from psfdae.telescope.field import Terms, telescope_model, terms_of
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
@@ -90,8 +83,7 @@ def wavefront(
         state = fit_telescope(search, modes, telescope_model(telescope, angle)) if joint else None
     except SamplingError as error:
         raise SensingError(
-            f"{telescope.name}: aberrations or seeing need more than {PUPIL_SIZES[-1]} samples "
-            f"across the pupil ({error})"
+            f"{telescope.name}: aberrations or seeing need a finer pupil grid ({error})"
         ) from error
     return Wavefronts(search, stamps, angle, modes, state)
 

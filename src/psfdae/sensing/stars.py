@@ -13,20 +13,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.bright_stars import LEAST_SKY, MOST_SKY
 from psfdae.errors import Error
 from psfdae.image.stamps import Stamps, border_median, border_scatter
-from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling
+from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
 from psfdae.progress import task
 from psfdae.rng import stream
-from psfdae.sensing.climbing import Steps, climb, group_maximum, poisson_information
-from psfdae.sensing.sampling import Mixture, sample_around
+from psfdae.sensing.climbing import Evaluation, Steps, climb, group_maximum, poisson_information
+from psfdae.sensing.sampling import sample_around
 from psfdae.telescope.field import Terms
 from psfdae.telescope.settings import OwnTelescope
 
@@ -44,16 +44,12 @@ STARS_AT_ONCE = 128
 """Stars of 16 × 16 px that are worked on together, to bound the memory."""
 
 
-class Round(NamedTuple):
-    """Number of candidates that are drawn for a star, and of those that are followed to modes."""
+ROUNDS = ((48, 4), (100, 6), (400, 12), (1000, 12))
+"""Rounds of the search: candidates drawn for a star, and those of them that are followed to modes.
 
-    candidates: int
-    starts: int
-
-
-ROUNDS = (Round(48, 4), Round(100, 6), Round(400, 12), Round(1000, 12))
-"""Rounds of the search. Those after the first are for stars that no mode explains yet, or for
-which the round before found another mode."""
+Rounds after the first are for stars that no mode explains yet, or for which the round before found
+another mode.
+"""
 
 
 class SensingError(Error, ValueError):
@@ -101,20 +97,20 @@ class StarOptics:
 
         With `broadening`, the stamps are derivatives by the logarithm of the FWHM of the seeing.
         """
-        telescope = self.telescope
-        blur = telescope.blur
+        telescope, blur = self.telescope, self.telescope.blur
+        pixel = telescope.pixel / oversampling
         sampling: Callable[..., Sampling] = PointSampling
         if blur is not None:
             profile = Broadening(blur) if broadening else blur
             sampling = partial(BlurredSampling, profile=profile)
-        pixel = telescope.pixel / oversampling
         return SampledStamps(
             telescope.obscuration,
             # Two modes more move the star by a pixel of the telescope along x and y.
             partial(movable_modes, self.terms.modes, telescope.pixel),
-            partial(sampling, stamp_px=stamp_px, pixel=pixel, precision="complex64"),
+            sampling,
             stamp_px,
             pixel,
+            "complex64",
             PUPIL_SIZES[1:] if blur is None else PUPIL_SIZES,
             reach=blur.reach if blur is not None else 0.0,
             batch=64,
@@ -140,9 +136,7 @@ class StarOptics:
         waves = np.einsum("mk,mkj->mj", coefficients, self.terms.to_modes[star])
         return np.concatenate([waves, place_px], axis=1)
 
-    def derivatives(
-        self, modes: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self, modes: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
         """Return stamps of light 1, (m, P), and their derivatives, (m, k + 2, P).
 
         Parameters
@@ -155,10 +149,8 @@ class StarOptics:
         directions = np.pad(directions, ((0, 0), (0, 2), (0, 2)))
         directions[:, [-2, -1], [-2, -1]] = 1.0
         stamps, slopes = self.operator.derivatives(modes, directions)
-        return (
-            stamps.reshape(len(modes), -1).astype(np.float64),
-            slopes.reshape(*slopes.shape[:2], -1).astype(np.float64),
-        )
+        slopes = slopes.reshape(*slopes.shape[:2], -1).astype(np.float64)
+        return stamps.reshape(len(modes), -1).astype(np.float64), slopes
 
     def twins(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Return standardised coefficients (m, K) whose even terms are negated in waves.
@@ -328,11 +320,11 @@ class WavefrontSearch:
         count = self.optics.coefficient_count
         modes: list[StarModes] = []
         likely_modes = np.ones(len(self.flux), int)
-        for number, search_round in enumerate(ROUNDS):
+        for number, sizes in enumerate(ROUNDS):
             if not stars.size:
                 break
             # Climbs from the candidates that match best.
-            starts = [self._match_candidates(star, number, search_round) for star in stars]
+            starts = [self._match_candidates(star, number, *sizes) for star in stars]
             members = np.repeat(stars, [len(start) for start in starts])
             fresh = self._climb(members, np.concatenate(starts))
             # Climbs from the twins of their modes, where the prior permits them.
@@ -353,12 +345,12 @@ class WavefrontSearch:
             stars = np.intersect1d(stars, best.star[has_more | ~self.is_explained(best)])
         return modes[0]
 
-    def _match_candidates(self, star: int, number: int, search_round: Round) -> np.ndarray:
-        """Return the best candidates of a star as starts, (at most `starts`, K + 4)."""
+    def _match_candidates(self, star: int, number: int, candidates: int, starts: int) -> np.ndarray:
+        """Return the best candidates of a star in a round as starts, (at most `starts`, K + 4)."""
         optics = self.optics
         # Candidates from the prior; the first one of all is its mean.
         rng = stream(self.seed, "wavefront", int(star), number)
-        z = rng.standard_normal((search_round.candidates, optics.coefficient_count))
+        z = rng.standard_normal((candidates, optics.coefficient_count))
         z = np.clip(z, -MAX_Z, MAX_Z)
         if number == 0:
             z[0] = 0.0
@@ -368,7 +360,7 @@ class WavefrontSearch:
         flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
         value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
         shift = value.argmax(axis=1)
-        best = np.argsort(-value.max(axis=1), kind="stable")[: search_round.starts]
+        best = np.argsort(-value.max(axis=1), kind="stable")[:starts]
         if number == 0:
             first_flux = flux[best[0], shift[best[0]]]
             self.flux[star] = max(first_flux, np.sqrt(self.photons.sky_counts[star]))
@@ -406,10 +398,13 @@ class WavefrontSearch:
         """Follow starts (M, K + 4) of stars (M,) to modes."""
         optics, photons, k = self.optics, self.photons, self.optics.coefficient_count
         limit = np.array([MAX_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
+        # Normal priors of the coefficients, σ = 1, and of the place, σ = the stamp's side. A trace
+        # of information on flux and sky keeps all matrices regular.
+        prior_variance = np.array([1.0] * k + [optics.stamp_px**2] * 2 + [np.inf] * 2)
+        prior_information = np.maximum(1.0 / prior_variance, 1e-9)
+        diagonal = range(k + 4)
 
-        def evaluate(
-            members: np.ndarray, parameters: np.ndarray
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def evaluate(members: np.ndarray, parameters: np.ndarray) -> Evaluation:
             advance(1)
             stars, z, place = star[members], parameters[:, :k], parameters[:, k : k + 2]
             # Poisson likelihood of the counts.
@@ -418,13 +413,8 @@ class WavefrontSearch:
             stamps, slopes = optics.derivatives(modes, directions)
             mean, slopes = self.expected_counts(stars, stamps, slopes, parameters[:, k:])
             deviance, score, information = poisson_information(photons.counts[stars], mean, slopes)
-            # Normal priors of the coefficients, σ = 1, and of the place, σ = the stamp's side.
-            score[:, :k] -= z
-            information[:, range(k), range(k)] += 1.0
-            score[:, k : k + 2] -= place / optics.stamp_px**2
-            information[:, range(k, k + 2), range(k, k + 2)] += 1.0 / optics.stamp_px**2
-            # A trace of information on flux and sky, so that no matrix is singular.
-            information[:, range(k + 2, k + 4), range(k + 2, k + 4)] += 1e-9
+            score -= parameters / prior_variance
+            information[:, diagonal, diagonal] += prior_information
             return -0.5 * (deviance + self._prior_penalty(parameters)), score, information
 
         steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
@@ -439,39 +429,33 @@ class WavefrontSearch:
 
     def _draw_parameters_of(self, modes: StarModes) -> np.ndarray:
         """Draw from the posteriors of all stars that the modes belong to."""
-        stars, k = modes.best_modes.star, self.optics.coefficient_count
+        stars, optics, k = modes.best_modes.star, self.optics, self.optics.coefficient_count
 
         def twin(member: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # Twins have the same likelihood: ln p differs by the prior, −½|z|².
             z = parameters[:, :k]
-            twin_z = self.optics.twins(stars[member], z)
+            twin_z = optics.twins(stars[member], z)
             gain = 0.5 * ((z**2).sum(axis=1) - (twin_z**2).sum(axis=1))
             gain = np.where((np.abs(twin_z) <= MAX_Z).all(axis=1), gain, -np.inf)
             return np.concatenate([twin_z, parameters[:, k:]], axis=1), gain
 
-        return sample_around(
-            lambda member, parameters: self._log_posterior(stars[member], parameters),
-            twin,
-            np.searchsorted(stars, modes.star),
-            Mixture(modes.parameters, np.linalg.cholesky(modes.covariance), modes.evidence),
-            [stream(self.seed, "wavefront draws", int(star)) for star in stars],
-        )
+        def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+            # Images are those at the limits where parameters are beyond.
+            star, place, reach = stars[member], parameters[:, k : k + 2], optics.reach_px
+            coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
+            modes = optics.mode_coefficients(star, coefficients, np.clip(place, -reach, reach))
+            stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
+            no_slopes = np.empty((len(star), 0, stamps.shape[1]))
+            mean, no_slopes = self.expected_counts(star, stamps, no_slopes, parameters[:, k:])
+            deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
+            height = -0.5 * (deviance + self._prior_penalty(parameters))
+            # A star far from its stamp is impossible; a finite number keeps differences finite.
+            return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
 
-    def _log_posterior(self, star: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the posterior at parameters (m, K + 4) of stars (m,)."""
-        optics, k = self.optics, self.optics.coefficient_count
-        # Images are those at the limits where parameters are beyond.
-        coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
-        place = parameters[:, k : k + 2]
-        clipped = np.clip(place, -optics.reach_px, optics.reach_px)
-        modes = optics.mode_coefficients(star, coefficients, clipped)
-        stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
-        no_slopes = np.empty((len(star), 0, stamps.shape[1]))
-        mean, no_slopes = self.expected_counts(star, stamps, no_slopes, parameters[:, k:])
-        deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
-        height = -0.5 * (deviance + self._prior_penalty(parameters))
-        # A star far from its stamp is impossible; a finite number keeps differences finite.
-        return np.where((np.abs(place) <= optics.reach_px).all(axis=1), height, -1e100)
+        owner = np.searchsorted(stars, modes.star)
+        rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
+        mixture = modes.parameters, modes.covariance, modes.evidence
+        return sample_around(log_posterior, twin, owner, *mixture, rngs)
 
     def _prior_penalty(self, parameters: np.ndarray) -> np.ndarray:
         """Return −2 ln of the prior of parameters (m, K + 4), (m,).
@@ -488,7 +472,7 @@ class WavefrontSearch:
         stamps: np.ndarray,
         slopes: np.ndarray,
         star_parameters: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> StampsAndSlopes:
         """Return expected counts (m, P), and their derivatives (m, k + 2, P).
 
         Two derivatives are added: by flux and by sky.

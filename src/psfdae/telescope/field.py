@@ -83,26 +83,19 @@ def static_zernikes(
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
     assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
-    zernikes = trace_zernikes(
-        telescope, aberrations, angle_deg, aberrations.defocus_m, aberrations.misalignment
-    )
-    return noll, zernikes
+    defocus_m, misalignment = aberrations.defocus_m, aberrations.misalignment
+    return noll, trace_zernikes(telescope, angle_deg, defocus_m, misalignment)
 
 
 def trace_zernikes(
-    telescope: OwnTelescope,
-    aberrations: Raytraced,
-    angle_deg: np.ndarray,
-    defocus_m: float,
-    misalignment: np.ndarray,
+    telescope: OwnTelescope, angle_deg: np.ndarray, defocus_m: float, misalignment: np.ndarray
 ) -> np.ndarray:
     """Trace rays of a telescope and return its Zernike coefficients (n, J), an OPD in waves.
 
     Parameters
     ----------
     telescope : OwnTelescope
-    aberrations : Raytraced
-        Its prescription.
+        Telescope with a prescription.
     angle_deg : ndarray, shape (n, 2)
     defocus_m : float
         Distance of the detector beyond best focus.
@@ -111,17 +104,14 @@ def trace_zernikes(
     """
     from psfdae.telescope.raytracing import ZernikeTracer, build_optic, misalign
 
+    aberrations = telescope.aberrations
+    assert isinstance(aberrations, Raytraced)
     with needed_by(f"{telescope.name}: a ray trace"):
         optic = build_optic(aberrations.prescription, telescope, defocus_m)
     optic = misalign(optic, misalignment)
     # The optic is already misaligned: the tracer's own range of misalignments is 0.
-    tracer = ZernikeTracer(
-        optic,
-        telescope.wavelength_m,
-        np.deg2rad(angle_deg),
-        np.zeros(4),
-        aberrations.highest_zernike,
-    )
+    field_rad, highest = np.deg2rad(angle_deg), aberrations.highest_zernike
+    tracer = ZernikeTracer(optic, telescope.wavelength_m, field_rad, np.zeros(4), highest)
     # The trace counts the lead of the wavefront, an OPD its delay.
     return np.asarray(-tracer(np.zeros((1, 4)))[0])
 
@@ -276,24 +266,20 @@ def _ray_traced_model(
     telescope: OwnTelescope, aberrations: Raytraced, angle_deg: np.ndarray
 ) -> TelescopeModel:
     """Return the model of a ray-traced telescope: defocus, and secondary or optical axis."""
-    prior = telescope.prior
+    prior, defocus_m = telescope.prior, aberrations.defocus_m
     if aberrations.prescription.secondary is not None:
         to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
         return TelescopeModel(
             ("defocus", "decentre_x", "decentre_y", "tilt_x", "tilt_y"),
             ("m", "m", "m", "deg", "deg"),
-            np.array([aberrations.defocus_m, *aberrations.decentre_m, *aberrations.tilt_deg]),
+            np.array([defocus_m, *aberrations.decentre_m, *aberrations.tilt_deg]),
             np.array([prior.defocus_m, *[prior.decentre_m] * 2, *[prior.tilt_deg] * 2]),
-            lambda numbers: trace_zernikes(
-                telescope, aberrations, angle_deg, numbers[0], to_radians * numbers[1:]
-            ),
+            lambda t: trace_zernikes(telescope, angle_deg, t[0], to_radians * t[1:]),
         )
     return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),
-        np.array([aberrations.defocus_m, 0.0, 0.0]),
+        np.array([defocus_m, 0.0, 0.0]),
         np.array([prior.defocus_m, prior.tilt_deg, prior.tilt_deg]),
-        lambda numbers: trace_zernikes(
-            telescope, aberrations, angle_deg - numbers[1:], numbers[0], np.zeros(4)
-        ),
+        lambda t: trace_zernikes(telescope, angle_deg - t[1:], t[0], np.zeros(4)),
     )

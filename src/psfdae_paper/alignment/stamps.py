@@ -102,13 +102,13 @@ class AlignmentStamps:
         )
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
-        side, pixel = alignment.stamp_px, telescope.pixel
         self.propagation = SampledStamps(
             telescope.obscuration,
             self._modes,
-            partial(PeriodSampling, stamp_px=side, pixel=pixel, precision=optics.precision),
-            side,
-            pixel,
+            PeriodSampling,
+            alignment.stamp_px,
+            telescope.pixel,
+            optics.precision,
             optics.pupil_samples,
             batch=optics.batch,
             threads=optics.threads,

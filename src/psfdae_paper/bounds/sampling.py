@@ -4,7 +4,7 @@ What is unknown of a star are its field f, the pixels o from the chief ray to th
 its stamp, and the Seidel coefficients c. For one (f, o) the image is smooth in c, so a
 mode of the posterior is sought by Gauss–Newton steps from the bank's best matches, and
 coefficients are drawn around all modes found, from a mixture of Student's t. The mixture
-is adapted to its own draws (`psfdae.sensing.sampling`), and the
+is adapted to its own draws (`psfdae_paper.bounds.mixture`), and the
 draws of all rounds are weighed by prior × likelihood over the density of all rounds
 together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
 brightest pixel the simulator would not frame at o have no weight.
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial, reduce
+from functools import cached_property, reduce
 from itertools import product
 from typing import NamedTuple, get_args
 
@@ -35,8 +35,8 @@ from psfdae.optics.wavefronts import (
 )
 from psfdae.sensing.climbing import Peaks, Steps, group_maximum, poisson_information
 from psfdae.sensing.climbing import climb as climbed
-from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
+from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
@@ -217,14 +217,14 @@ class StampModel:
 
     @cached_property
     def _operators(self) -> dict[Precision, SampledStamps]:
-        side, pixel = self.framing.stamp_px, self.telescope.pixel
         return {
             precision: SampledStamps(
                 self.telescope.obscuration,
                 monomial_images,
-                partial(PointSampling, stamp_px=side, pixel=pixel, precision=precision),
-                side,
-                pixel,
+                PointSampling,
+                self.framing.stamp_px,
+                self.telescope.pixel,
+                precision,
                 sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples}),
                 batch=TERMS * self.optics.batch,
             )
