@@ -8,20 +8,20 @@ import pytest
 from psfdae.optics.wavefronts import zernike_images
 from psfdae.settings import ConfigError
 from psfdae.telescope.raytracing import (
-    DEGREES_OF_FREEDOM,
     RayTracingError,
     annulus_points,
     build_optic,
     misalign,
 )
 from psfdae_paper.alignment.telescope import (
+    DEGREES_OF_FREEDOM,
     ModelError,
+    StateTracer,
     design_states,
     field_points,
     fit_quadratic,
     uniform_states,
     verify,
-    zernike_tracer,
 )
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
@@ -127,7 +127,7 @@ def test_vignetted_field_is_refused():
     config = load([*CHOICE, "alignment.field_radius_deg=0.7"])
     message = r"state 0, field \(0\.7, 0\)°: \d+ of 132 rays are vignetted; 8 of 9 fields are"
     with pytest.raises(RayTracingError, match=message):
-        zernike_tracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
+        StateTracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
 
 
 @pytest.mark.parametrize(

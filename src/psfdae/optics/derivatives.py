@@ -117,6 +117,7 @@ class PointSampling(SeparableSampling):
         above = 0.5 * np.hstack([mirrored.T, (even_weights + odd_weights).T])
         below = above[::-1, ::-1][: stamp_px // 2]
         self.pixel_weights = np.vstack([below, above]).astype(self.dtype)
+        # Waves times P_a(x), by the degree a.
         self._weighted_waves: dict[int, np.ndarray] = {}
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
@@ -133,7 +134,10 @@ class PointSampling(SeparableSampling):
         for degree in degrees:
             # An even polynomial leaves the parity, an odd one changes it: the even part of the
             # product meets the cosines, the odd part the sines.
-            cosine_waves, sine_waves = self._weighted(degree)
+            if degree not in self._weighted_waves:
+                weighted = legendre([degree], self._axis)[0][:, None] * self._waves
+                self._weighted_waves[degree] = weighted.astype(self.dtype)
+            cosine_waves, sine_waves = self._weighted_waves[degree]
             cos_re, cos_im = (parts[degree % 2] @ cosine_waves).reshape(shape)
             sin_re, sin_im = (parts[(degree + 1) % 2] @ sine_waves).reshape(shape)
             # C − iS at the points above the chief ray, C + iS below.
@@ -150,13 +154,6 @@ class PointSampling(SeparableSampling):
         """Propagate along y as `Sampling` does."""
         # Transposed, so that both ways are the same products.
         return self.along_x(rows.swapaxes(-1, -2), degrees).swapaxes(-1, -2)
-
-    def _weighted(self, degree: int) -> np.ndarray:
-        """Return cosines and sines times P_a(x) over half of the pupil, (2, M/2, m/2)."""
-        if degree not in self._weighted_waves:
-            weighted = legendre([degree], self._axis)[0][:, None] * self._waves
-            self._weighted_waves[degree] = weighted.astype(self.dtype)
-        return self._weighted_waves[degree]
 
 
 class PeriodSampling(SeparableSampling, WholePeriod):

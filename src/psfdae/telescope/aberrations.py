@@ -35,6 +35,8 @@ def _check_not_zero(value: float) -> float:
 
 
 Radius = Annotated[Finite, AfterValidator(_check_not_zero)]
+Pair = tuple[Finite, Finite]
+Jitter = Annotated[float, Field(ge=0, le=100)]
 Resonances = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
@@ -193,9 +195,7 @@ class Zernike(Group):
         description="Waves RMS by Noll index and power of the field: "
         "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
     )
-    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=0.0, description="Standard deviation added to every term of every star"
-    )
+    jitter_waves: Jitter = Field(default=0.0, description="Scatter of every term of every star")
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -219,18 +219,14 @@ class Raytraced(Group):
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
         default=0.0, description="Distance of the detector beyond best focus"
     )
-    decentre_m: tuple[Finite, Finite] = Field(
-        default=(0.0, 0.0), description="Decentre of the secondary along x and y"
-    )
-    tilt_deg: tuple[Finite, Finite] = Field(
-        default=(0.0, 0.0), description="Tilt of the secondary about its vertex, about x and y"
+    decentre_m: Pair = Field(default=(0.0, 0.0), description="Of the secondary, along x and y")
+    tilt_deg: Pair = Field(
+        default=(0.0, 0.0), description="Of the secondary about its vertex, about x and y"
     )
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
         default=22, description="Highest Noll index of the wavefront"
     )
-    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=0.0, description="Standard deviation added to every Zernike term of every star"
-    )
+    jitter_waves: Jitter = Field(default=0.0, description="Scatter of every term of every star")
 
     @property
     def misalignment(self) -> np.ndarray:

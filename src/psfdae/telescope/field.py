@@ -102,18 +102,16 @@ def trace_zernikes(
     misalignment : ndarray, shape (4,)
         Decentre x, y in metres and tilt about x, y in radians of the secondary.
     """
-    from psfdae.telescope.raytracing import ZernikeTracer, build_optic, misalign
+    from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 
     aberrations = telescope.aberrations
     assert isinstance(aberrations, Raytraced)
     with needed_by(f"{telescope.name}: a ray trace"):
         optic = build_optic(aberrations.prescription, telescope, defocus_m)
-    optic = misalign(optic, misalignment)
-    # The optic is already misaligned: the tracer's own range of misalignments is 0.
     field_rad, highest = np.deg2rad(angle_deg), aberrations.highest_zernike
-    tracer = ZernikeTracer(optic, telescope.wavelength_m, field_rad, np.zeros(4), highest)
+    tracer = ZernikeTracer(optic, telescope.wavelength_m, field_rad, highest)
     # The trace counts the lead of the wavefront, an OPD its delay.
-    return np.asarray(-tracer(np.zeros((1, 4)))[0])
+    return np.asarray(-tracer(misalignment[None])[0])
 
 
 def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
@@ -252,7 +250,7 @@ def _linear_model(
     sd = np.hypot(fraction * np.abs(mean), waves)
     is_free = sd > 0
     fixed = np.tensordot(mean[~is_free], basis[~is_free], 1)
-    names = tuple(name for name, free in zip(names, is_free, strict=True) if free)
+    names = tuple(names[index] for index in np.flatnonzero(is_free))
     return TelescopeModel(
         names,
         ("wave",) * len(names),

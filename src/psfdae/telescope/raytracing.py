@@ -29,12 +29,9 @@ if TYPE_CHECKING:
     from psfdae.telescope.aberrations import Lens, Mirror, Prescription
     from psfdae.telescope.settings import Telescope
 
-DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
-"""Order of the four numbers of a state of misalignment."""
-
 
 class RayTracingError(Error, ValueError):
-    """A state of misalignment or a field whose rays cannot be traced."""
+    """Error of a misalignment or a field whose rays cannot be traced."""
 
 
 def misalign(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
@@ -67,8 +64,6 @@ class ZernikeTracer:
     wavelength_m : float
     field_rad : ndarray, shape (F, 2)
         Field angles (x, y).
-    misalignment_range : ndarray, shape (4,)
-        Largest misalignment in metres, metres, radians, radians: the unit of states.
     highest_noll : int
         Highest Noll index.
     """
@@ -78,7 +73,6 @@ class ZernikeTracer:
         optic: CompoundOptic,
         wavelength_m: float,
         field_rad: np.ndarray,
-        misalignment_range: np.ndarray,
         highest_noll: int,
     ) -> None:
         import batoid
@@ -86,7 +80,6 @@ class ZernikeTracer:
         self.optic = optic
         self.wavelength_m = wavelength_m
         self.field_rad = np.asarray(field_rad, float)
-        self.misalignment_range = np.asarray(misalignment_range, float)
         # Weighted least squares, (√w Z)⁺ √w.
         x, y, self._weights = annulus_points(highest_noll, optic.pupilObscuration)
         root = np.sqrt(self._weights)
@@ -105,13 +98,13 @@ class ZernikeTracer:
         ]
         self._rays = batoid.concatenateRayVectors(rays)
 
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        """Return the Zernike coefficients of states of misalignment.
+    def __call__(self, misalignments: np.ndarray) -> np.ndarray:
+        """Return the Zernike coefficients of misalignments of the secondary.
 
         Parameters
         ----------
-        states : ndarray, shape (n, 4)
-            In units of the range, order of `DEGREES_OF_FREEDOM`.
+        misalignments : ndarray, shape (n, 4)
+            Decentre x, y in metres and tilt about x, y in radians, as in `misalign`.
 
         Returns
         -------
@@ -121,26 +114,14 @@ class ZernikeTracer:
         Raises
         ------
         RayTracingError
-            If a state lies outside the range or a field is vignetted; names the state.
+            If a field is vignetted; names the number of the misalignment.
         """
-        states = np.atleast_2d(np.asarray(states, float))
-        # Ends of a grid are rounded: 1e-9 of the range is no mistake.
-        is_outside = ~(np.abs(states) <= 1.0 + 1e-9)
-        if is_outside.any():
-            state, axis = np.argwhere(is_outside)[0]
-            value = states[state, axis]
-            size = value * self.misalignment_range[axis]
-            size_text = f"{size * 1e3:.6g} mm" if axis < 2 else f"{np.rad2deg(size):.6g}°"
-            raise RayTracingError(
-                f"state {state}: {DEGREES_OF_FREEDOM[axis]} = {value:.6g} of the range "
-                f"({size_text}): must be between -1 and 1"
-            )
-        return np.stack([self._trace(number, state) for number, state in enumerate(states)])
+        return np.stack([self._trace(*state) for state in enumerate(misalignments)])
 
-    def _trace(self, number: int, state: np.ndarray) -> np.ndarray:
-        """Return the coefficients (F, J) of one state, whose number messages name."""
+    def _trace(self, number: int, misalignment: np.ndarray) -> np.ndarray:
+        """Return the coefficients (F, J) of one misalignment, whose number messages name."""
         rays = self._rays.copy()
-        misalign(self.optic, state * self.misalignment_range).trace(rays)
+        misalign(self.optic, misalignment).trace(rays)
         is_stopped = (rays.vignetted | rays.failed).reshape(len(self.field_rad), -1)
         if is_stopped.any():
             is_vignetted = is_stopped.any(axis=1)

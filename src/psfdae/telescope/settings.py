@@ -23,7 +23,7 @@ from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
 from psfdae.reading import read_yaml
 from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, validate
-from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
+from psfdae.telescope.aberrations import Jitter, Raytraced, Seidel, Zernike
 
 
 class Telescope(Group):
@@ -68,7 +68,7 @@ class Prior(Group):
     fraction: Annotated[float, Field(ge=0, le=10)] = Field(
         default=0.1, description="Relative standard deviation of every term"
     )
-    waves: Annotated[float, Field(ge=0, le=100)] | None = Field(
+    waves: Jitter | None = Field(
         default=None, description="Standard deviation in waves besides; null: jitter_waves"
     )
     defocus_m: Positive = Field(

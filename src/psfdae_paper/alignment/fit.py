@@ -14,8 +14,8 @@ import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae.sensing.climbing import Peaks, Steps, climb
-from psfdae.telescope.raytracing import DEGREES_OF_FREEDOM
 from psfdae_paper.alignment.fisher import Stamps, deviance_and_information
+from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.alignment import Fit
 
 ROUNDING = 1e-6
