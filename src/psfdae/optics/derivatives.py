@@ -27,13 +27,7 @@ from typing import Protocol
 
 import numpy as np
 
-from psfdae.optics.propagation import (
-    Precision,
-    complex_field,
-    image_points,
-    in_batches,
-    real_dtype_of,
-)
+from psfdae.optics.propagation import Precision, complex_field, image_points, in_batches, real_dtype
 from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
 from psfdae.optics.seeing import WholePeriod
 from psfdae.optics.wavefronts import (
@@ -102,7 +96,7 @@ class PointSampling(SeparableSampling):
     product_cost = 0.1
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
-        self.dtype = real_dtype_of(precision)
+        self.dtype = real_dtype(precision)
         half, even_weights, odd_weights = image_points(pupil, stamp_px, pixel)
         # Cosines and sines over half of the pupil. The middle sample of an odd grid is its own
         # mirror image and counts once.
@@ -167,6 +161,7 @@ class PeriodSampling(SeparableSampling, WholePeriod):
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         super().__init__(pupil, precision)
+        # Lags between samples, as frequencies of the image in cycles per λ/D.
         samples = pupil.axis.size
         lags = np.arange(1 - samples, samples)
         frequency = 0.5 * pupil.spacing * lags
@@ -212,11 +207,13 @@ class ModalStamps:
         self._sampling = sampling
         self._pixel = pixel
         self._axis = pupil.axis.astype(dtype)
+        # Images of the modes as rows of a matrix, and √light-normalised transmission.
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
         degrees, coefficients = legendre_expansion(modes)
         self._coefficients = coefficients.astype(dtype)
+        # Modes as Legendre products (a, b), whose fields are the cheap ones.
         self._products = [*map(tuple, degrees)]
         # Degrees along y that go with each degree along x; the constant first, it is the field.
         self._degrees = [
@@ -239,6 +236,7 @@ class ModalStamps:
             Fraction of the light through the pupil on each pixel.
         """
         sampling = self._sampling
+        # The field by two products of matrices, and the light on the pixels from its intensity.
         (rows,) = sampling.along_x(self._pupil_fields(coefficients, offset_px))
         (field,) = sampling.along_y(rows)
         return sampling.to_pixels(field.real**2 + field.imag**2)
@@ -289,6 +287,7 @@ class ModalStamps:
         fields[:, 0] = pupil_fields
         opd = (directions @ self._modes).reshape(*directions.shape[:2], *shape)
         np.multiply(pupil_fields[:, None], opd, out=fields[:, 1:])
+        # All of them are propagated as one batch.
         (rows,) = sampling.along_x(fields.reshape(-1, *shape))
         (images,) = sampling.along_y(rows)
         images = images.reshape(*fields.shape[:2], *images.shape[1:])
@@ -304,10 +303,12 @@ class ModalStamps:
         sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
         for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
+            # P_a(x) along x serves all P_b(y) that go with it; P_0 P_0 is the field itself.
             changes = sampling.along_y(rows, self._degrees[a])
             if a == 0:
                 image = changes[0]
             for b, change in zip(self._degrees[a], changes, strict=True):
+                # Im E Re G − Re E Im G, as by direction; kept as pixels, which are fewer.
                 slope = image.imag * change.real - image.real * change.imag
                 slopes[a, b] = sampling.to_pixels(slope)
         # Slopes along a direction are those of the products times their coefficients in it.
@@ -375,7 +376,7 @@ class SampledStamps:
         self.stamp_px, self.pixel, self.sizes, self.reach = stamp_px, pixel, tuple(sizes), reach
         self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
         self._precision, self._batch, self._threads = precision, batch, threads
-        self._dtype = real_dtype_of(precision)
+        self._dtype = real_dtype(precision)
         self._slopes = mode_slopes(modes)
         self._operators: dict[int, ModalStamps] = {}
 
@@ -402,6 +403,7 @@ class SampledStamps:
         half = np.array([-0.5, 0.5]) * self.stamp_px
         edges = (offset_px[:, ::-1, None] + half) * self.pixel
         edges = edges + np.array([-self.reach, self.reach])
+        # The sampling guard chooses by the slopes of each wavefront.
         needed = required_samples(slope_ranges(self._slopes, coefficients), edges)
         return choose_samples(needed, self.sizes)
 
@@ -436,17 +438,14 @@ class SampledStamps:
 
         def differentiate(operator: ModalStamps, batch: np.ndarray) -> None:
             offset = None if offset_px is None else offset_px[batch]
-            stamps[batch], slopes[batch] = operator.derivatives(
-                coefficients[batch], directions[batch], offset, by_position
-            )
+            wavefronts = coefficients[batch], directions[batch], offset
+            stamps[batch], slopes[batch] = operator.derivatives(*wavefronts, by_position)
 
         samples = self.samples(coefficients, offset_px) if samples is None else samples
         self._run(differentiate, samples, max(1, self._batch // count))
         return stamps, slopes
 
-    def _run(
-        self, work: Callable[[ModalStamps, np.ndarray], None], samples: np.ndarray, size: int
-    ) -> None:
+    def _run(self, work: Callable[..., None], samples: np.ndarray, size: int) -> None:
         """Call `work` with the operator and the numbers of each batch of wavefronts."""
         in_batches(samples, size, self._threads, lambda n: partial(work, self.operator(n)))
 
@@ -464,6 +463,7 @@ def normalise_with_derivatives(
         (∂p − (p/f) ∂f)/f; each sums to 0.
     flux : ndarray, shape (...)
     """
+    # Derivative of the quotient p/f.
     flux = stamps.sum(axis=(-2, -1))
     normalised = stamps / flux[..., None, None]
     flux_slope = derivatives.sum(axis=(-2, -1))[..., None, None]

@@ -41,7 +41,7 @@ EXTRA_POINTS = 6
 """Points beyond two per λ/D; they integrate a wave to 5e-4 of a pixel's width."""
 
 
-def real_dtype_of(precision: Precision) -> np.dtype:
+def real_dtype(precision: Precision) -> np.dtype:
     """Return float32 or float64, the type of the real part in a precision."""
     return np.empty(0, precision).real.dtype
 
@@ -149,7 +149,7 @@ class StampPropagator:
             raise ValueError(f"optics.backend = {backend!r}: expected 'numpy' or 'torch'")
         self.stamp_px = stamp_px
         self.pixel = pixel
-        self.real_dtype = real_dtype_of(precision)
+        self.real_dtype = real_dtype(precision)
         self._half = half = (pupil.axis.size + 1) // 2
         # Cosines and sines from the pupil's columns to the points along x.
         points, even_weights, odd_weights = image_points(pupil, stamp_px, pixel, extra)

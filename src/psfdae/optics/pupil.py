@@ -76,6 +76,7 @@ def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
     ndarray, shape (M, M), float64
         Coverage, 0 … 1.
     """
+    # By symmetry, distances from the centre are all that counts.
     x = np.abs(pupil_axis(samples, guard))
     half = 1.0 / samples
     # Distance of the nearest and of the farthest point of each cell from the centre.
@@ -118,6 +119,7 @@ def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pup
     """
     if not 0.0 <= obscuration < 1.0:
         raise ValueError(f"obscuration = {obscuration} is outside [0, 1)")
+    # Lit part of every cell: the outer disc less the central obscuration.
     grey = disc_coverage(samples, 1.0, guard=1)
     if obscuration:
         grey = grey - disc_coverage(samples, obscuration, guard=1)

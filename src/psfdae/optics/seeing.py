@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfdae.optics.propagation import Precision, complex_field, real_dtype_of
+from psfdae.optics.propagation import Precision, complex_field, real_dtype
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import legendre
 
@@ -46,6 +46,7 @@ class Profile:
     @property
     def scale(self) -> float:
         """Core radius a, or the Gaussian's standard deviation, in λ/D."""
+        # Half of the maximum at half of the FWHM.
         if self.beta is None:
             return float(self.fwhm / np.sqrt(8.0 * np.log(2.0)))
         return float(0.5 * self.fwhm / np.sqrt(2.0 ** (1.0 / self.beta) - 1.0))
@@ -91,6 +92,7 @@ class Broadening:
             replace(self.profile, fwhm=self.profile.fwhm * np.exp(change)).transfer(frequency)
             for change in (step, -step)
         )
+        # d/d ln(width), because the widths are scaled by exp(± step).
         return np.asarray((broad - narrow) / (2.0 * step))
 
 
@@ -110,7 +112,7 @@ class WholePeriod:
     def __init__(self, pupil: Pupil, precision: Precision) -> None:
         from scipy import fft  # here, because every configuration knows the profiles
 
-        self.dtype = real_dtype_of(precision)
+        self.dtype = real_dtype(precision)
         self._axis = pupil.axis
         # Twice as many points as samples determine the intensity.
         self.points = fft.next_fast_len(2 * pupil.axis.size)
@@ -127,12 +129,15 @@ class WholePeriod:
         """Return fields (B, ., .) times Legendre polynomials, transformed along an axis."""
         from scipy import fft
 
+        # Zeros behind the pupil's samples, up to the number of points.
         shape = [len(degrees), *fields.shape]
         shape[axis] = self.points
         padded = np.zeros(shape, fields.dtype)
+        # The axis that is transformed comes last.
         along = padded if axis == -1 else padded.swapaxes(-1, -2)
         lit = along[..., : len(self._axis)]
         values = fields if axis == -1 else fields.swapaxes(-1, -2)
+        # P_0 = 1 needs no product.
         if max(degrees):
             weights = legendre(degrees, self._axis).astype(self.dtype)
             np.multiply(values, weights[:, None, None], out=lit)
@@ -218,6 +223,7 @@ class BlurredPropagator:
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, moved by (B, 2) pixels."""
         offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
+        # Field of the pupil, field at the points of a period, and blurred pixels of each star.
         stamps = []
         for waves, offset in zip(opd, offset_px, strict=True):
             phase = (2.0 * np.pi) * waves.astype(self.real_dtype)

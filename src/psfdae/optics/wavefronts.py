@@ -80,6 +80,7 @@ def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (8, ...)
     """
+    # In the order of `MONOMIALS`.
     x, y = np.broadcast_arrays(x, y)
     r2 = x**2 + y**2
     return np.stack([r2**2, r2 * x, r2 * y, x**2, x * y, y**2, x, y])
@@ -110,6 +111,7 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 def radial_polynomial(n: int, m: int, r: np.ndarray) -> np.ndarray:
     """Return Zernike's R_n^|m|(r), 1 at r = 1."""
     m = abs(m)
+    # Σ_k (−1)^k (n−k)! / (k! ((n+m)/2−k)! ((n−m)/2−k)!) r^(n−2k), as two binomials.
     polynomial: np.ndarray = sum(
         (-1) ** k * comb(n - k, k) * comb(n - 2 * k, (n - m) // 2 - k) * r ** (n - 2 * k)
         for k in range((n - m) // 2 + 1)
@@ -132,6 +134,7 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     -------
     ndarray of the broadcast shape of x and y
     """
+    # √(n+1) R_n⁰ for m = 0, else √(2(n+1)) R_n^m times cos mθ or sin mθ.
     n, m = noll_to_nm(j)
     r, theta = np.hypot(x, y), np.arctan2(y, x)
     if m == 0:
@@ -166,6 +169,7 @@ def field_coefficients(
     ndarray, shape (F, J)
         In waves.
     """
+    # Σ waves x^a y^b of every term; a term without powers is 0.
     x, y = field[:, 0], field[:, 1]
     terms = [
         sum((waves * x**a * y**b for (a, b), waves in polynomial.items()), np.zeros(len(field)))

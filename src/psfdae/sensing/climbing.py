@@ -113,9 +113,11 @@ def combine_images(
     """
     count, images, k = score.shape
     size = shared + images * (k - shared)
+    # Likelihoods multiply: scores and informations of independent images add up.
     total_score = np.zeros((count, size))
     total_information = np.zeros((count, size, size))
     for image in range(images):
+        # Places of this image's parameters among all.
         first = shared + image * (k - shared)
         columns = np.r_[0:shared, first : first + k - shared]
         total_score[:, columns] += score[:, image]
@@ -146,6 +148,7 @@ def climb(
         Number of the posterior of each start; climbs far below the best of their group are given
         up.
     """
+    # All climbs begin together; those that arrive or are given up leave `active`.
     start = np.clip(np.asarray(start, np.float64), -limit, limit)
     active = np.arange(len(start))
     evaluations = np.ones(len(start), int)
@@ -209,6 +212,7 @@ def _damped_step(
     is_fixed = ((parameters >= limit) & (slope > 0)) | ((parameters <= -limit) & (slope < 0))
     information[is_fixed[:, :, None] | is_fixed[:, None, :]] = 0.0
     information[:, diagonal, diagonal] += is_fixed
+    # Its row and column are those of the unit matrix: its step is 0.
     step = np.linalg.solve(information, np.where(is_fixed, 0.0, slope)[:, :, None])[:, :, 0]
     return np.asarray(np.clip(parameters + step, -limit, limit) - parameters)
 

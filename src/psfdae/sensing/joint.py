@@ -52,8 +52,8 @@ class Joint:
         Numbers of the twin, if there is one.
     star : ndarray of int, shape (m,)
         Stars that took part.
-    deviance, deviance_limit : ndarray, shape (m,)
-        Deviance of each star, and the limit above which the state does not explain it.
+    disagrees : ndarray of bool, shape (m,)
+        True for stars whose deviance is above the limit: the state does not explain them.
     """
 
     model: TelescopeModel
@@ -63,13 +63,7 @@ class Joint:
     probability: float
     twin: np.ndarray | None
     star: np.ndarray
-    deviance: np.ndarray
-    deviance_limit: np.ndarray
-
-    @property
-    def disagrees(self) -> np.ndarray:
-        """True for stars that the state does not explain, (m,)."""
-        return self.deviance > self.deviance_limit
+    disagrees: np.ndarray
 
 
 class TelescopePosterior:
@@ -106,12 +100,14 @@ class TelescopePosterior:
 
     def relative_seeing(self, t: np.ndarray) -> float:
         """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
+        # The FWHM is the last number of the model.
         fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
         return float(fwhm / self._seeing.fwhm_arcsec)
 
     def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
         fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._seeing.fwhm_arcsec
+        # The same telescope but for its seeing.
         seeing = self._seeing.model_copy(update={"fwhm_arcsec": fwhm})
         telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
         optics = replace(self.optics, telescope=telescope)
@@ -123,6 +119,7 @@ class TelescopePosterior:
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
         """Return the derivatives of the coefficients of the stars by t, (m, Q, K)."""
+        # ∂c/∂t = σ ∂c/∂number, from [number, star, coefficient] to [star, number, coefficient].
         jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
         return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.stars])
 
@@ -133,6 +130,7 @@ class TelescopePosterior:
         impossible.
         """
         q, (count, size) = self.number_count, parameters.shape
+        # Parameters without an image keep a height of −∞.
         height, score = np.full(count, -np.inf), np.zeros((count, size))
         information = np.tile(np.eye(size), (count, 1, 1))
         for row, values in enumerate(parameters):
@@ -157,6 +155,7 @@ class TelescopePosterior:
         q, optics = self.number_count, self.optics
         t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.stars), 4)
         place = star_parameters[:, :2]
+        # Images of all stars, and derivatives by t, along the modes, and by the place.
         modes = optics.mode_coefficients(self.stars, self.coefficients(t), place)
         directions = self.slopes(t) @ optics.terms.to_modes[self.stars]
         stamps, slopes = optics.derivatives(modes, directions)
@@ -190,11 +189,12 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
         raise SensingError("the prior leaves nothing of the telescope free: its widths are 0")
     # The 500 explained stars with the most light in units of the sky's noise; the cost grows
     # with their number.
-    optics, best = search.optics, modes.best_modes
-    best = best.take(np.flatnonzero(search.is_explained(best)))
-    light = search.flux[best.star] * best.parameters[:, -2]
-    light = light / np.sqrt(search.photons.sky_counts[best.star])
-    stars = np.sort(best.star[np.argsort(-light, kind="stable")[:500]])
+    optics, best_modes = search.optics, modes.best_modes
+    best_modes = best_modes.take(np.flatnonzero(search.is_explained(best_modes)))
+    stars = best_modes.star
+    light = search.flux[stars] * best_modes.parameters[:, -2]
+    light = light / np.sqrt(search.photons.sky_counts[stars])
+    stars = np.sort(stars[np.argsort(-light, kind="stable")[:500]])
     if stars.size * 2 < model.sd.size or not stars.size:
         raise SensingError(
             f"{stars.size} stars that a wavefront explains are too few for "
@@ -233,22 +233,23 @@ def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     # Laplace's approximation: mass = height of the peak × √|covariance|.
     covariance = np.linalg.inv(peaks.information)
     evidence = peaks.height + 0.5 * np.linalg.slogdet(covariance)[1]
-    best = int(evidence.argmax())
-    state_covariance = covariance[best, : t.shape[1], : t.shape[1]]
+    best_peak = int(evidence.argmax())
+    state_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
     sigma = np.sqrt(np.diagonal(state_covariance))
     # Peaks that are more than a standard deviation from the best one share the probability.
-    twins = [m for m in range(len(t)) if m != best and np.abs((t[m] - t[best]) / sigma).max() > 1]
-    mass = np.exp(evidence - evidence[best])
+    twins = np.flatnonzero(np.abs((t - t[best_peak]) / sigma).max(axis=1) > 1)
+    # Masses relative to that of the best peak.
+    mass = np.exp(evidence - evidence[best_peak])
+    deviance = posterior.evaluate_stars(peaks.parameters[best_peak])[0]
     return Joint(
         model,
-        value=model.mean + model.sd * t[best],
+        value=model.mean + model.sd * t[best_peak],
         error=model.sd * sigma,
         correlation=state_covariance / sigma / sigma[:, None],
-        probability=float(1.0 / (1.0 + sum(mass[m] for m in twins))),
-        twin=model.mean + model.sd * t[twins[0]] if twins else None,
+        probability=float(1.0 / (1.0 + mass[twins].sum())),
+        twin=model.mean + model.sd * t[twins[0]] if twins.size else None,
         star=stars,
-        deviance=posterior.evaluate_stars(peaks.parameters[best])[0],
-        deviance_limit=posterior.search.photons.deviance_limit[stars],
+        disagrees=deviance > posterior.search.photons.deviance_limit[stars],
     )
 
 
@@ -288,8 +289,11 @@ def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
     A least-squares solution by Gauss–Newton steps: often no telescope has exactly these.
     """
     is_even = posterior.search.optics.terms.is_even
+    # Coefficients that the twin should have; those of odd terms stay.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
     for _ in range(MAX_ROUNDS):
+        # All coefficients of all stars are equations for the numbers; singular values below 1e-9
+        # are combinations of numbers that no coefficient shows.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)
         gap = (target - posterior.coefficients(t)).ravel()
         t = np.clip(t + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0], -MAX_Z, MAX_Z)

@@ -26,11 +26,11 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     # OPD of the most probable mode of each star, and of the model.
     summary, joint = wavefronts.summary, wavefronts.joint
     first = np.searchsorted(summary["star"], stars)
-    measured = _pupil_images(wavefronts, stars, summary["mean"][first])
+    measured = _pupil_opd(wavefronts, stars, summary["mean"][first])
     expected = wavefronts.terms.mean
     if joint is not None:
         expected = joint.model.coefficients(joint.value)
-    model = _pupil_images(wavefronts, stars, expected[stars])
+    model = _pupil_opd(wavefronts, stars, expected[stars])
     # Residuals in units of the sky's noise, less the median of each stamp.
     stamps, photons = wavefronts.stamps, wavefronts.search.photons
     residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
@@ -45,6 +45,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
         (model_name, model, peak, "RdBu_r", "OPD (waves)"),
         ("residuals of the stars", residual, 4.0, "Greys", "noise of the sky"),
     )
+    # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     # Each image fills a cell about the place of its star, with a gap to the next one.
@@ -79,6 +80,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
 def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
     """Return the brightest explained stars that are a cell or more from each other."""
     stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
+    # Brightest first: of stars in one cell, the brightest is drawn.
     stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
     # Rounding must not part stars of a regular grid.
     cell = (1.0 - 1e-6) * np.ptp(wavefronts.field_deg, axis=0).max() / CELLS
@@ -90,15 +92,17 @@ def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
     return np.array(separate, int)
 
 
-def _pupil_images(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return the OPD in waves over the pupil, without piston and tilts, (m, 48, 48).
 
     NaN where the pupil is not lit. `coefficients` (m, K) are in waves.
     """
+    # The lit annulus on a grid.
     axis = np.linspace(-1.0, 1.0, 48)
     x, y = axis[None, :], axis[:, None]
     radius = np.hypot(x, y)
     is_lit = (radius <= 1.0) & (radius >= wavefronts.telescope.obscuration)
+    # OPD Σ c_k T_kj M_j of each star.
     modes = wavefronts.terms.modes(x, y)[:, is_lit]
     opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ modes
     # Take out the plane that fits best.

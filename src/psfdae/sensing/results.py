@@ -67,6 +67,7 @@ def wavefront(
     >>> psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
     Wavefronts('refractor', 1 stars)
     """
+    # Telescope and stamps, read or converted where they are files or arrays.
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
     stamps = stars if isinstance(stars, Stamps) else _as_stamps(stars, noise, gain)
@@ -75,6 +76,7 @@ def wavefront(
         raise SensingError(
             f"field_deg of shape {angle.shape}, expected ({len(stamps)}, 2) finite numbers"
         )
+    # The posterior of each star by itself, and then the telescope that explains them together.
     try:
         terms = terms_of(telescope, angle)
         optics = StarOptics(telescope, terms, stamps.data.shape[-1])
@@ -96,12 +98,14 @@ def _as_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None
     SensingError
         If shapes do not fit, or noise or gain is not above 0.
     """
+    # Square stamps, one or more.
     data = np.asarray(stars, float)
     if data.ndim != 3 or data.shape[1] != data.shape[2] or not len(data):
         raise SensingError(f"stars of shape {data.shape}, expected (n, d, d)")
     count = len(data)
 
     def per_star(name: str, value: ArrayLike | None) -> np.ndarray:
+        # One number serves all stars; NaN stands for a number that is to be estimated.
         numbers = np.asarray(np.nan if value is None else value, float)
         if numbers.shape not in ((), (count,)):
             raise SensingError(
@@ -112,6 +116,7 @@ def _as_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None
             raise SensingError(f"{name}: expected numbers above 0")
         return np.broadcast_to(numbers, count).copy()
 
+    # Pixels that are not finite are bad; nothing is known of flux, sky and place.
     is_finite, unknown = np.isfinite(data), np.full(count, np.nan)
     return Stamps(
         data=np.where(is_finite, data, 0.0),
@@ -147,12 +152,13 @@ class Wavefronts:
 
     Examples
     --------
-    >>> found = psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
-    >>> found.explained
+    >>> angle = [[0.0, 0.0]]
+    >>> wavefronts = psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=angle, gain=1.0)
+    >>> wavefronts.explained
     array([ True])
-    >>> found.psf().shape
+    >>> wavefronts.psf().shape
     (1, 16, 16)
-    >>> found.table.colnames[8:12]
+    >>> wavefronts.table.colnames[8:12]
     ['z4', 'z4_error', 'z5', 'z5_error']
     """
 
@@ -201,6 +207,7 @@ class Wavefronts:
         """Mode that is nearest to every draw, (m, s), by the Mahalanobis distance."""
         nearest = np.empty(self.draws.shape[:2], int)
         for row, star in enumerate(self.star):
+            # Squared distance (x − μ)ᵀ C⁻¹ (x − μ) of all draws from all modes of the star.
             modes = np.flatnonzero(self.modes.star == star)
             gap = self.draws[row][None] - self.modes.parameters[modes][:, None]
             precision = np.linalg.inv(self.modes.covariance[modes])
@@ -235,6 +242,7 @@ class Wavefronts:
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
         """Return central intervals of the coefficients over all modes, (n, K, 2) in waves."""
+        # Quantiles at (1 ± probability)/2 leave out equal parts on both sides.
         half = 0.5 * probability
         ends = np.quantile(self.coefficients, [0.5 - half, 0.5 + half], axis=1)
         return self._for_all_stars(np.moveaxis(ends, 0, -1))
@@ -251,9 +259,11 @@ class Wavefronts:
         images = images.reshape(len(images), -1)
         fit = np.linalg.solve((planes * weight) @ planes.T, (planes * weight) @ images.T)
         images = images - fit.T @ planes
+        # Taking a plane off every mode takes it off every sum of modes.
         # Mean square of Σ c_j M_j over the pupil: cᵀ G c with the Gram matrix G of the modes.
         gram = (images * weight) @ images.T
         modes = np.einsum("msk,mkj->msj", self.coefficients, self.terms.to_modes[self.star])
+        # Rounding can make the square of a perfect wavefront negative.
         rms = np.sqrt(np.maximum(np.einsum("msi,ij,msj->ms", modes, gram, modes), 0.0))
         return self._for_all_stars(rms.mean(axis=1)), self._for_all_stars(rms.std(axis=1))
 
@@ -272,9 +282,11 @@ class Wavefronts:
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
+        # The star stands in the middle: its place is no part of the PSF.
         centred = np.zeros((self.draws.shape[1], 2))
         mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
+            # Smaller pixels hold less light: their values are those of a whole pixel.
             images = operator.stamps(self._pupil_modes(row, centred)) * oversampling**2
             mean[star], error[star] = images.mean(axis=0), images.std(axis=0)
         return mean, error
@@ -287,6 +299,7 @@ class Wavefronts:
         for row, star in enumerate(self.star):
             place, flux = self.draws[row, :, k : k + 2], self.draws[row, :, k + 2]
             images = self.search.optics.operator.stamps(self._pupil_modes(row, place))
+            # Fluxes of the draws, from units of the search to electrons to the stamps' unit.
             light = self.search.flux[star] * flux / self.search.photons.gain[star]
             model[star] = (light[:, None, None] * images).mean(axis=0)
         return model
@@ -305,6 +318,7 @@ class Wavefronts:
     @property
     def explained(self) -> np.ndarray:
         """True for stars that a mode explains, (n,)."""
+        # Stars without usable pixels have no mode and count as unexplained.
         explained = np.zeros(len(self.stamps), bool)
         explained[self.star] = self.search.is_explained(self.modes.best_modes)
         return explained
@@ -325,15 +339,16 @@ class Wavefronts:
         # Zero and unit of each parameter. Places count from the middle of the stamp, flux and sky
         # are in electrons, the sky in units of the root of its counts.
         gain = photons.gain[star]
-        ones = np.ones(len(star))
+        unit_px = np.ones(len(star))
         columns: dict[str, np.ndarray] = {}
         scales = {
-            "x": (self._corner(self.stamps.x) + 0.5 * (side - 1), ones),
-            "y": (self._corner(self.stamps.y) + 0.5 * (side - 1), ones),
+            "x": (self._corner(self.stamps.x) + 0.5 * (side - 1), unit_px),
+            "y": (self._corner(self.stamps.y) + 0.5 * (side - 1), unit_px),
             "flux": (np.zeros(len(star)), self.search.flux[star] / gain),
             "sky": (photons.sky_level[star], np.sqrt(photons.sky_counts[star]) / gain),
         }
         for index, (name, (zero, unit)) in enumerate(scales.items(), len(self.terms.names)):
+            # Mean and standard deviation over all modes.
             draws = self.draws[..., index]
             columns[name] = self._for_all_stars(zero + unit * draws.mean(axis=1))
             columns[f"{name}_error"] = self._for_all_stars(unit * draws.std(axis=1))
@@ -380,6 +395,7 @@ class Wavefronts:
             ("y_deg", self.field_deg[star, 1], "deg"),
         ]
         for k, name in enumerate(self.terms.names):
+            # Coefficients with the standard deviation of their mode.
             error = np.sqrt(summary["covariance"][:, k, k])
             columns.append((name, completed(summary["mean"][:, k]), "wave"))
             columns.append((f"{name}_error", completed(error), "wave"))

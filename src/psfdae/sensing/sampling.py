@@ -75,6 +75,7 @@ def sample_around(
             for low, high, rng in zip(bounds, bounds[1:], rngs, strict=False)
         ]
     )
+    # Chains of a posterior are neighbours.
     posterior = np.repeat(np.arange(posteriors), chains)
     mean, factor = mean[mode], CHAINS.reference_scale * np.linalg.cholesky(covariance)[mode]
 

@@ -98,6 +98,7 @@ class StarOptics:
         With `broadening`, the stamps are derivatives by the logarithm of the FWHM of the seeing.
         """
         telescope, blur = self.telescope, self.telescope.blur
+        # Points of the image for stamps without blur, its whole period for blurred ones.
         pixel = telescope.pixel / oversampling
         sampling: Callable[..., Sampling] = PointSampling
         if blur is not None:
@@ -133,6 +134,7 @@ class StarOptics:
         place_px : ndarray, shape (m, 2)
             Place (x, y) of the star from the middle of the stamp.
         """
+        # Terms are linear in the modes, by a matrix of each star's field.
         waves = np.einsum("mk,mkj->mj", coefficients, self.terms.to_modes[star])
         return np.concatenate([waves, place_px], axis=1)
 
@@ -146,9 +148,11 @@ class StarOptics:
         directions : ndarray, shape (m, k, J)
             Derivatives of the modes by k parameters; those by the place (x, y) are added.
         """
+        # Two parameters more, each of which is the coefficient of one of the last two modes.
         directions = np.pad(directions, ((0, 0), (0, 2), (0, 2)))
         directions[:, [-2, -1], [-2, -1]] = 1.0
         stamps, slopes = self.operator.derivatives(modes, directions)
+        # Counts are compared in double precision.
         slopes = slopes.reshape(*slopes.shape[:2], -1).astype(np.float64)
         return stamps.reshape(len(modes), -1).astype(np.float64), slopes
 
@@ -200,6 +204,7 @@ class Photons:
         # the sky's. N electrons have the variance N, so the sky counts are (gain · noise)².
         gain = np.where(np.isfinite(stamps.gain), stamps.gain, MOST_SKY**0.5 / noise)
         sky = np.clip((gain * noise) ** 2, LEAST_SKY, MOST_SKY)
+        # Counts of star and sky; pixels that are bad or saturated are not used.
         counts = gain[:, None, None] * (data - level[:, None, None]) + sky[:, None, None]
         counts = np.where(stamps.bad | stamps.saturated, np.nan, counts).reshape(len(data), -1)
         return cls(counts, sky, gain, level, noise)
@@ -263,6 +268,7 @@ class StarModes:
     @property
     def probability(self) -> np.ndarray:
         """Fraction of the mass of its star that each mode has, (M,)."""
+        # Masses relative to the best mode of the star do not underflow all together.
         mass = np.exp(self.evidence - group_maximum(self.evidence, self.star))
         return np.asarray(mass / np.bincount(self.star, mass)[self.star])
 
@@ -312,6 +318,7 @@ class WavefrontSearch:
         return np.asarray(modes.deviance <= self.photons.deviance_limit[modes.star])
 
     def _blocks(self, stars: np.ndarray) -> list[np.ndarray]:
+        # Memory grows with the number of pixels.
         size = max(1, int(STARS_AT_ONCE * (16 / self.optics.stamp_px) ** 2))
         return np.split(stars, range(size, stars.size, size))
 
@@ -337,12 +344,13 @@ class WavefrontSearch:
             modes = [separate_modes(join_modes([*modes, fresh]))]
             # The next round is for stars that are not explained, and for those that have got
             # another mode with a probability above 1 %: there may be more.
-            best = modes[0].best_modes
+            best_modes = modes[0].best_modes
             is_likely = modes[0].probability > 0.01
             likely_before = likely_modes
             likely_modes = np.bincount(modes[0].star, is_likely, likely_before.size)
-            has_more = likely_modes[best.star] > likely_before[best.star]
-            stars = np.intersect1d(stars, best.star[has_more | ~self.is_explained(best)])
+            has_more = likely_modes[best_modes.star] > likely_before[best_modes.star]
+            needs_more = has_more | ~self.is_explained(best_modes)
+            stars = np.intersect1d(stars, best_modes.star[needs_more])
         return modes[0]
 
     def _match_candidates(self, star: int, number: int, candidates: int, starts: int) -> np.ndarray:
@@ -360,15 +368,17 @@ class WavefrontSearch:
         flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
         value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
         shift = value.argmax(axis=1)
-        best = np.argsort(-value.max(axis=1), kind="stable")[:starts]
+        ranked = np.argsort(-value.max(axis=1), kind="stable")[:starts]
         if number == 0:
-            first_flux = flux[best[0], shift[best[0]]]
+            # The unit of flux, not below the noise of a pixel.
+            first_flux = flux[ranked[0], shift[ranked[0]]]
             self.flux[star] = max(first_flux, np.sqrt(self.photons.sky_counts[star]))
-        # A window that begins later in the wide stamp shows the star earlier.
-        row, column = np.divmod(shift[best], 2 * optics.search_px + 1)
+        # There are 2 · search_px + 1 shifts along each axis. A window that begins later in the
+        # wide stamp shows the star earlier.
+        row, column = np.divmod(shift[ranked], 2 * optics.search_px + 1)
         place = optics.search_px - np.stack([column, row], axis=1)
-        relative_flux = np.maximum(flux[best, shift[best]] / self.flux[star], 0.01)
-        return np.column_stack([z[best], place, relative_flux, np.zeros(best.size)])
+        relative_flux = np.maximum(flux[ranked, shift[ranked]] / self.flux[star], 0.01)
+        return np.column_stack([z[ranked], place, relative_flux, np.zeros(ranked.size)])
 
     def _match(self, star: int, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Fit the flux of candidates z (c, K) at S shifts; return it and its gain, (c, S).
@@ -384,8 +394,8 @@ class WavefrontSearch:
         stars = np.full(len(z), star)
         coefficients = optics.coefficients(stars, z)
         modes = optics.mode_coefficients(stars, coefficients, np.zeros((len(z), 2)))
-        wide = self._wide_operator.stamps(modes).astype(np.float64)
-        windows = np.lib.stride_tricks.sliding_window_view(wide, (side, side), axis=(1, 2))
+        wide_stamps = self._wide_operator.stamps(modes).astype(np.float64)
+        windows = np.lib.stride_tricks.sliding_window_view(wide_stamps, (side, side), axis=(1, 2))
         image = windows.reshape(-1, side**2)[:, used]
         image -= image.mean(axis=1, keepdims=True)
         # Least squares: flux = p·d/p·p, and χ² falls by flux p·d/σ², with σ² the sky's counts.
@@ -445,6 +455,7 @@ class WavefrontSearch:
             coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
             modes = optics.mode_coefficients(star, coefficients, np.clip(place, -reach, reach))
             stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
+            # The likelihood alone; no derivatives are needed.
             no_slopes = np.empty((len(star), 0, stamps.shape[1]))
             mean, no_slopes = self.expected_counts(star, stamps, no_slopes, parameters[:, k:])
             deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
@@ -452,6 +463,7 @@ class WavefrontSearch:
             # A star far from its stamp is impossible; a finite number keeps differences finite.
             return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
 
+        # A random stream for each star: its draws do not depend on the other stars.
         owner = np.searchsorted(stars, modes.star)
         rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
         mixture = modes.parameters, modes.covariance, modes.evidence
@@ -486,6 +498,7 @@ class WavefrontSearch:
             Place (x, y), flux and sky of each star, in the units of `StarModes`.
         """
         # μ = F f p + B + √B s, with the unit of flux F, the flux f and the sky s.
+        # The derivatives by flux and sky are F p and √B.
         flux, sky = self.flux[star, None], self.photons.sky_counts[star, None]
         sky_slope = np.broadcast_to(np.sqrt(sky), stamps.shape)
         mean = flux * star_parameters[:, 2:3] * stamps + sky + sky_slope * star_parameters[:, 3:]
@@ -507,6 +520,7 @@ def separate_modes(modes: StarModes) -> StarModes:
     Modes whose evidence is 12 below the best one of their star (6e-6 of its mass) are dropped.
     """
     is_likely = modes.evidence > group_maximum(modes.evidence, modes.star) - 12.0
+    # Modes of each star from the best on.
     separate: dict[int, list[int]] = {}
     order = np.lexsort((-modes.evidence, modes.star))
     for mode in order[is_likely[order]]:

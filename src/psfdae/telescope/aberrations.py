@@ -35,6 +35,7 @@ def _check_not_zero(value: float) -> float:
 
 
 Radius = Annotated[Finite, AfterValidator(_check_not_zero)]
+# Types of settings: two numbers along x and y, waves of scatter, and Sellmeier's three terms.
 Pair = tuple[Finite, Finite]
 Jitter = Annotated[float, Field(ge=0, le=100)]
 Resonances = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -65,6 +66,7 @@ class Lens(Group):
 
     @model_validator(mode="after")
     def _check_thickness(self) -> Lens:
+        # The front is above the back.
         thickness = self.front_vertex_m - self.back_vertex_m
         if not thickness > 0:
             raise ValueError(
@@ -108,6 +110,7 @@ class Prescription(Group):
     @model_validator(mode="after")
     def _check_path(self) -> Prescription:
         """Refuse lenses without a secondary or a glass, and surfaces in a wrong order."""
+        # Lenses need a secondary in front of them, and a glass.
         if self.lenses and self.secondary is None:
             raise ValueError(f"lenses = {list(self.lenses)}: must lie behind a secondary")
         if bool(self.lenses) != (self.glass is not None):
@@ -123,6 +126,7 @@ class Prescription(Group):
                 downwards.append((f"front of {name}", lens.front_vertex_m))
                 downwards.append((f"back of {name}", lens.back_vertex_m))
             downwards.append(focus)
+        # Each surface follows the one before in the direction of the light.
         for sign, path in ((1, upwards), (-1, downwards)):
             for (start, z_start), (end, z_end) in pairwise(path):
                 distance = sign * (z_end - z_start)
@@ -167,6 +171,7 @@ def _check_powers(term: dict[str, float]) -> dict[str, float]:
 def _check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
     """Return terms whose names are Zernike polynomials from z2 on."""
     for name in terms:
+        # z1 is piston, which no image shows.
         number = re.fullmatch(r"z([1-9]\d?)", name)
         if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
             raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
@@ -195,7 +200,7 @@ class Zernike(Group):
         description="Waves RMS by Noll index and power of the field: "
         "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
     )
-    jitter_waves: Jitter = Field(default=0.0, description="Scatter of every term of every star")
+    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -226,11 +231,12 @@ class Raytraced(Group):
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
         default=22, description="Highest Noll index of the wavefront"
     )
-    jitter_waves: Jitter = Field(default=0.0, description="Scatter of every term of every star")
+    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
 
     @property
     def misalignment(self) -> np.ndarray:
         """Decentre x, y in metres and tilt about x, y in radians of the secondary, shape (4,)."""
+        # Settings are in degrees, optics in radians.
         return np.array([*self.decentre_m, *np.deg2rad(self.tilt_deg)])
 
     @model_validator(mode="after")

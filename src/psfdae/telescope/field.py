@@ -79,9 +79,11 @@ def static_zernikes(
     """
     aberrations = telescope.aberrations
     if isinstance(aberrations, Zernike):
+        # Polynomials of the field.
         field = relative_field(telescope, angle_deg)
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
     assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
+    # The ray trace of the telescope as its file states it.
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
     defocus_m, misalignment = aberrations.defocus_m, aberrations.misalignment
     return noll, trace_zernikes(telescope, angle_deg, defocus_m, misalignment)
@@ -137,6 +139,7 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
         mean = np.tile(aberrations.coefficients[: len(names)], (len(field), 1))
     else:
         jitter = aberrations.jitter_waves
+        # Each Zernike polynomial is a term and a mode.
         noll, mean = static_zernikes(telescope, angle_deg)
         visible = [k for k, j in enumerate(noll) if j >= FIRST_NOLL]
         if not visible:
@@ -183,6 +186,7 @@ class TelescopeModel:
         """
         slopes = []
         for axis, step in enumerate(0.01 * self.sd):
+            # One number at a time.
             shift = np.where(np.arange(self.sd.size) == axis, step, 0.0)
             change = self.coefficients(numbers + shift) - self.coefficients(numbers - shift)
             slopes.append(change / (2.0 * step))
@@ -220,6 +224,7 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
         model = _linear_model(names, mean, basis, prior.fraction, waves)
     else:
         model = _ray_traced_model(telescope, aberrations, angle_deg)
+    # The FWHM of the seeing is added if the prior leaves it free.
     if seeing is None or not prior.seeing:
         return model
     return TelescopeModel(
@@ -247,6 +252,7 @@ def _linear_model(
     fraction, waves : float
         Standard deviation of the numbers: relative to the mean, and in waves, in quadrature.
     """
+    # Prior of the numbers; those without a width are constants.
     sd = np.hypot(fraction * np.abs(mean), waves)
     is_free = sd > 0
     fixed = np.tensordot(mean[~is_free], basis[~is_free], 1)
@@ -266,6 +272,7 @@ def _ray_traced_model(
     """Return the model of a ray-traced telescope: defocus, and secondary or optical axis."""
     prior, defocus_m = telescope.prior, aberrations.defocus_m
     if aberrations.prescription.secondary is not None:
+        # Misalignments are in metres and radians, numbers in metres and degrees.
         to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
         return TelescopeModel(
             ("defocus", "decentre_x", "decentre_y", "tilt_x", "tilt_y"),
@@ -274,6 +281,7 @@ def _ray_traced_model(
             np.array([prior.defocus_m, *[prior.decentre_m] * 2, *[prior.tilt_deg] * 2]),
             lambda t: trace_zernikes(telescope, angle_deg, t[0], to_radians * t[1:]),
         )
+    # Without a secondary, the optical axis may be off the middle of the field.
     return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),

@@ -120,6 +120,7 @@ class ZernikeTracer:
 
     def _trace(self, number: int, misalignment: np.ndarray) -> np.ndarray:
         """Return the coefficients (F, J) of one misalignment, whose number messages name."""
+        # The trace changes the rays in place.
         rays = self._rays.copy()
         misalign(self.optic, misalignment).trace(rays)
         is_stopped = (rays.vignetted | rays.failed).reshape(len(self.field_rad), -1)
@@ -222,6 +223,7 @@ def build_optic(
         ]
         return batoid.Lens(surfaces, name=name, medium=glass)
 
+    # Media on both sides of the surfaces of lenses.
     vacuum = batoid.ConstMedium(1.0)
     glass = prescription.glass and batoid.SellmeierMedium(
         *prescription.glass.sellmeier_b, *prescription.glass.sellmeier_c_um2
@@ -240,6 +242,7 @@ def build_optic(
         aperture = clear(prescription.secondary.clear_radius_m)
         items.append(mirror(prescription.secondary, "M2", aperture))
     items += [lens(*item) for item in prescription.ordered_lenses]
+    # Detector and entrance pupil, planes across the axis.
     detector = at(prescription.best_focus_m + light_direction * defocus_m)
     items.append(batoid.Detector(batoid.Plane(), name="D", coordSys=detector, obscuration=None))
     entrance_pupil = batoid.Interface(

@@ -71,18 +71,11 @@ class Prior(Group):
     waves: Jitter | None = Field(
         default=None, description="Standard deviation in waves besides; null: jitter_waves"
     )
-    defocus_m: Positive = Field(
-        default=1e-4,
-        description="Of a ray trace: standard deviation of the detector's distance from focus",
-    )
-    decentre_m: Positive = Field(
-        default=1e-3, description="Likewise, of the secondary's decentre along x and y"
-    )
-    tilt_deg: Positive = Field(default=0.1, description="Likewise, of its tilt about x and y")
+    defocus_m: Positive = Field(default=1e-4, description="Of a ray trace: σ of the defocus")
+    decentre_m: Positive = Field(default=1e-3, description="σ of the secondary's decentre, x and y")
+    tilt_deg: Positive = Field(default=0.1, description="σ of the secondary's tilt about x and y")
     seeing: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.0,
-        description="Relative standard deviation of the seeing's FWHM, fitted to all stars "
-        "together; 0: as given",
+        default=0.0, description="Relative σ of the seeing's FWHM in a joint fit; 0: as given"
     )
 
 
@@ -118,6 +111,7 @@ class OwnTelescope(Telescope):
         """Profile of the seeing, in λ/D."""
         if self.seeing is None:
             return None
+        # The seeing on the sky in the units of pixels.
         fwhm = pixel_width(self.seeing.fwhm_arcsec, self.diameter_m, self.wavelength_m)
         return Profile(fwhm, self.seeing.beta)
 
@@ -182,6 +176,7 @@ def _composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, An
     """
     if path in including:
         raise ConfigError(f"{path}: defaults: it names itself")
+    # The file without the list of those that it includes.
     tree = read_yaml(path)
     entries = tree.pop("defaults", [])
     if not isinstance(entries, list):
@@ -195,6 +190,7 @@ def _composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, An
         match = re.fullmatch(pattern, str(text))
         if match is None:
             raise ConfigError(f"{path}: defaults: {entry!r}: must be NAME or /GROUP@KEY: NAME")
+        # Content of the entry: the file itself, or another file, under its key if it has one.
         part = tree
         if text != "_self_":
             folder = path.parent.parent / match["group"] if match["group"] else path.parent
