@@ -87,7 +87,7 @@ class SeparableSampling:
 
 
 class PointSampling(SeparableSampling):
-    """The points of `image_points` on both sides of the chief ray, with its parameters.
+    """Points of `image_points` on both sides of the chief ray, with its parameters.
 
     Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
     meet cosines or sines, so that products are real and a quarter as large.
@@ -207,13 +207,13 @@ class ModalStamps:
         self._sampling = sampling
         self._pixel = pixel
         self._axis = pupil.axis.astype(dtype)
-        # Images of the modes as rows of a matrix, and √light-normalised transmission.
+        # Images of the modes as rows of a matrix, and the transmission for a whole light of 1.
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
         degrees, coefficients = legendre_expansion(modes)
         self._coefficients = coefficients.astype(dtype)
-        # Modes as Legendre products (a, b), whose fields are the cheap ones.
+        # Degrees (a, b) of the Legendre products in the modes.
         self._products = [*map(tuple, degrees)]
         # Degrees along y that go with each degree along x; the constant first, it is the field.
         self._degrees = [

@@ -147,7 +147,7 @@ class TelescopePosterior:
                 information[row, range(q, size), range(q, size)] += 1e-9
         return height, score, information
 
-    def evaluate_stars(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
         """Return deviance (m,), score (m, Q + 4) and information of every star by itself.
 
         They are derivatives by the Q numbers of the telescope and the four of the star.
@@ -186,7 +186,7 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
         If the prior fixes all numbers, or there are fewer stars than half the numbers.
     """
     if not model.sd.size:
-        raise SensingError("the prior leaves nothing of the telescope free: its widths are 0")
+        raise SensingError("the prior fixes all numbers of the telescope: there is nothing to fit")
     # The 500 explained stars with the most light in units of the sky's noise; the cost grows
     # with their number.
     optics, best_modes = search.optics, modes.best_modes

@@ -58,8 +58,8 @@ class Secondary(Mirror):
 class Lens(Group):
     """Lens with two spherical surfaces; light meets the front first."""
 
-    front_radius_m: Radius = Field(description="Radius of curvature, > 0: centre above vertex")
-    back_radius_m: Radius = Field(description="Radius of the back, likewise")
+    front_radius_m: Radius = Field(description="Radius of the front, > 0: centre above vertex")
+    back_radius_m: Radius = Field(description="Radius of the back, > 0: centre above vertex")
     front_vertex_m: Finite = Field(description="z of the front vertex")
     back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
     clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
@@ -80,7 +80,7 @@ class Glass(Group):
     """Glass by Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
 
     sellmeier_b: Resonances = Field(description="Strengths of the three resonances")
-    sellmeier_c_um2: Resonances = Field(description="Their squared wavelengths, in µm²")
+    sellmeier_c_um2: Resonances = Field(description="Squared wavelengths of the resonances, µm²")
 
 
 class Prescription(Group):
@@ -140,7 +140,7 @@ class Prescription(Group):
 class Seidel(Group):
     """Static third-order aberrations in waves at H = 1."""
 
-    kind: Literal["seidel"] = Field(description="Tells which keys follow")
+    kind: Literal["seidel"] = Field(description="Kind of aberrations; decides the other keys")
     spherical: Finite = Field(description="W040, waves")
     coma: Finite = Field(description="W131, waves")
     astigmatism: Finite = Field(description="W222, waves")
@@ -193,7 +193,7 @@ class Zernike(Group):
     disc. The field vector (x, y) has length 1 at `field_edge_deg`.
     """
 
-    kind: Literal["zernike"] = Field(description="Tells which keys follow")
+    kind: Literal["zernike"] = Field(description="Kind of aberrations; decides the other keys")
     terms: Annotated[
         dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(_check_noll)
     ] = Field(
@@ -219,14 +219,14 @@ class Zernike(Group):
 class Raytraced(Group):
     """Aberrations of a telescope that a ray trace computes (batoid)."""
 
-    kind: Literal["raytraced"] = Field(description="Tells which keys follow")
+    kind: Literal["raytraced"] = Field(description="Kind of aberrations; decides the other keys")
     prescription: Prescription
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
         default=0.0, description="Distance of the detector beyond best focus"
     )
-    decentre_m: Pair = Field(default=(0.0, 0.0), description="Of the secondary, along x and y")
+    decentre_m: Pair = Field(default=(0.0, 0.0), description="Decentre of the secondary, x and y")
     tilt_deg: Pair = Field(
-        default=(0.0, 0.0), description="Of the secondary about its vertex, about x and y"
+        default=(0.0, 0.0), description="Tilt of the secondary about its vertex, about x and y"
     )
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
         default=22, description="Highest Noll index of the wavefront"

@@ -71,7 +71,7 @@ class Prior(Group):
     waves: Jitter | None = Field(
         default=None, description="Standard deviation in waves besides; null: jitter_waves"
     )
-    defocus_m: Positive = Field(default=1e-4, description="Of a ray trace: σ of the defocus")
+    defocus_m: Positive = Field(default=1e-4, description="σ of the detector's defocus (ray trace)")
     decentre_m: Positive = Field(default=1e-3, description="σ of the secondary's decentre, x and y")
     tilt_deg: Positive = Field(default=0.1, description="σ of the secondary's tilt about x and y")
     seeing: Annotated[float, Field(ge=0, le=0.3)] = Field(
