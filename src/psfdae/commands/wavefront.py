@@ -19,7 +19,7 @@ from psfdae.image.tables import fits_values
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.options import File
 from psfdae.sensing.joint import Joint
-from psfdae.sensing.results import NANOMETRE, Wavefronts
+from psfdae.sensing.results import Wavefronts
 from psfdae.sensing.results import wavefront as sensed
 from psfdae.sensing.stars import SensingError
 from psfdae.telescope.settings import OwnTelescope, read_telescope
@@ -228,7 +228,7 @@ def report(found: Wavefronts) -> list[str]:
     terms, summary = found.terms, found.summary
     first = np.flatnonzero(np.diff(summary["star"], prepend=-1))
     error = np.sqrt(np.einsum("mkk->mk", summary["covariance"][first]))
-    nm = found.telescope.wavelength_m / NANOMETRE
+    nm = found.wavelength_nm
     two = np.mean(summary["probability"][first] < 0.95)
     rms = nm * np.nanmedian(found.rms[0])
     lines = [
