@@ -21,7 +21,7 @@ from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
-from psfdae.commands.from_stars import _alone
+from psfdae.commands.from_stars import _locked
 from psfdae.files import read_product, write_product
 from psfdae.image.observation import Source
 from psfdae.image.selection import collect
@@ -288,8 +288,8 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.from_stars import _alone\n"
-        "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+        "from psfdae.commands.from_stars import _locked\n"
+        "with _locked(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
@@ -298,7 +298,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         message = refused("from-stars", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
-    with _alone(out):
+    with _locked(out):
         assert [path.name for path in out.iterdir()] == [".from_stars.lock"]
     assert not out.exists()
 
