@@ -265,7 +265,7 @@ def predict_image(
 
 
 def check_targets(
-    inputs: Sequence[object], out: Path, *others: Path | None, overwrite: bool
+    inputs: Sequence[object], out: Path, *other_outputs: Path | None, overwrite: bool
 ) -> None:
     """Refuse outputs that exist, unless `overwrite` is set or a killed run left them.
 
@@ -275,7 +275,7 @@ def check_targets(
         All that the command reads.
     out : Path
         The output that gets its name last.
-    others : Path or None
+    other_outputs : Path or None
         Outputs that may be there already if a run was killed.
 
     Raises
@@ -283,7 +283,7 @@ def check_targets(
     OutputError, PredictionError
         If a path is an input, a folder or an existing file, or two outputs have the same name.
     """
-    targets = [out, *filter(None, others)]
+    targets = [out, *filter(None, other_outputs)]
     check_outputs(targets, inputs)
     replaceable = overwrite or (not out.exists() and interrupted(out))
     for target in targets:
