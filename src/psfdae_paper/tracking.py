@@ -243,7 +243,7 @@ def _of_stars(
         metrics=metrics,
         data=stars,
         fit=Fit(kind, model) if kind.packing else None,
-        epochs=_epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
+        epochs=_epochs(fits.path_beside(kind, model, HISTORY), "train_mse", "validation_mse")
         if trained
         else (),
     )
@@ -268,7 +268,7 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """Files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
     more = fits.storage_of(kind).diagnostics
-    return model | {name: fits.beside(kind, place, name) for name in more}
+    return model | {name: fits.path_beside(kind, place, name) for name in more}
 
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:

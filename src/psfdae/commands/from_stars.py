@@ -396,7 +396,7 @@ def _fit_methods(
         print(f"fitting {method_class.look.label}")
         place = files.fit(method_class)
         # A network keeps its state here while it trains, for the case that it is killed.
-        checkpoint = fits.beside(method_class, place, "checkpoint.pt")
+        checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
         fit = fitted_to(stars, method_class, checkpoint)
         fits.store(fit, place, described(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)
