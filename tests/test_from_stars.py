@@ -32,7 +32,7 @@ from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
 from psfdae.model.star_sets import split_stars
 from psfdae.model.validation import Report
-from psfdae.moments import moved
+from psfdae.moments import shift_stamps
 from psfdae.noise import NoiseModel, OwnNoise
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
@@ -216,8 +216,10 @@ def test_own_noise_is_what_moving_and_dividing_leave_of_it():
     sky, background = 0.004, 1.0
     rms = np.sqrt(sky**2 + sky / background**0.5 * wide)
     phase = rng.uniform(-0.5, 0.5, (count, 2))
-    noise = moved(rms * rng.normal(size=(count, 24, 24)), phase)
-    clean, noisy = (cut(moved(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise))
+    noise = shift_stamps(rms * rng.normal(size=(count, 24, 24)), phase)
+    clean, noisy = (
+        cut(shift_stamps(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise)
+    )
     error = noisy / noisy.sum((1, 2), keepdims=True) - clean / clean.sum((1, 2), keepdims=True)
     found = error.reshape(count, -1).T @ error.reshape(count, -1)
     everyone, alone = np.arange(count), np.full(count, sky)

@@ -117,11 +117,15 @@ class BundleInfo(_Described):
 
     @property
     def kappa(self) -> float:
-        """Noise at the noise level λ = 1 of the training; 0 where a description lacks it."""
+        """Noise at the noise level λ = 1 of the training.
+
+        Where it is not stated: 1 for a network, which needs no λ, and 0, which is refused, for
+        other methods.
+        """
         try:
             return float(self.config["train"]["noise"]["kappa"])
         except (LookupError, TypeError, ValueError):
-            return 1.0 if self.dae else 0.0  # the network is given no λ
+            return 1.0 if self.dae else 0.0
 
     @property
     def adapted(self) -> str | None:
