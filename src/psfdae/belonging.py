@@ -17,16 +17,12 @@ from psfdae.reading import read_yaml
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-STATIC = (
-    *("scene.name", "telescope", "framing.stamp_px", "framing.jitter_px", "framing.tie"),
-    *("grid", "wavefront"),
-)
+FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
+STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
 """Configuration keys that decide the static PSFs of a scene."""
 
-STARS = (
-    *STATIC,
-    *("framing.subpixel", "telescope.aberrations.jitter_waves", "stars.aberration_fraction"),
-)
+RANDOM_PARTS = ("telescope.aberrations.jitter_waves", "stars.aberration_fraction")
+STARS = (*STATIC, "framing.subpixel", *RANDOM_PARTS)
 """Configuration keys that decide the kind of stars; sets of one kind differ by seed and name."""
 
 SAME_STARS = ("seed", "stars.name", "stars.count")
@@ -74,13 +70,12 @@ def require(
         group, expected_group = _at(config, key), _at(tree, key)
         names, subgroups = [key], set()
         if isinstance(group, Mapping) and isinstance(expected_group, Mapping):
-            of_group, of_expected = (
-                {name for name in side if isinstance(side[name], Mapping)}
-                for side in (group, expected_group)
-            )
             # If both sides state one part of a group by itself, such as aberrations, they state
             # all of its parts: then a part that one side lacks differs.
-            subgroups = of_group | of_expected if of_group & of_expected else set()
+            of_group = {name for name, value in group.items() if isinstance(value, Mapping)}
+            expected_of_group = {k for k, v in expected_group.items() if isinstance(v, Mapping)}
+            if of_group & expected_of_group:
+                subgroups = of_group | expected_of_group
             compared = ({*group} & {*expected_group} | subgroups) - UNCOMPARED_KEYS
             names = [f"{key}.{name}" for name in sorted(compared)]
         for name in names:
@@ -90,10 +85,8 @@ def require(
                 continue
             difference = _difference(name, value, expected_value)
             if difference is not None:
-                dotted, value, expected_value = difference
-                raise ProductError(
-                    f"{path}: {dotted} = {value}, but {expected_from} has {expected_value}"
-                )
+                dotted_key, a, b = difference
+                raise ProductError(f"{path}: {dotted_key} = {a}, but {expected_from} has {b}")
 
 
 def _at(tree: Any, key: str) -> Any:
@@ -116,9 +109,8 @@ def _difference(name: str, first: Any, second: Any) -> tuple[str, Any, Any] | No
         return None if first == second else (name, first, second)
     for key in {**first, **second}:
         if key not in UNCOMPARED_KEYS:
-            values = (side.get(key, "nothing") for side in (first, second))
-            difference = _difference(f"{name}.{key}", *values)
-            if difference is not None:
+            values = first.get(key, "nothing"), second.get(key, "nothing")
+            if (difference := _difference(f"{name}.{key}", *values)) is not None:
                 return difference
     return None
 

@@ -327,10 +327,7 @@ def write_product(
 
 @contextmanager
 def stream_product(
-    path: str | Path,
-    kind: str,
-    columns: Mapping[str, Column | Empty],
-    config: Mapping[str, Any],
+    path: str | Path, kind: str, columns: Mapping[str, Column | Empty], config: Mapping[str, Any]
 ) -> Iterator[Mapping[str, Dataset]]:
     """Write a product piece by piece, so that it never has to fit into memory.
 

@@ -19,65 +19,53 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-def storage_of(method_class: type[Method]) -> Storage:
+def storage_of(method: type[Method]) -> Storage:
     """Return how the fits of a method are stored; the method must leave files."""
-    assert method_class.storage is not None, f"{method_class.name} leaves no file"
-    return method_class.storage
+    assert method.storage is not None, f"{method.name} leaves no file"
+    return method.storage
 
 
-def rule_of(method_class: type[Method]) -> str:
+def rule_of(method: type[Method]) -> str:
     """Return the name of the rule that fits a method."""
-    return storage_of(method_class).rule or f"fit_{method_class.name}"
+    return storage_of(method).rule or f"fit_{method.name}"
 
 
-def suffix_of(method_class: type[Method]) -> str:
+def suffix_of(method: type[Method]) -> str:
     """Return the ending of the names of a method's bundles."""
-    assert method_class.packing is not None, f"{method_class.name} is part of no bundle"
-    return (
-        f"-{method_class.name}"
-        if method_class.packing.suffix is None
-        else method_class.packing.suffix
-    )
+    assert method.packing is not None, f"{method.name} is part of no bundle"
+    return f"-{method.name}" if method.packing.suffix is None else method.packing.suffix
 
 
-def stem(method_class: type[Method], dataset: str, split: str, reference: str) -> str:
+def stem(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the part of a path that distinguishes the fits of a method."""
-    return f"{dataset}/{split}" + (
-        f"-{reference}" if storage_of(method_class).per_reference else ""
-    )
+    return f"{dataset}/{split}" + (f"-{reference}" if storage_of(method).per_reference else "")
 
 
-def place_of(method_class: type[Method], dataset: str, split: str, reference: str) -> str:
+def place_of(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the folder or file of a fit, below the folder of results."""
-    return (
-        f"{method_class.name}/{named(method_class, stem(method_class, dataset, split, reference))}"
-    )
+    return f"{method.name}/{named(method, stem(method, dataset, split, reference))}"
 
 
-def named(method_class: type[Method], text: str) -> str:
+def named(method: type[Method], text: str) -> str:
     """Return the name of a fit: as it is for a folder, with the ending ".h5" for a file."""
-    return text if storage_of(method_class).files else f"{text}.h5"
+    return text if storage_of(method).files else f"{text}.h5"
 
 
-def own_files(method_class: type[Method], place: str | Path) -> list[Path]:
+def own_files(method: type[Method], place: str | Path) -> list[Path]:
     """Return the files of a fit that the method itself reads."""
-    return [Path(place, name) for name in storage_of(method_class).files] or [Path(place)]
+    return [Path(place, name) for name in storage_of(method).files] or [Path(place)]
 
 
-def path_beside(method_class: type[Method], place: str | Path, name: str) -> Path:
+def path_beside(method: type[Method], place: str | Path, name: str) -> Path:
     """Return the path of a further file of a fit: in its folder, or beside its product."""
     place = Path(place)
-    return (
-        place / name if storage_of(method_class).files else place.with_name(f"{place.stem}.{name}")
-    )
+    return place / name if storage_of(method).files else place.with_name(f"{place.stem}.{name}")
 
 
-def outputs(method_class: type[Method], place: str | Path) -> list[Path]:
+def outputs(method: type[Method], place: str | Path) -> list[Path]:
     """Return the paths of all files of a fit."""
-    further_names = (TRAINED_ON, *storage_of(method_class).diagnostics)
-    return own_files(method_class, place) + [
-        path_beside(method_class, place, name) for name in further_names
-    ]
+    further_names = (TRAINED_ON, *storage_of(method).diagnostics)
+    return own_files(method, place) + [path_beside(method, place, name) for name in further_names]
 
 
 def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Product) -> None:
@@ -89,39 +77,34 @@ def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Prod
 
 
 def described_by(
-    method_class: type[Method], tree: Mapping[str, Any], split: str, reference: str
+    method: type[Method], tree: Mapping[str, Any], split: str, reference: str
 ) -> dict[str, Any]:
     """Return the configuration that is written with a fit.
 
     It has the settings `tree`, the split of the stars, and the reference, if the method is fitted
     to each reference by itself.
     """
-    has_reference = storage_of(method_class).per_reference
+    has_reference = storage_of(method).per_reference
     return {**tree, "split": split, **({"reference": reference} if has_reference else {})}
 
 
-def learnt(method_class: type[Method], reference: str) -> str:
+def learnt(method: type[Method], reference: str) -> str:
     """Return the reference to which a method is fitted that is to restore `reference`.
 
     A method with one fit for both references is fitted to templates.
     """
-    fits_each = method_class.storage is None or method_class.storage.per_reference
+    fits_each = method.storage is None or method.storage.per_reference
     return reference if fits_each else "template"
 
 
 def require(
-    method_class: type[Method],
-    place: Path,
-    stars: Product,
-    config: BaseModel,
-    split: str,
-    reference: str,
+    method: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
     """Refuse a fit that does not belong to test stars.
 
     Parameters
     ----------
-    method_class : type of Method
+    method : type of Method
         Class of the method.
     place : Path
         Folder or file of the fit.
@@ -139,5 +122,5 @@ def require(
     ProductError
         For the first setting that differs, with both values.
     """
-    options = described_by(method_class, {}, split, reference)
-    require_training(place, method_class.described(place), stars, config, **options)
+    options = described_by(method, {}, split, reference)
+    require_training(place, method.described(place), stars, config, **options)

@@ -28,9 +28,7 @@ METRIC_COLUMNS = {
 
 
 @command("describe")
-def describe(
-    bundle: Annotated[File | None, {"argument": True}] = None,
-) -> None:
+def describe(bundle: Annotated[File | None, {"argument": True}] = None) -> None:
     """Say what BUNDLE (default: the shipped one) was trained for and how well it does."""
     print(description(read_bundle(bundle)))
 
@@ -61,9 +59,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     if info.dae:
         normalisation += f"; the network sees it × {info.image_scale:g}"
         kernels, widths = (" ".join(map(str, v)) for v in (info.dae.kernels, info.dae.widths))
-        method_facts = {
-            "Network": f"kernels {kernels}; widths {widths}; {number_count} weights",
-        }
+        method_facts = {"Network": f"kernels {kernels}; widths {widths}; {number_count} weights"}
     else:
         method_facts = {"Method": f"{method(info.method).look.label}; {number_count} numbers"}
         fitted = estimator(bundle)

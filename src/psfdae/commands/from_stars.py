@@ -33,14 +33,7 @@ from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
 from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
-from psfdae.model.settings import (
-    CHOSEN,
-    IMAGE_GROUPS,
-    Settings,
-    Words,
-    of_config,
-    with_keywords,
-)
+from psfdae.model.settings import CHOSEN, IMAGE_GROUPS, Settings, Words, of_config, with_keywords
 from psfdae.model.stars import ALL, Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder

@@ -209,11 +209,7 @@ def begin_linear(
 
 
 def _fit_last_layer(
-    model: Dae,
-    images: torch.Tensor,
-    references: np.ndarray,
-    weight: np.ndarray,
-    pixels: np.ndarray,
+    model: Dae, images: torch.Tensor, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
 ) -> None:
     """Fit the weights and the bias of the last layer to the references by least squares.
 
