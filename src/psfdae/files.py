@@ -10,7 +10,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -309,16 +309,7 @@ def write_product(
     # In memory, because HDF5 crashes where a full disk keeps it from closing a file.
     # A name of its own, because HDF5 opens no file twice.
     with h5py.File(secrets.token_hex(16), "w", driver="core", backing_store=False) as file:
-        _describe(file, kind, config)
-        stored: dict[int, str] = {}
-        for name, column in columns.items():
-            if id(column.values) in stored:
-                file[name] = h5py.SoftLink(f"/{stored[id(column.values)]}")
-                continue
-            stored[id(column.values)] = name
-            data = file.create_dataset(name, data=column.values, chunks=True, fletcher32=True)
-            data.attrs["unit"] = column.unit
-            data.attrs["about"] = column.about
+        _create_datasets(file, kind, columns, config, lambda column: id(column.values))
         file.flush()
         content = file.id.get_file_image()
     with atomic_path(path) as temporary:
@@ -347,22 +338,12 @@ def stream_product(
     OSError
         If the disk has too little space.
     """
-    import h5py
-
     with atomic_path(path) as temporary, _reserved(temporary, columns) as file:
-        _describe(file, kind, config)
-        stored: dict[int, str] = {}
-        for name, column in columns.items():
-            if id(column) in stored:
-                file[name] = h5py.SoftLink(f"/{stored[id(column)]}")
-                continue
-            stored[id(column)] = name
-            data = file.create_dataset(name, fletcher32=True, **_storage(column))
-            data.attrs["unit"] = column.unit
-            data.attrs["about"] = column.about
+        names = _create_datasets(file, kind, columns, config, id)
         yield {name: file[name] for name in columns}
         file.flush()
-        for name in stored.values():
+        # HDF5 creates the chunks of an array when they are written.
+        for name in names:
             data = file[name]
             filled_rows = data.id.get_num_chunks() * data.chunks[0]
             if isinstance(columns[name], Empty) and filled_rows < data.shape[0]:
@@ -420,11 +401,37 @@ def _storage(column: Column | Empty) -> dict[str, Any]:
     return {"shape": column.shape, "dtype": dtype, "chunks": (rows, *column.shape[1:])}
 
 
-def _describe(file: File, kind: str, config: Mapping[str, Any]) -> None:
-    """Write the kind, the package version and the configuration of a product to its file."""
+def _create_datasets(
+    file: File,
+    kind: str,
+    columns: Mapping[str, Any],
+    config: Mapping[str, Any],
+    identity: Callable[[Any], int],
+) -> list[str]:
+    """Write the attributes of a product, and create a dataset for each of its columns.
+
+    A column with the `identity` of an earlier one becomes a link to it.
+
+    Returns
+    -------
+    list of str
+        Names of the columns that are no links.
+    """
+    import h5py
+
     file.attrs["kind"] = kind
     file.attrs["psfdae_version"] = __version__
     file.attrs["config"] = json.dumps(config, sort_keys=True)
+    names: dict[int, str] = {}
+    for name, column in columns.items():
+        if identity(column) in names:
+            file[name] = h5py.SoftLink(f"/{names[identity(column)]}")
+            continue
+        names[identity(column)] = name
+        data = file.create_dataset(name, fletcher32=True, **_storage(column))
+        data.attrs["unit"] = column.unit
+        data.attrs["about"] = column.about
+    return list(names.values())
 
 
 @dataclass(frozen=True)
