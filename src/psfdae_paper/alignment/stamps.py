@@ -108,7 +108,6 @@ class AlignmentStamps:
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
         # Stamps are nearly as wide as the period of the image, which is transformed whole.
-        side, pixel = alignment.stamp_px, telescope.pixel
         self.propagation = SampledStamps(
             telescope.obscuration,
             self._modes,
