@@ -267,7 +267,7 @@ def _make(
     """Make all files; how good the model is, in a sentence."""
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
-    for part in stars.each:
+    for part in stars.images:
         if part.observation.found is not None:
             write_list(part.observation, files.star_list(part.name))
     write_table(files.path / "selection.csv", stars.table)

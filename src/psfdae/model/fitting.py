@@ -164,7 +164,7 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
             return model
         wings_of_each = [
             part.wings or wings_of_stars(model, part.observation.with_margin(MARGIN_PX))
-            for part in stars.each
+            for part in stars.images
         ]
     known_wings = [wings for wings in wings_of_each if wings is not None]
     if not known_wings:

@@ -29,9 +29,10 @@ from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
+from psfdae.model.star_sets import split_stars
 from psfdae.rng import stream
 from psfdae.settings import Noise
-from psfdae.splits import held_out_fields
+from psfdae.splits import Split, held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -293,15 +294,20 @@ class Stars:
         return cls(source, observation, found, held_out, settings, tuple(notes))
 
     @property
-    def each(self) -> Sequence[Stars]:
-        """The stars of every image."""
+    def images(self) -> Sequence[Stars]:
+        """Stars of each image."""
         return self.exposures or (self,)
+
+    @cached_property
+    def split(self) -> Split:
+        """Numbers of the training, validation and test images in `product`."""
+        return split_stars(self.product, SPLIT, self.settings)
 
     @cached_property
     def columns(self) -> dict[str, Column]:
         """Arrays of the product "stars"."""
         settings, bright = self.settings, self.candidates.bright
-        grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.each])
+        grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.images])
         rest = settings.calibration_stars.bins, settings.framing, settings.parts
         rng = stream(settings.seed, "own stars")
         centring = settings.calibration_stars.centring_px or 0.0
@@ -327,7 +333,7 @@ class Stars:
 
     def _repr_html_(self) -> str:
         """Counts of the stars, for a notebook."""
-        held_count, images = int(self.held_out.sum()), len(self.each)
+        held_count, images = int(self.held_out.sum()), len(self.images)
         learnt_count = len(self) - held_count
         rows = [
             ["image", escape(self.observation.path.name)],
@@ -370,10 +376,10 @@ class Stars:
 
         columns = self.candidates.columns(self.held_out)
         if self.exposures:
-            counts = [one.observation.count for one in self.each]
-            names = [one.observation.path.name for one in self.each]
+            counts = [one.observation.count for one in self.images]
+            names = [one.observation.path.name for one in self.images]
             columns = {"image": np.repeat(names, counts), **columns}
-        of_lists = [one.observation.list_columns for one in self.each]
+        of_lists = [one.observation.list_columns for one in self.images]
         known = [of_list for of_list in of_lists if of_list is not None]
         of_list = vstack(known) if len(known) == len(of_lists) else None
         return star_table(columns, self.observation.unit, of_list)
@@ -401,8 +407,8 @@ class Stars:
         said = {
             **kept,
             "source": "stars",
-            "image": ", ".join(part.observation.path.name for part in self.each),
-            "image_sha256": ", ".join(part.observation.sha256() for part in self.each),
+            "image": ", ".join(part.observation.path.name for part in self.images),
+            "image_sha256": ", ".join(part.observation.sha256() for part in self.images),
             **size,
             **taken_with,
             **colours,
