@@ -146,12 +146,12 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         _error_table([*rows, *mean_rows], stars, methods),
         _stacked(rows),
         _joined(per_star),
-        _photometry_table(model, stars, restored),
+        _measure_photometry(model, stars, restored),
         restored,
     )
 
 
-def _photometry_table(
+def _measure_photometry(
     model: PsfModel, stars: Stars, restored: Mapping[float, Mapping[str, np.ndarray]]
 ) -> Table:
     """Predict held-out stars of flux 1 at each λ from their places alone (`Report.found`).
