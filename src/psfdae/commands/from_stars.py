@@ -32,12 +32,19 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
+from psfdae.model.fitting import (
+    choose_method,
+    described,
+    fitted_to,
+    makes_models,
+    pack_model,
+    worth_trying,
+)
 from psfdae.model.settings import (
-    CHOSEN,
+    DATASET_CHOICE,
     IMAGE_GROUPS,
     Settings,
-    Words,
+    SettingsReader,
     of_config,
     with_keywords,
 )
@@ -92,7 +99,7 @@ class Made:
         return [self.stars, self.bundle, *own]
 
 
-@command("from-stars", Words())
+@command("from-stars", SettingsReader())
 def from_stars(
     config: Settings,
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
@@ -277,12 +284,12 @@ def _make(
     fitted = _fits(stars, files, [k for k in files.kinds if k in taking or k not in tried])
     taken = taking[0]
     if len(taking) > 1:
-        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in taking})
+        name, errors = choose_method(stars, {kind.name: fitted[kind.name] for kind in taking})
         taken = method(name)
         for other, error in errors.items():
             print(f"{method(other).look.label}: MSE {error:.3g} on validation stars")
     print(f"packing {taken.look.label}")
-    model = packed(stars, fitted[taken.name], files.name, licence)
+    model = pack_model(stars, fitted[taken.name], files.name, licence)
     for fact in facts_of(fitted[taken.name]):
         print(f"{taken.look.label}: {fact}")
     if model.wings is not None:
@@ -325,6 +332,8 @@ def _fits(stars: Stars, files: Made, kinds: Sequence[type[Method]]) -> dict[str,
 def _overrides(settings: Settings) -> str:
     """The settings as words of a command line that chooses files of the configuration, too."""
     return (
-        "\n".join([CHOSEN, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))])
+        "\n".join(
+            [DATASET_CHOICE, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))]
+        )
         + "\n"
     )
