@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +13,8 @@ from psfdae.image.selection import misfit
 from psfdae.image.stamps import cut
 from psfdae.model.report import (
     MEAN_PSF,
-    ReportContents,
-    check_model,
+    check_held_out,
+    check_stars,
     comparison_sentence,
     fit_mean_psf,
     mse_ratios,
@@ -85,17 +84,15 @@ def photometry(flux=(0.68, 0.68), centre=(0.68, 0.68)):
     return Table(columns)
 
 
-def quality(**more):
+def checks(**changed):
+    """Checks of a good model, but for what is changed."""
     truth = cut(gaussians(*np.random.default_rng(2).uniform(-0.5, 0.5, (2, 40))), SIDE)
-    degraded_images = {
-        snr: {"truth": truth, "model": truth, MEAN_PSF: truth[::-1]} for snr in (10.0, 50.0)
-    }
+    images = {"truth": truth, "model": truth, MEAN_PSF: truth[::-1]}
     stars = {"snr": np.geomspace(5, 700, 60), "chi2": np.ones(60), "flags": np.zeros(60, int)}
     stars["part"] = np.where(np.arange(60) % 5 == 4, "held out", "training")
-    facts = dict.fromkeys(field.name for field in fields(ReportContents))
-    facts |= {"method": "gmm", "errors": errors((2e-6, 1e-6)), "photometry": photometry()}
-    facts |= {"coverage": {10.0: 0.68}, "degraded_images": degraded_images, "stars": stars}
-    return ReportContents(**facts | more)
+    measured = {"errors": errors((2e-6, 1e-6)), "photometry": photometry()}
+    measured |= {"coverage": {10.0: 0.68}, "degraded": {10.0: images, 50.0: images}}
+    return check_stars(stars) + check_held_out("gmm", **measured | changed)
 
 
 @pytest.mark.parametrize(
@@ -110,8 +107,8 @@ def quality(**more):
     ],
 )
 def test_what_is_wrong_is_marked(wrong, check):
-    assert all(good for *_, good in check_model(quality()))
-    assert [question for question, _, good in check_model(quality(**wrong)) if not good] == [check]
+    assert all(good for *_, good in checks())
+    assert [question for question, _, good in checks(**wrong) if not good] == [check]
 
 
 # Stars that are not good

@@ -331,9 +331,5 @@ def _fits(stars: Stars, files: Made, kinds: Sequence[type[Method]]) -> dict[str,
 
 def _overrides(settings: Settings) -> str:
     """The settings as words of a command line that chooses files of the configuration, too."""
-    return (
-        "\n".join(
-            [DATASET_CHOICE, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))]
-        )
-        + "\n"
-    )
+    overrides = as_overrides(settings.model_dump(exclude={"calibration_stars"}))
+    return "\n".join([DATASET_CHOICE, *overrides]) + "\n"

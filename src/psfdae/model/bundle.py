@@ -373,16 +373,13 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
-    optional: dict[str, Any] = {name: arrays.get(name) for name in OPTIONAL}
+    names = ("noise_nodes", "error68", "rms", "ratio95", *OPTIONAL)
+    tables: dict[str, Any] = {name: arrays.get(name) for name in names}
     prefix = f"{info.method}/"
-    return Bundle(
-        info=info,
-        weights={k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)},
-        flux_model=_read_flux_model(arrays),
-        **{name: arrays[name] for name in ("noise_nodes", "error68", "rms", "ratio95")},
-        distance_limit=float(arrays["distance_limit"]),
-        **optional,
-    )
+    weights = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    distance_limit = float(arrays["distance_limit"])
+    flux_model = _read_flux_model(arrays)
+    return Bundle(info, weights, flux_model, distance_limit=distance_limit, **tables)
 
 
 def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:

@@ -323,11 +323,7 @@ def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling
 
 
 def _write_cube(
-    path: Path,
-    model: FieldPsfs,
-    positions: np.ndarray,
-    oversampling: int,
-    cards: list[Card],
+    path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int, cards: list[Card]
 ) -> None:
     """Write a FITS cube of centred PSFs, with cards of its format after those of the model."""
     from astropy.io import fits

@@ -16,12 +16,7 @@ from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
 from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.settings import with_keywords
-from psfdae.model.star_sets import (
-    field_positions,
-    fit_apart,
-    noise_model,
-    training_set,
-)
+from psfdae.model.star_sets import field_positions, fit_apart, noise_model, training_set
 from psfdae.model.stars import ENOUGH_STARS, REFERENCE, SPLIT, Stars
 from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream

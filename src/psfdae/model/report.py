@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from psfdae.figures import SERIES_COLORS, as_png, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.image.tables import html_table
+from psfdae.method import facts_of
 from psfdae.methods import method as method_of
 from psfdae.model.plot import UNUSABLE_FLAGS
 from psfdae.moments import measure_shapes, moved
@@ -26,6 +26,8 @@ from psfdae.moments import measure_shapes, moved
 if TYPE_CHECKING:
     from astropy.table import Table
     from matplotlib.figure import Figure
+
+    from psfdae.model.validation import Report
 
 MEAN_PSF = "mean_psf"
 """Name, in tables, of the comparison with one mean PSF whose centre is fitted to each star."""
@@ -158,7 +160,20 @@ def check_held_out(
     coverage: Mapping[float, float],
     degraded: Mapping[float, Mapping[str, np.ndarray]],
 ) -> list[Check]:
-    """Check a model on held-out stars alone; parameters are attributes of `ReportContents`."""
+    """Check a model on held-out stars alone.
+
+    Parameters
+    ----------
+    method : str
+        Name of the model's method.
+    errors, photometry : Table
+        Columns of `report.csv`, and of `found.csv`.
+    coverage : mapping of float to float
+        Fraction of the errors of pixels within their stated 68 % half-width, by S/N.
+    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
+        (`model`) and by one mean PSF (`MEAN_PSF`).
+    """
     rows: list[Check] = []
     # MSE beside the two simplest models of the PSF.
     for label, reference in (("one mean PSF", MEAN_PSF), ("linear MMSE", "lmmse")):
@@ -191,16 +206,12 @@ def check_held_out(
     return [*rows, ("Stars held out", f"{held_out}", held_out >= 20)]
 
 
-def check_model(contents: ReportContents) -> list[Check]:
-    """Check a model on its held-out stars, and on all stars of the image."""
-    *checks, held_out_check = check_held_out(
-        contents.method,
-        contents.errors,
-        contents.photometry,
-        contents.coverage,
-        contents.degraded_images,
-    )
-    stars = contents.stars
+def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
+    """Check a model on all stars of its image.
+
+    `stars` has columns of the prediction and `part` of `selection.csv`, shape (n,) each.
+    """
+    checks: list[Check] = []
     # χ² of stars that the model has not learnt from, by classes of S/N with at least five stars.
     is_usable = (stars["flags"] == 0) & (stars["part"] != "training") & np.isfinite(stars["chi2"])
     snr_class = np.searchsorted((10.0, 100.0, 1000.0), stars["snr"])
@@ -216,10 +227,8 @@ def check_model(contents: ReportContents) -> list[Check]:
         checks.append((question, ", ".join(answers), is_passed))
     # Outliers: the model is not meant for an image where more than a tenth of the stars are.
     outliers = float(((stars["flags"] & int(StarFlag.UNLIKE_TRAINING)) > 0).mean())
-    checks.append(
-        ("Stars unlike the training", f"{100 * outliers:.0f} % of the list", outliers < 0.1)
-    )
-    return [*checks, held_out_check]
+    answer = f"{100 * outliers:.0f} % of the list"
+    return [*checks, ("Stars unlike the training", answer, outliers < 0.1)]
 
 
 def checks_html(rows: Sequence[Check]) -> str:
@@ -232,95 +241,62 @@ def checks_html(rows: Sequence[Check]) -> str:
 # The page.
 
 
-@dataclass(frozen=True)
-class ReportContents:
-    """Contents of the report page of a model.
+def quality_page(
+    report: Report,
+    stars: dict[str, np.ndarray],
+    degraded_rows: np.ndarray,
+    field_map: Figure | None,
+    residuals: Figure | None,
+) -> str:
+    """Return the report page as HTML.
 
-    Attributes
+    Parameters
     ----------
-    name, image : str
-        Name of the model, and of the file with the image that it was trained on.
-    method, label : str
-        Name of the model's method, in tables and in sentences.
-    notes : sequence of str
-        Facts about the camera, and advice on settings.
-    errors : Table
-        Columns of `report.csv`.
-    photometry : Table
-        Columns of `found.csv`.
-    coverage : dict of float to float
-        Fraction of the errors of pixels within their stated 68 % half-width, by S/N.
-    degraded_images : dict of float to dict of str to ndarray, shape (n, d, d)
-        Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
-        (`model`) and by one mean PSF (`MEAN_PSF`).
-    degraded_stars : dict of str to ndarray, shape (n,)
-        Columns x, y and flux of these stars.
-    stars : dict of str to ndarray, shape (N,)
-        Columns of the prediction of all N stars, and `verdict` and `part` of `selection.csv`.
-    residuals : ndarray, shape (k, d, d)
-        Stamp minus PSF of some bright held-out stars, in σ of the sky.
-    bright_stamps : ndarray, shape (k, d, d)
-        Stamps of these stars over their flux, without sky.
-    strip_png : bytes
-        PNG figure of degraded held-out stars as each method restores them.
+    report : Report
+    stars : dict of str to ndarray, shape (n,)
+        Columns of the prediction of all stars, and `verdict` and `part` of `selection.csv`.
+    degraded_rows : ndarray of int
+        Star of each held-out image in `report.restored`.
     field_map : Figure, optional
         Map of the PSF, if the stars have positions.
-    facts : sequence of str
-        Sentences of the method about its fit (`psfdae.method.facts_of`).
+    residuals : Figure, optional
+        Residuals of bright held-out stars (`residual_strip`), if there are any.
     """
-
-    name: str
-    image: str
-    method: str
-    label: str
-    notes: Sequence[str]
-    errors: Table
-    photometry: Table
-    coverage: dict[float, float]
-    degraded_images: dict[float, dict[str, np.ndarray]]
-    degraded_stars: dict[str, np.ndarray]
-    stars: dict[str, np.ndarray]
-    residuals: np.ndarray
-    bright_stamps: np.ndarray
-    strip_png: bytes
-    field_map: Figure | None
-    facts: Sequence[str] = ()
-
-
-def quality_page(contents: ReportContents) -> str:
-    """Return the report page as HTML."""
-    summary = comparison_sentence(contents.errors, contents.method, contents.label)
-    field_map = contents.field_map
+    method, images = type(report.model.engine.estimator), report.restored_by_snr
+    name, image = report.model.info.name, report.stars.observation.path.name
+    # Checks of all stars come before the number of stars held out.
+    *checks, held_out_check = report.checks()
+    summary_checks = [*checks, *check_stars(stars), held_out_check]
+    notes = (line for note in report.stars.notes for line in note.splitlines())
     parts = [
-        f"<h1>{escape(contents.name)}</h1><p class=lead>{escape(summary)}.</p>",
-        checks_html(check_model(contents)),
+        f"<h1>{escape(name)}</h1><p class=lead>{escape(str(report))}.</p>",
+        checks_html(summary_checks),
         "<h2>Errors on stars that no training saw, degraded to low S/N</h2>",
-        _errors_table(contents),
-        _image_tag(errors_figure(contents)),
-        _image_tag(contents.strip_png),
+        _errors_table(report.table, method.name),
+        _image_tag(errors_figure(report.table, method.name)),
+        _image_tag(report.strip_png),
         "<h2>Flux, centre and their errors</h2>",
-        _photometry_table(contents.photometry),
+        _photometry_table(report.found),
         "<h2>The PSF over the field</h2>",
-        *(f"<p>{escape(fact)}.</p>" for fact in contents.facts),
+        *(f"<p>{escape(fact)}.</p>" for fact in facts_of(report.model.engine.estimator)),
         _image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         "<h2>Residuals of held-out stars</h2>",
         "<p>Above: restored minus bright image at the S/N given, over all held-out stars. "
         "Below: bright held-out stars as they are in the image, and what their PSF leaves, in σ "
         "of the sky.</p>",
-        _image_tag(error_maps(contents.degraded_images)),
-        _image_tag(residual_strip(contents)) if len(contents.residuals) else "",
+        _image_tag(error_maps(images)),
+        _image_tag(residuals) if residuals else "",
         "<h2>Size and shape against magnitude and place</h2>",
-        _image_tag(shapes_figure(contents)),
+        _image_tag(shapes_figure(stars, degraded_rows, images)),
         "<h2>χ²</h2>",
-        _image_tag(chi2_figure(contents.stars)),
+        _image_tag(chi2_figure(stars)),
         "<h2>Stars left out</h2>",
-        _verdict_tables(contents.stars),
+        _verdict_tables(stars),
         "<h2>What is known of the image</h2><ul>",
-        *(f"<li>{escape(line)}</li>" for note in contents.notes for line in note.splitlines()),
+        *(f"<li>{escape(line)}</li>" for line in notes),
         "</ul>",
     ]
-    title, image = escape(contents.name), escape(contents.image)
-    return PAGE.format(title=title, image=image, body="\n".join(parts))
+    return PAGE.format(title=escape(name), image=escape(image), body="\n".join(parts))
 
 
 PAGE = """<!doctype html>
@@ -344,12 +320,12 @@ def _image_tag(picture: Figure | bytes) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
-def _errors_table(contents: ReportContents) -> str:
+def _errors_table(errors: Table, model_method: str) -> str:
     """Return the table of MSE with standard errors: rows are methods, columns S/N."""
-    errors, levels = contents.errors, np.unique(contents.errors["snr"])
+    levels = np.unique(errors["snr"])
     cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
     rows = [
-        [escape(f"{label} (the model)" if name == contents.method else label)]
+        [escape(f"{label} (the model)" if name == model_method else label)]
         + [cells.get((name, snr), "") for snr in levels]
         for name, label in _method_labels(errors).items()
     ]
@@ -400,19 +376,17 @@ def _method_labels(errors: Table) -> dict[str, str]:
 
 
 @styled
-def errors_figure(contents: ReportContents) -> Figure:
+def errors_figure(errors: Table, model_method: str) -> Figure:
     """Draw MSE against S/N for each method, with the noise of the bright images as a floor."""
     figure = new_figure(3.4, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="MSE")
-    errors = contents.errors
     for index, (name, label) in enumerate(_method_labels(errors).items()):
         rows = errors[errors["method"] == name]
         rows.sort("snr")
-        color = SERIES_COLORS[index % len(SERIES_COLORS)]
-        line_width = 2.2 if name == contents.method else 1
+        color, width = SERIES_COLORS[index % len(SERIES_COLORS)], 2.2 if name == model_method else 1
         axes.errorbar(
             rows["snr"], rows["mse"], rows["mse_stderr"], label=label, marker="o", ms=3,
-            color=color, lw=line_width,
+            color=color, lw=width,
         )  # fmt: skip
     axes.axhline(errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
     axes.grid(True, which="both")
@@ -424,7 +398,7 @@ def errors_figure(contents: ReportContents) -> Figure:
 def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """Draw mean and RMS, over held-out stars, of restored minus bright image.
 
-    `degraded` is `ReportContents.degraded_images`; images are those of the S/N nearest to 10.
+    `degraded` has images by S/N, as of `check_held_out`; those of the S/N nearest to 10 are shown.
     """
     snr = nearest_snr(degraded)
     images = degraded[snr]
@@ -447,12 +421,19 @@ def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
 
 
 @styled
-def residual_strip(contents: ReportContents) -> Figure:
-    """Draw bright held-out stars, and below them their residuals within ± 5 σ of the sky."""
+def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
+    """Draw bright held-out stars, and below them their residuals within ± 5 σ of the sky.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (k, d, d)
+        Stamps of the stars over their flux, without sky.
+    residuals : ndarray, shape (k, d, d)
+        Stamp minus PSF, in σ of the sky.
+    """
     figure = new_figure(2.6, layout="constrained")
-    grid: Any = figure.subplots(2, len(contents.residuals), squeeze=False)
-    pairs = zip(grid.T, contents.bright_stamps, contents.residuals, strict=True)
-    for (above, below), stamp, residual in pairs:
+    grid: Any = figure.subplots(2, len(residuals), squeeze=False)
+    for (above, below), stamp, residual in zip(grid.T, stamps, residuals, strict=True):
         # A square root shows core and wings in one picture.
         above.imshow(np.sqrt(np.clip(stamp / np.nanmax(stamp), 0, 1)), origin="lower", cmap="magma")
         artist = below.imshow(residual, origin="lower", cmap="RdBu_r", vmin=-5, vmax=5)
@@ -463,42 +444,41 @@ def residual_strip(contents: ReportContents) -> Figure:
 
 
 @styled
-def shapes_figure(contents: ReportContents) -> Figure:
+def shapes_figure(
+    stars: Mapping[str, np.ndarray],
+    degraded_rows: np.ndarray,
+    degraded: Mapping[float, Mapping[str, np.ndarray]],
+) -> Figure:
     """Draw FWHM and ellipticity against magnitude, x and y.
 
     Upper panels: all usable stars, with held-out stars in colour. Lower panels: errors of the
-    held-out stars after they were degraded to the S/N nearest to 10.
+    held-out stars after they were degraded to the S/N nearest to 10. Parameters are those of
+    `quality_page`, with the images by S/N.
     """
-
-    def coordinates(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """Return instrumental magnitude (NaN for flux ≤ 0), x and y of stars."""
-        flux = np.where(columns["flux"] > 0, columns["flux"], np.nan)
-        return -2.5 * np.log10(flux), columns["x"], columns["y"]
-
-    stars, snr = contents.stars, nearest_snr(contents.degraded_images)
+    snr = nearest_snr(degraded)
     usable = ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
-    size_error, ellipticity_error = size_errors(contents.degraded_images[snr])
+    size_error, ellipticity_error = size_errors(degraded[snr])
     figure = new_figure(7.6, layout="constrained")
     grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
     rows = (
         ("FWHM (px)", "fwhm_px", 100 * size_error, f"FWHM at S/N {snr:.3g} (%)"),
         ("ellipticity", "ellipticity", ellipticity_error, f"ellipticity at S/N {snr:.3g}"),
     )
-    labels = ("−2.5 log₁₀ flux", "x (px)", "y (px)")
-    places = zip(coordinates(stars), coordinates(contents.degraded_stars), strict=True)
-    for column, (place, degraded_place) in enumerate(places):
+    magnitude = -2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan))
+    coordinates = {"−2.5 log₁₀ flux": magnitude, "x (px)": stars["x"], "y (px)": stars["y"]}
+    for column, (axis_label, place) in enumerate(coordinates.items()):
         for row, (label, name, error, error_label) in enumerate(rows):
             above, below = grid[2 * row : 2 * row + 2, column]
             above.plot(place[usable], stars[name][usable], ".", ms=2, color="#888888", label="all")
             above.plot(place[held_out], stars[name][held_out], ".", color=SERIES_COLORS[5],
                        label="held out")  # fmt: skip
             below.axhline(0.0, color="black", lw=0.8)
-            below.plot(degraded_place, error, ".", ms=2, color=SERIES_COLORS[5])
+            below.plot(place[degraded_rows], error, ".", ms=2, color=SERIES_COLORS[5])
             if column == 0:
                 above.set_ylabel(label)
                 below.set_ylabel(f"error of\n{error_label}")
-        grid[-1, column].set_xlabel(labels[column])
+        grid[-1, column].set_xlabel(axis_label)
     grid[0, 0].legend()
     return figure
 

@@ -45,8 +45,8 @@ class Settings(Group):
     methods: MethodNames = Field(["noisy", "lmmse", "gmm", "field"])
     calibration_stars: CalibrationStars = CalibrationStars()
     framing: Stamp = Stamp()
-    # With κ = 1 a noise level is the RMS of a pixel over the star's flux. The levels are replaced by
-    # those of the stated S/N, and the sky by that of the image where its gain is known.
+    # With κ = 1 a noise level is the RMS of a pixel over the star's flux. The levels are replaced
+    # by those of the stated S/N, and the sky by that of the image where its gain is known.
     noise: Noise = Noise(name="from_stars", levels=[1e-2], kappa=1.0, background_photons=1e4)
     parts: Parts = Parts()
     evaluation: Evaluation = Evaluation()

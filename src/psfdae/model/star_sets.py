@@ -144,12 +144,7 @@ def own_noise(
 
 
 def training_set(
-    config: OfFit,
-    kind: type[Method],
-    stars: Product,
-    split: str,
-    reference: str,
-    **fields: Any,
+    config: OfFit, kind: type[Method], stars: Product, split: str, reference: str, **fields: Any
 ) -> TrainingSet:
     """Return the training part of a split, with the noise of a configuration.
 

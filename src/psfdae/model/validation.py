@@ -15,7 +15,7 @@ import numpy as np
 from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
 from psfdae.image.tables import shown_with_digits
-from psfdae.method import Method, facts_of
+from psfdae.method import Method
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
 from psfdae.model.field_psfs import PredictionError
@@ -26,13 +26,13 @@ from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.report import (
     MEAN_PSF,
     Check,
-    ReportContents,
     check_held_out,
     checks_html,
     comparison_sentence,
     fit_mean_psf,
     nearest_snr,
     quality_page,
+    residual_strip,
 )
 from psfdae.model.star_sets import (
     field_positions,
@@ -176,10 +176,7 @@ def _measure_photometry(
         # Offsets of the centre, and their standard errors, along x and y.
         offset = np.stack([estimate.x_fit - bright.x_fit, estimate.y_fit - bright.y_fit])
         offset_error = np.stack(
-            [
-                np.hypot(estimate.x_error, bright.x_error),
-                np.hypot(estimate.y_error, bright.y_error),
-            ]
+            [np.hypot(estimate.x_error, bright.x_error), np.hypot(estimate.y_error, bright.y_error)]
         )
         pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
         flux_bias, flux_bias_stderr = _usable_mean(estimate.flux - 1.0, star, usable)
@@ -328,28 +325,19 @@ class Report:
 
     def checks(self) -> list[Check]:
         """Check the model on the stars held out: question, answer, and True if it is passed."""
-        return check_held_out(
-            self.model.info.method,
-            self.table,
-            self.found,
-            self._coverage,
-            self._restored_by_snr,
-        )
+        rows = self.model.info.metrics
+        coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
+        method = self.model.info.method
+        return check_held_out(method, self.table, self.found, coverage, self.restored_by_snr)
 
     @property
-    def _restored_by_snr(self) -> dict[float, dict[str, np.ndarray]]:
+    def restored_by_snr(self) -> dict[float, dict[str, np.ndarray]]:
         """Restored images by S/N."""
         info = self.model.info
         return {
             signal_to_noise(info.kappa * level, info.noise_equivalent_px): images
             for level, images in self.restored.items()
         }
-
-    @property
-    def _coverage(self) -> dict[float, float]:
-        """Fraction of the errors within ± the stated 68 %, by S/N."""
-        rows = self.model.info.metrics
-        return {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
 
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other."""
@@ -392,34 +380,19 @@ class Report:
         held_out = np.flatnonzero(selection["part"] == "held out")
         shown = held_out[_evenly_spread(stars.candidates.position[held_out], 8)]
         columns, psf, residuals = _predict_all(model, stars, shown)
-        tested_row = product["row"][product["field_index"][stars.split.test]]
+        residual_figure = None
+        if len(shown):
+            sigma = columns["noise"][shown, None, None]
+            residual_figure = residual_strip(psf[shown] + residuals, residuals / sigma)
         field_map = None
         if stars.observation.positions is not None:
             names = FieldStars.__dataclass_fields__
             field_stars = FieldStars(**{name: columns[name] for name in names})
-            shown_psf = psf[field_stars.stamp_stars()]
-            field_map = psf_map(shown_psf, field_stars, stars.observation.path.name)
-        method_class = type(model.engine.estimator)
-        return quality_page(
-            ReportContents(
-                name=model.info.name,
-                image=stars.observation.path.name,
-                method=method_class.name,
-                label=method_class.look.label,
-                notes=stars.notes,
-                errors=self.table,
-                photometry=self.found,
-                coverage=self._coverage,
-                degraded_images=self._restored_by_snr,
-                degraded_stars={name: columns[name][tested_row] for name in ("x", "y", "flux")},
-                stars=columns | {name: selection[name] for name in ("verdict", "part")},
-                residuals=residuals / columns["noise"][shown, None, None],
-                bright_stamps=psf[shown] + residuals,
-                strip_png=self.strip_png,
-                field_map=field_map,
-                facts=facts_of(model.engine.estimator),
-            )
-        )
+            field_psf = psf[field_stars.stamp_stars()]
+            field_map = psf_map(field_psf, field_stars, stars.observation.path.name)
+        columns |= {name: selection[name] for name in ("verdict", "part")}
+        degraded_rows = product["row"][product["field_index"][stars.split.test]]
+        return quality_page(self, columns, degraded_rows, field_map, residual_figure)
 
 
 def _evenly_spread(position: np.ndarray, count: int) -> np.ndarray:
