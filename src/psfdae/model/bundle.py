@@ -172,6 +172,7 @@ class Bundle:
         """
         if self.scale68 is None:
             return None
+        # np.interp takes one column at a time: flatten a table to (S, …), and restore its shape.
         scales = []
         for name in SCALES:
             table = getattr(self, name)
@@ -245,6 +246,7 @@ def brightest(psf: np.ndarray) -> np.ndarray:
 
     Errors of these pixels, the core, scale in another way than those of the many faint pixels.
     """
+    # The threshold is the faintest of the bright pixels; equal pixels count as bright as well.
     flat = psf.reshape(len(psf), -1)
     faint_count = flat.shape[1] - max(1, round(20 / 256 * flat.shape[1]))
     return psf >= np.partition(flat, faint_count, axis=1)[:, faint_count, None, None]
@@ -274,6 +276,7 @@ def mahalanobis(
     -------
     ndarray, shape (n,), float64
     """
+    # Scores along the eigenvectors, each over its standard deviation with the star's noise.
     centred = stamps.reshape(len(stamps), -1) - model.mean
     scores = centred @ model.basis[:, -components:]
     variance = model.variance[-components:] + np.asarray(noise, dtype=np.float64)[:, None] ** 2
@@ -285,6 +288,7 @@ def mahalanobis(
 
 def creation_date() -> str:
     """Return today's date in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible."""
+    # https://reproducible-builds.org/specs/source-date-epoch
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
         moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
@@ -295,6 +299,7 @@ def creation_date() -> str:
 
 def write_bundle(bundle: Bundle, path: Path) -> None:
     """Write a bundle atomically, if its parts fit together; the same one gives the same bytes."""
+    # Checked as it will be when it is read: no file is written that cannot be read.
     arrays = bundle_arrays(bundle)
     _check(bundle.info, arrays, path)
     content = bundle_bytes(bundle.info.described(), arrays)
@@ -351,7 +356,7 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
 
 
 def _dtype(name: str) -> np.dtype:
-    """Return the type of an array of the file: what is compared or inverted is float64."""
+    """Return the type of an array: float64 for noise, variances, limits and factors of errors."""
     double = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", *OPTIONAL}
     return np.dtype(np.float64 if name in double else np.float32)
 
@@ -373,6 +378,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
+    # Tables keep their names; arrays of the method lose their prefix.
     names = ("noise_nodes", "error68", "rms", "ratio95", *OPTIONAL)
     tables: dict[str, Any] = {name: arrays.get(name) for name in names}
     prefix = f"{info.method}/"
@@ -436,6 +442,7 @@ def _read_info(text: Mapping[str, Any], arrays: Mapping[str, np.ndarray], path: 
         first = error.errors(include_input=False)[0]
         key = ".".join(str(part) for part in first["loc"])
         raise BundleError(f"{path}: damaged ({key[:80]}: {first['msg']})") from None
+    # Deep nesting passes the validation, but the description could not be written again.
     try:
         info.model_dump(mode="json")
     except ValueError:
@@ -451,6 +458,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     BundleError
         If an array is missing, unknown, or has a wrong type, shape or number.
     """
+    # Arrays of every bundle, with d² pixels and S nodes.
     side, pixels, components = info.stamp_px, info.stamp_px**2, info.components
     nodes = arrays["noise_nodes"].size if "noise_nodes" in arrays else 0
     expected: dict[str, tuple[int, ...]] = {
@@ -476,6 +484,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
         name = f"{info.method}/{key}"
         is_open = shape is None and name in arrays
         expected[name] = arrays[name].shape if is_open else shape or ()
+    # No array is missing or unknown; then each has the right type, shape and numbers.
     unmatched = arrays.keys() ^ expected.keys()
     name = min(unmatched, default="")
     state = "missing" if name in expected else "unknown"

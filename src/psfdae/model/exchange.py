@@ -83,6 +83,7 @@ class PsfexField(FieldPsfs):
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
+        # PSFEx writes one table with one row, the images of all terms.
         file = plain_file(path)
         with reading(path), open_hdus(file) as hdus:
             tables = [
@@ -129,6 +130,7 @@ class PsfexField(FieldPsfs):
         self.terms: np.ndarray = np.array(
             psfex_powers(self._order) if self._order <= max_order else []
         )
+        # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         side = min(mask.shape[-2:])
         is_usable = (
             0 <= self._order <= max_order
@@ -260,6 +262,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     psfs = model.psf_at(x, y, oversampling)
     basis = np.tensordot(np.linalg.pinv(terms), psfs, 1)
     error = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
+    # Readers show the FWHM; it is that of the PSF in the middle of the list of positions.
     fwhm = float(measure_shapes(psfs[len(psfs) // 2][None]).fwhm_px[0]) / oversampling
     size = basis.shape[-1]
     column = fits.Column(
@@ -269,6 +272,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
         array=basis[None].astype(np.float32),
     )
     table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    # Cards in the words of PSFEx; scaled positions u = (x − POLZERO) / POLSCAL, x from 1.
     cards: dict[str, str | float] = {"LOADED": 0, "ACCEPTED": 0, "CHI2": 1.0, "POLNAXIS": 2}
     for i, axis in enumerate("XY"):
         cards[f"POLGRP{i + 1}"] = 1
@@ -300,6 +304,7 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
             f"{path}: photutils takes the second part of a name with two or three underscores "
             "for a detector of STScI; expected another number of them"
         )
+    # Columns and rows of the grid, whole pixels counted from 1.
     positions = np.rint(model.grid(columns, rows))
     grid = positions.reshape(rows, columns, 2)
     cards: list[Card] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]

@@ -60,6 +60,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
             f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
             "exposure it was trained on"
         )
+    # The settings by which the stars of the training were chosen.
     try:
         trained = info.config["stars"]
         settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
@@ -69,6 +70,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         ) from None
     # Its bright stars, chosen as those of the training, but few are enough.
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS})
+    # The image must have the pixels of the training; another filter is only reported.
     observation = source.open(info.stamp_px, calibration.margin_px).assuming()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
@@ -79,6 +81,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
     sentence = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
     sentence = f"{sentence} ({difference})" if difference else sentence
+    # Remarks for the user: offset of the star list, number of stars, differences.
     offset_note = list_offset(
         observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
     )
@@ -121,6 +124,7 @@ def _adapt(
     weights = dict(model.bundle.weights)
     for key in ("coefficients", "listed"):
         weights[key] = arrays[key].astype(weights[key].dtype)
+    # The description names the new image, and keeps that of the training.
     image = {
         "image": observation.path.name,
         "image_sha256": observation.sha256(),

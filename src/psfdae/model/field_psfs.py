@@ -155,7 +155,8 @@ class FieldPsfs(ABC):
             raise PredictionError(f"oversampling {oversampling}: 1 to 32")
         with np.errstate(all="ignore"):
             psfs = self._psfs(position.reshape(-1, count), oversampling)
-        # Far outside the image, or in a damaged file, polynomials may give anything.
+        # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
+        # give anything.
         flux = psfs.sum(axis=(1, 2))
         is_usable = np.isfinite(flux) & (flux > 0)
         if not is_usable.all():
@@ -196,12 +197,14 @@ class FieldPsfs(ABC):
 
     def grid(self, columns: int, rows: int) -> np.ndarray:
         """Return positions (n, 2), x and y, evenly over the field; raises as `field_range`."""
+        # Rows of the grid follow each other: x changes fastest.
         low, high = self.field_range()
         x, y = (np.linspace(low[i], high[i], count) for i, count in ((0, columns), (1, rows)))
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def fwhm_px(self) -> float:
         """Return the FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        # In the middle of a pixel, so that the FWHM does not depend on a phase.
         x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
         return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
@@ -227,6 +230,7 @@ class FieldPsfs(ABC):
 
         from psfdae.model.psf_grid import PsfGrid
 
+        # photutils takes PSFs on a regular grid, x changing fastest, and interpolates between them.
         grid = PsfGrid.of(self, nodes, oversampling)
         positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
         meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
@@ -244,6 +248,7 @@ def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
     PredictionError
         If the values, called `name` in the message, are no real numbers.
     """
+    # Floats of up to 32 bits become float32, all other numbers float64.
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")

@@ -64,13 +64,16 @@ def fit(
     >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
     PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
+    # Candidates: the stated method, or all of the settings of which one becomes the model.
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
     for method_name in names:
         if not makes_models(method_name):
             raise ConfigError(f"method {method_name!r}: makes no model of an image")
     candidates = worth_trying(stars, [method_of(method_name) for method_name in names])
+    # Keywords belong to the settings of the candidates; no setting of a method changes the stars.
     groups = [group for candidate in candidates for group in candidate.groups]
     stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
+    # With several fits, validation stars decide.
     fits = {candidate.name: fitted_to(stars, candidate) for candidate in candidates}
     chosen_name = next(iter(fits)) if len(fits) == 1 else choose_method(stars, fits)[0]
     return pack_model(stars, fits[chosen_name], name or stars.name, licence)
@@ -95,7 +98,17 @@ def makes_models(name: str) -> bool:
 def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
     """Fit a method to the stars that are not held out.
 
-    A long fit keeps its state in the file `checkpoint`, if one is given.
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+    checkpoint : Path, optional
+        File for the state of a long fit, from which it goes on if it was interrupted.
+
+    Raises
+    ------
+    MissingExtraError
+        If the method needs a package that is not installed.
     """
     data = training_set(
         stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
@@ -105,7 +118,14 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
 
 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
-    """Return the settings that determine a fit, for the description of its product and model."""
+    """Return the settings that determine a fit, for the description of its product and model.
+
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+        The fitted method, whose groups of settings count beside split and truth.
+    """
     group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
     return described_by(kind, group_settings, SPLIT, REFERENCE)
 
@@ -127,6 +147,7 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
         MSE of PSFs of flux 1 by method: the geometric mean over the noise levels, so that every
         S/N counts alike.
     """
+    # Every method restores the same bright stars, degraded with the same noise.
     settings, product, validation = stars.settings, stars.product, stars.split.validation
     truth, positions = product["realisation"][validation], field_positions(product)[validation]
     errors = {}
@@ -141,6 +162,7 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # Stars of the model's use have an unknown flux.
             restorer = with_free_flux(judged)
+            # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):
                 psf = restorer.restore(images, level, positions)
@@ -161,6 +183,7 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
     name, licence : str
         Name and licence of the model.
     """
+    # Calibrate the errors of the fit on held-out stars.
     settings = stars.settings
     description = described(stars, type(fitted))
     with fixed_threads(settings.evaluation.threads):

@@ -26,7 +26,14 @@ from psfdae.model.stars import DETECTED_SIGMA, Stars
 
 
 class _Field(FieldPsfs):
-    """PSF over the field of a fit, without the errors that a model in a bundle has."""
+    """PSF over the field of a fit, without the errors that a model in a bundle has.
+
+    Parameters
+    ----------
+    fitted : FieldMixture
+    stamp_px : int
+        Side of the stamps that the fit was made of.
+    """
 
     name, image_px = "of stars without neighbours", None
 
@@ -67,6 +74,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
     Stars
         The stars as they were, with a note that tells why, if their image cannot be fitted.
     """
+    # The new choice has the stated limit on neighbours, and a nearer one on their distance.
     observation, notes = stars.observation, stars.notes
     accepted_ratio = stars.settings.calibration_stars.neighbour_ratio
     calibration = stars.settings.calibration_stars.model_copy(
@@ -128,6 +136,7 @@ def light_of_others(
     # The fitted star of each star of the list; none is within 1.5 px of a star without position.
     distance, nearest = cKDTree(centre[measured]).query(np.nan_to_num(listed, nan=-np.inf))
 
+    # The fit has the light of all stars in one image; a list asks for it a part at a time.
     def light(rows: slice, stamp_px: int, margin: int) -> np.ndarray:
         x, y = listed[rows].T
         stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]

@@ -58,6 +58,7 @@ class FieldStars:
 
         They are taken from the brightest down.
         """
+        # Take the brightest star, drop all whose stamps would overlap with its stamp, and repeat.
         candidates, spacing_px, selected = self.usable_stars(), self.stamp_spacing_px(), []
         while candidates.size:
             star = candidates[0]

@@ -133,6 +133,7 @@ class PsfGrid:
         They are the means of the splines of four nodes `node` (n, 4), weighted by `share` (n, 4),
         from the column and row `begin` (n, 2) on.
         """
+        # One star at a time: each needs another part of its four splines.
         squares = np.empty((len(node), side, side))
         for star, (column, row) in enumerate(begin.tolist()):
             square = np.s_[row : row + side, column : column + side]
@@ -143,6 +144,7 @@ class PsfGrid:
 
     def _nodes(self, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (n, 4) of the nodes around each star, and their bilinear weights."""
+        # Along each axis: the nodes below and above, and their weights.
         axes = []
         for nodes, position in ((self.columns, centre[:, 0]), (self.rows, centre[:, 1])):
             lower = np.clip(np.searchsorted(nodes, position) - 1, 0, max(len(nodes) - 2, 0))
@@ -151,6 +153,7 @@ class PsfGrid:
             # Beyond the grid the PSF is that at its edge.
             fraction = np.clip((position - nodes[lower]) / width, 0.0, 1.0)
             axes.append((np.stack([lower, upper]), np.stack([1.0 - fraction, fraction])))
+        # Four corners: weights are products of those along the axes.
         (column, column_share), (row, row_share) = axes
         number = row[:, None] * len(self.columns) + column[None]
         share = row_share[:, None] * column_share[None]

@@ -117,6 +117,7 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     method, label : str
         Name of the method in the table, and in the sentence.
     """
+    # The S/N nearest to 10 stands for faint stars, for which models differ most.
     mean, linear = (mse_ratios(errors, method, name) for name in (MEAN_PSF, "lmmse"))
     snr = nearest_snr(mean)
     sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {MEAN_LABEL}"
@@ -323,6 +324,7 @@ def _image_tag(picture: Figure | bytes) -> str:
 def _errors_table(errors: Table, model_method: str) -> str:
     """Return the table of MSE with standard errors: rows are methods, columns S/N."""
     levels = np.unique(errors["snr"])
+    # A method that was not measured at a S/N has an empty cell.
     cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
     rows = [
         [escape(f"{label} (the model)" if name == model_method else label)]
@@ -402,6 +404,7 @@ def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """
     snr = nearest_snr(degraded)
     images = degraded[snr]
+    # In per cent of the mean peak; both means share one scale of colours, symmetric about 0.
     peak = images["truth"].max(axis=(1, 2)).mean()
     figure = new_figure(2.4, layout="constrained")
     grid: Any = figure.subplots(1, 4, subplot_kw={"xticks": [], "yticks": []})
@@ -465,6 +468,7 @@ def shapes_figure(
         ("FWHM (px)", "fwhm_px", 100 * size_error, f"FWHM at S/N {snr:.3g} (%)"),
         ("ellipticity", "ellipticity", ellipticity_error, f"ellipticity at S/N {snr:.3g}"),
     )
+    # Columns of panels: instrumental magnitude, then position.
     magnitude = -2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan))
     coordinates = {"−2.5 log₁₀ flux": magnitude, "x (px)": stars["x"], "y (px)": stars["y"]}
     for column, (axis_label, place) in enumerate(coordinates.items()):

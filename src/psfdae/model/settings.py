@@ -55,6 +55,7 @@ class Settings(Group):
     @classmethod
     def _stated_size(cls, tree: Any) -> Any:
         """Keep a stated size of stamps: the light that they hold shall not change it."""
+        # What is no tree, or has a group that is none, is refused later with its key.
         if not isinstance(tree, Mapping) or not isinstance(tree.get("framing"), Mapping):
             return tree
         stars = tree.get("calibration_stars", {})
@@ -76,6 +77,7 @@ def _unpickled() -> Settings:
 @cache
 def settings_model() -> type[Settings]:
     """Return the class of all settings, those of all methods that are installed included."""
+    # A field of the class for each group of each method, by the name of the group.
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
         for method_class in known()
@@ -98,6 +100,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
     for word in words:
         key, equals, text = word.lstrip("+").partition("=")
         group, _, name = key.partition(".")
+        # Seed and list of methods are groups of a single value.
         is_group = group in ("seed", "methods") and not name
         if not equals or group not in groups or not (name or is_group):
             # The word chooses a file of a configuration, or is wrong. The extra "paper" reads the
@@ -141,6 +144,7 @@ def of_config(config: Group | Mapping[str, Any]) -> Settings:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
+    # Groups, and their keys, that these settings do not have are left out.
     tree = config if isinstance(config, Mapping) else config.model_dump()
     settings = {}
     for name in settings_model().model_fields:
@@ -162,6 +166,7 @@ def with_keywords(
     ConfigError
         If no group has a name, or a value is out of its range.
     """
+    # Only what was stated: a default may depend on it.
     tree = settings.model_dump(exclude_unset=True)
     # A group without keys, such as the seed, is itself a key.
     group_keys = {group: _keys(group) or {group} for group in groups}

@@ -20,6 +20,7 @@ from psfdae.splits import Split, held_out_split, random_split
 
 def read_stars(path: Path, *references: str) -> Product:
     """Read stars with their noise-free images, fields and the given references."""
+    # The realisation, the noise-free image, is the first of the references.
     names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
     return read_product(path, "stars", names)
 
@@ -38,6 +39,7 @@ def field_positions(stars: Product) -> np.ndarray:
         Simulated stars: steps of the field's grid. Stars of an image: pixels, magnitude and colour
         of the bright star, which stay those of its noisy images; NaN where the list lacks them.
     """
+    # Rows of fields, or of bright stars; each has several images.
     position = stars["grid"]
     if of_image(stars):
         position = places(stars["position"], stars["flux"], stars["colour"])
@@ -78,6 +80,7 @@ def split_stars(stars: Product, kind: str, config: OfFit) -> Split:
     count, validation = len(field_index), parts.validation_fraction
     if kind == "held_out":
         return held_out_split(field_index, stars["grid"], validation, config.seed)
+    # Training and test share no image; validation stars are a part of the training.
     if parts.train_stars + parts.test_stars > count:
         raise ProductError(
             f"{stars.path}: holds {count} stars, but parts.train_stars + parts.test_stars = "
@@ -107,6 +110,7 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
     level : float
     """
     set_name = stars.config.get("stars", {}).get("name", "own")
+    # Six digits of λ: the same level from two files may differ in the last bit.
     rng = stream(config.seed, "noise", "test", set_name, f"{level:.6g}")
     return np.asarray(noise_model(config).draw(stars["realisation"], level, rng)[test])
 
@@ -167,6 +171,8 @@ def training_set(
         star, background = stars["field_index"], config.noise.background_photons
         return OwnNoise(stars["noise"][star], background, stars["phase"], star)(images, mean)
 
+    # Stars of an image have noise themselves, and some methods measure them in the image; simulated
+    # stars have a description of their simulation.
     parts = split_stars(stars, split, config)
     if of_image(stars):
         fields["own_noise"] = star_noise

@@ -166,6 +166,7 @@ class Stars:
         Error
             If the image or the list cannot be used, or too few stars are bright enough.
         """
+        # All images are opened with the same statements.
         threshold = DETECTED_SIGMA if detect is True else detect or None
         images = as_images(image)
         if not images:
@@ -223,6 +224,7 @@ class Stars:
                 f"learnt from, as fewer than 20 have S/N {calibration.least_snr:g}; --snr-min "
                 "takes others"
             )
+        # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
         for source, observation, measured in zip(sources, opened, candidates, strict=True):
             if len(sources) == 1:
@@ -288,6 +290,7 @@ class Stars:
         notes = [observation.said(), *filter(None, [offset_note])]
         if len(bright) >= settings.calibration_stars.stars_min:
             notes += advice(candidates, observation, settings.framing.stamp_px)
+        # Noise levels follow from the noise-equivalent area of the bright stars.
         if len(bright):
             sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
             settings = _with_noise(settings, bright, sky)
@@ -360,6 +363,7 @@ class Stars:
 
     def with_settings(self, settings: Settings) -> Stars:
         """Return these stars with other settings of methods."""
+        # The images are drawn once for all methods.
         stars = replace(self, settings=settings)
         vars(stars)["columns"] = self.columns  # no setting of a method changes them
         return stars
@@ -422,6 +426,7 @@ class Stars:
         description["telescope"] = {"pixel_scale_arcsec": observation.pixel_scale_arcsec}
         if observation.scale_assumed:
             description["telescope"]["assumed"] = True
+        # Tuples become lists, as in the description of a product that was read from a file.
         plain: dict[str, Any] = json.loads(json.dumps(description))
         return plain
 
@@ -468,15 +473,16 @@ def collect_enough(
     selection = collect_all(snr_min=calibration.least_snr)
     if bright_count(selection) >= ENOUGH_STARS:
         return selection
-    # Fainter stars; down to S/N 20 their number makes up for their noise. Of two selections with as
-    # many stars, the first one stays.
+    # Fainter stars: three times as many as needed while their S/N is above 20. Of two selections
+    # with as many stars, the first one stays.
     for snr in calibration.lower_snr():
         selection = max(selection, collect_all(snr_min=snr), key=bright_count)
         if bright_count(selection) >= (ENOUGH_STARS if snr <= 20.0 else 3 * ENOUGH_STARS):
             return selection
     crowded = sum(np.count_nonzero(c.verdict == Verdict.CROWDED) for c in selection[1])
-    # Brighter neighbours, and cores alone: the median of stars with neighbours on any side has
-    # little of the neighbours' light.
+    # Brighter neighbours; their brightness is that of their cores, since the stamp of a faint star
+    # has the light of a bright neighbour. The mean PSF is a median: of neighbours on all sides it
+    # has little light.
     for ratio in (0.05, 0.1, 0.2, 0.4) if crowded >= ENOUGH_STARS else ():
         if bright_count(selection) < ENOUGH_STARS:
             limits = {"snr_min": calibration.least_snr, "neighbour_ratio": ratio}

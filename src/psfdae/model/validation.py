@@ -78,7 +78,7 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     _require_unseen(model, stars)
     settings, product = stars.settings, stars.product
     fits = {**(others or {}), model.info.method: model.engine.estimator}
-    # Every table has the noisy images and linear MMSE; both take no time to fit.
+    # Every table has the noisy images and linear MMSE; both are quick to fit.
     baselines = ("noisy", "lmmse")
     names = [name for name in settings.methods if name in fits or name in baselines]
     names += [name for name in (model.info.method, *baselines) if name not in names]
@@ -106,6 +106,7 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
     hashes = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
     if not {*", ".join(hashes).split(", ")} & {*product.config["image_sha256"].split(", ")}:
         return
+    # The training images of a model are those of these stars if their checksum is the same.
     train = stars.split.train
     if info.training_sha256 != checksum(product["realisation"][train], product[REFERENCE][train]):
         raise PredictionError(
@@ -178,6 +179,7 @@ def _measure_photometry(
         offset_error = np.stack(
             [np.hypot(estimate.x_error, bright.x_error), np.hypot(estimate.y_error, bright.y_error)]
         )
+        # Pull of the flux: its error over the standard error, that of the truth included.
         pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
         flux_bias, flux_bias_stderr = _usable_mean(estimate.flux - 1.0, star, usable)
         flux_pull = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
@@ -228,6 +230,7 @@ def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
     """
     from astropy.table import Table
 
+    # Methods differ in their metrics: columns stand in the order in which they first appear.
     names = dict.fromkeys(name for block in blocks for name in block)
     columns = {
         name: [np.broadcast_to(block.get(name, np.nan), block["star"].shape) for block in blocks]
@@ -325,6 +328,7 @@ class Report:
 
     def checks(self) -> list[Check]:
         """Check the model on the stars held out: question, answer, and True if it is passed."""
+        # Coverage was measured when the model was made, at S/N of its own.
         rows = self.model.info.metrics
         coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
         method = self.model.info.method
@@ -348,6 +352,7 @@ class Report:
         product, test = self.stars.product, self.stars.split.test
         kappa = self.stars.settings.noise.kappa
         area = star_area(product, self.stars.split.train)
+        # The noise level whose S/N is the nearest to 10.
         levels = {signal_to_noise(kappa * level, area): level for level in self.restored}
         snr = nearest_snr(levels)
         # Six stars that lie evenly over the field, one image of each.
@@ -356,6 +361,7 @@ class Report:
         shown = first[_evenly_spread(product["position"][tested], 6)]
         images = self.restored[levels[snr]]
         noisy, truth = images["noisy"][shown], images["truth"][shown]
+        # A row of the bright stars, then one for each method that figures show.
         rows = [StripRow("bright\nstar", truth)]
         for method in self.methods.values():
             look = method.look
@@ -428,6 +434,7 @@ def _predict_all(
     streams = (
         model.stream(image.observation.with_margin(MARGIN_PX), threads=1) for image in stars.images
     )
+    # Batches of a stream: columns and PSFs are joined, residuals are kept for few stars only.
     for _, prediction in itertools.chain.from_iterable(streams):
         for name, values in prediction.columns().items():
             columns.setdefault(name, []).append(values)
