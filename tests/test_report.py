@@ -100,9 +100,15 @@ def checks(**changed):
     [
         ({"errors": errors((2e-6, 5e-6), linear=(5e-6, 6e-6))}, "Better than one mean PSF?"),
         ({"errors": errors((2e-6, 3e-6))}, "Better than linear MMSE?"),
-        ({"coverage": {10.0: 0.4}}, "Does ± UNCERT hold 68 % of the errors?"),
-        ({"photometry": photometry(flux=(0.68, 0.5))}, "Do errors of the flux hold 68 %?"),
-        ({"photometry": photometry(centre=(0.9, 0.68))}, "Do errors of the centre hold 68 %?"),
+        ({"coverage": {10.0: 0.4}}, "Are 68 % of pixel errors within ± UNCERT?"),
+        (
+            {"photometry": photometry(flux=(0.68, 0.5))},
+            "Are 68 % of flux errors within ± σ?",
+        ),
+        (
+            {"photometry": photometry(centre=(0.9, 0.68))},
+            "Are 68 % of centre errors within ± σ?",
+        ),
         ({"errors": errors((2e-6, 1e-6), stars=5)}, "Stars held out"),
     ],
 )

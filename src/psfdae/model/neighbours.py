@@ -99,9 +99,9 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
             return replace(stars, notes=(*stars.notes, note))
         message = (
             f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
-            f"stamps; {len(stars)} stars are good with no neighbour above "
+            f"stamps; bright stars before: {len(stars)}, no neighbour above "
             f"{100 * accepted_ratio:g} % of their brightness within {calibration.isolation_px:g} "
-            f"px, {len(isolated)} with none above {100 * neighbour_ratio:g} % within "
+            f"px; now: {len(isolated)}, none above {100 * neighbour_ratio:g} % within "
             f"{isolation_px:.2g} px"
         )
         stars = replace(isolated, observation=observation, wings=photometry.wings)

@@ -195,14 +195,20 @@ def check_held_out(
     if coverage:
         by_snr = ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items()))
         is_covered = all(low < fraction < high for fraction in coverage.values())
-        rows.append(("Does ± UNCERT hold 68 % of the errors?", by_snr, is_covered))
+        rows.append(("Are 68 % of pixel errors within ± UNCERT?", by_snr, is_covered))
     for name in ("flux", "centre"):
         cells = [(r["snr"], r[f"{name}_within"], r[f"{name}_within_stderr"]) for r in photometry]
         cells = [cell for cell in cells if np.isfinite(cell[1])]
         by_snr = ", ".join(f"{100 * v:.0f} ± {100 * e:.0f} % at S/N {s:.3g}" for s, v, e in cells)
         is_covered = all(low < v + 2 * e and v - 2 * e < high for _, v, e in cells)
         if cells:
-            rows.append((f"Do errors of the {name} hold 68 %?", by_snr, is_covered))
+            rows.append(
+                (
+                    f"Are 68 % of {name} errors within ± σ?",
+                    by_snr,
+                    is_covered,
+                )
+            )
     # With fewer than 20 stars, all of the above is rough.
     return [*rows, ("Stars held out", f"{held_out}", held_out >= 20)]
 
@@ -223,7 +229,7 @@ def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
             medians.append(float(np.median(chi2)))
             answers.append(f"median {medians[-1]:.2f} at S/N {label} ({chi2.size} stars)")
     if medians:
-        question = "χ² of stars without a flag that were not learnt from"
+        question = "χ² of unflagged stars outside the training"
         is_passed = all(0.8 < median < 1.3 for median in medians)
         checks.append((question, ", ".join(answers), is_passed))
     # Outliers: the model is not meant for an image where more than a tenth of the stars are.
@@ -236,7 +242,7 @@ def checks_html(rows: Sequence[Check]) -> str:
     """Return a table of checks, each passed or to be inspected."""
     words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
     cells = [(escape(a), escape(b), words[bool(is_passed)]) for a, b, is_passed in rows]
-    return html_table(("check", "found", ""), cells)
+    return html_table(("check", "result", ""), cells)
 
 
 # The page.
@@ -272,7 +278,7 @@ def quality_page(
     parts = [
         f"<h1>{escape(name)}</h1><p class=lead>{escape(str(report))}.</p>",
         checks_html(summary_checks),
-        "<h2>Errors on stars that no training saw, degraded to low S/N</h2>",
+        "<h2>Errors on held-out stars, degraded to low S/N</h2>",
         _errors_table(report.table, method.name),
         _image_tag(errors_figure(report.table, method.name)),
         _image_tag(report.strip_png),
@@ -282,9 +288,9 @@ def quality_page(
         *(f"<p>{escape(fact)}.</p>" for fact in facts_of(report.model.engine.estimator)),
         _image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         "<h2>Residuals of held-out stars</h2>",
-        "<p>Above: restored minus bright image at the S/N given, over all held-out stars. "
-        "Below: bright held-out stars as they are in the image, and what their PSF leaves, in σ "
-        "of the sky.</p>",
+        "<p>Above: mean and RMS of restored minus bright image, over all held-out stars. Below: "
+        "bright held-out stars, and their residuals after the PSF is subtracted, in σ of the "
+        "sky.</p>",
         _image_tag(error_maps(images)),
         _image_tag(residuals) if residuals else "",
         "<h2>Size and shape against magnitude and place</h2>",
@@ -293,7 +299,7 @@ def quality_page(
         _image_tag(chi2_figure(stars)),
         "<h2>Stars left out</h2>",
         _verdict_tables(stars),
-        "<h2>What is known of the image</h2><ul>",
+        "<h2>Camera, star list and advice</h2><ul>",
         *(f"<li>{escape(line)}</li>" for line in notes),
         "</ul>",
     ]
@@ -350,9 +356,9 @@ def _photometry_table(photometry: Table) -> str:
     ]
     head = ("S/N", "flux, mean error", "pull of the flux", "centre, RMS error (px)")
     return (
-        "<p>Held-out stars degraded to low S/N, of which neither flux, sky, noise nor centre is "
-        "given. The pull is what 68 % of the errors are below, over the stated error; it is 1 "
-        "where errors hold.</p>" + html_table(head, rows)
+        "<p>Held-out stars degraded to low S/N; the model is given neither flux, sky, noise nor "
+        "centre. The pull is the 68 % quantile of the absolute error, over the stated error; it is "
+        "1 if stated errors are right.</p>" + html_table(head, rows)
     )
 
 
@@ -362,7 +368,7 @@ def _verdict_tables(stars: Mapping[str, np.ndarray]) -> str:
     rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
     counts = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
     return (
-        html_table(("used for training, or why not", "stars"), rows)
+        html_table(("selection for the training", "stars"), rows)
         + "<p>Flags of the model on all stars of the list:</p>"
         + html_table(("flag", "stars"), [*counts, ("none", str(int((flags == 0).sum())))])
     )

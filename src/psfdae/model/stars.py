@@ -221,8 +221,8 @@ class Stars:
         if relaxed.calibration_stars.least_snr < calibration.least_snr:
             notes.append(
                 f"few stars: those of S/N {relaxed.calibration_stars.least_snr:g} and above are "
-                f"learnt from, as fewer than 20 have S/N {calibration.least_snr:g}; --snr-min "
-                "takes others"
+                f"used, because fewer than 20 have S/N {calibration.least_snr:g}; --snr-min sets "
+                "another limit"
             )
         # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
@@ -553,7 +553,7 @@ def enlarge_stamps(
         old_part, new_part = (100 * largest.light_within(s) for s in (framing.stamp_px, side))
         note += (
             f"; stamps of {side} px, which hold {new_part:.1f} % of it, are used instead of "
-            f"{framing.stamp_px} px ({old_part:.0f} %); --stamp-px takes others"
+            f"{framing.stamp_px} px ({old_part:.0f} %); --stamp-px sets another size"
         )
     if largest.hollow:
         note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
@@ -584,7 +584,7 @@ def few_stars_notes(stars: Stars) -> list[str]:
         return ["one star: the PSF is this star, tested on itself; its error is not known"]
     training = count - held_out
     if count >= MIN_STARS_WITH_ERROR:
-        sentence = f"{training} are learnt from, {held_out} test the model; its errors are rough"
+        sentence = f"{training} train the model, {held_out} test it; its errors are rough"
     else:
         sentence = f"the PSF is the mean of {training} stars, tested on {held_out}; its error is "
         sentence += "not known"
