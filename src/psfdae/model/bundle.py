@@ -311,6 +311,7 @@ def bundle_bytes(description: Mapping[str, Any], arrays: Mapping[str, np.ndarray
     """Return the bytes of a bundle file with its checksum, without checks of its contents."""
     from safetensors.numpy import save
 
+    # The checksum is of the description as it stands here, and of all arrays.
     text = {
         "kind": KIND,
         "format_version": description["format_version"],
@@ -433,6 +434,7 @@ def _check_format(text: Any, path: Path) -> None:
 
 def _read_info(text: Mapping[str, Any], arrays: Mapping[str, np.ndarray], path: Path) -> BundleInfo:
     """Return the description of a bundle, whose checksum and fields are right."""
+    # The checksum of description and arrays comes first: nothing else is read from a damaged file.
     tree = text.get("info")
     is_intact = isinstance(tree, dict) and text.get("sha256") == _digest(tree, arrays)
     _require(is_intact, path, "damaged (the checksum differs)")

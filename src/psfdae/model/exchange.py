@@ -105,7 +105,20 @@ class PsfexField(FieldPsfs):
         raise PredictionError(f"{self.path}: {problem}")
 
     def _read(self, header: Mapping[str, Any], mask: np.ndarray) -> None:
-        """Set polynomial, sampling and scales from the header and the images of the terms."""
+        """Set polynomial, sampling and scales.
+
+        Parameters
+        ----------
+        header : mapping
+            Header of the table PSF_DATA.
+        mask : ndarray, shape (t, h, w) or (h, w)
+            Images of the terms.
+
+        Raises
+        ------
+        PredictionError, KeyError, TypeError, ValueError
+            If the header lacks a key, or has one that is no model of the position.
+        """
         # Coordinates of the polynomial: none, or x and y in one group.
         axis_count = int(header["POLNAXIS"])
         names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axis_count)]
@@ -148,13 +161,16 @@ class PsfexField(FieldPsfs):
 
     @property
     def order(self) -> int:
+        """Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere."""
         return self._order
 
     @cached_property
     def sha256(self) -> str:
+        """Checksum of the file."""
         return hashlib.sha256(self.path.read_bytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
         if (self.width <= UNKNOWN_WIDTH_PX).any():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
@@ -291,6 +307,13 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
 def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     """Write PSFs on a grid as STScI's library of PSFs has them, 4 values per pixel and axis.
 
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    columns, rows : int
+        Positions along x and along y, evenly over the field.
+
     Raises
     ------
     PredictionError
@@ -330,7 +353,19 @@ def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling
 def _write_cube(
     path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int, cards: list[Card]
 ) -> None:
-    """Write a FITS cube of centred PSFs, with cards of its format after those of the model."""
+    """Write a FITS cube of centred PSFs.
+
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    positions : ndarray, shape (n, 2)
+        Positions x and y; PSFs are those of the nearest whole pixel.
+    oversampling : int
+        Values per pixel and axis.
+    cards : list of Card
+        Cards of the format, which follow those of the model.
+    """
     from astropy.io import fits
 
     # PSFs about the middle of a pixel are centred.

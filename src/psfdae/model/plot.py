@@ -30,7 +30,19 @@ UNUSABLE_FLAGS = (
 
 @dataclass(frozen=True)
 class FieldStars:
-    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each."""
+    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each.
+
+    Attributes
+    ----------
+    x, y : ndarray
+        Positions, 0-based pixels of the image; NaN if unknown.
+    snr : ndarray
+        Signal-to-noise ratio, by which stars are ordered.
+    fwhm_px, ellipticity, position_angle_deg : ndarray
+        Size and shape of the PSF of the star; the angle is from +x to +y.
+    flags : ndarray of int
+        Sum of the values of `StarFlag`.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -71,7 +83,13 @@ class FieldStars:
 
 
 def map_of_file(path: Path) -> Figure:
-    """Draw the map of the PSFs in a FITS file of a prediction."""
+    """Draw the map of the PSFs in a FITS file of a prediction.
+
+    Parameters
+    ----------
+    path : Path
+        File of `psfdae predict`, with the extensions STARS and PSF.
+    """
     from astropy.io import fits
 
     with fits.open(path, memmap=True) as file:
@@ -138,7 +156,19 @@ def _draw_whiskers(
 ) -> LineCollection | None:
     """Draw a line along the major axis of each selected star, with a key for ellipticity 0.2.
 
-    Lines are coloured by FWHM. Return them, or None if no star is selected.
+    Parameters
+    ----------
+    axes : Axes
+    stars : FieldStars
+    selected : ndarray of int
+        Numbers of the stars.
+    spacing_px : float
+        Distance of two stamps of the map.
+
+    Returns
+    -------
+    LineCollection or None
+        Lines, coloured by FWHM; None if no star is selected.
     """
     from matplotlib.collections import LineCollection
 

@@ -108,7 +108,7 @@ def nearest_snr(values: Iterable[float]) -> float:
 
 
 def comparison_sentence(errors: Table, method: str, label: str) -> str:
-    """Compare a method with one mean PSF and with linear MMSE in one sentence.
+    """Return a sentence that compares a method with one mean PSF and with linear MMSE.
 
     Parameters
     ----------
@@ -175,6 +175,7 @@ def check_held_out(
         Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
         (`model`) and by one mean PSF (`MEAN_PSF`).
     """
+    # Each row: question, answer at each S/N, and the verdict. What was not measured has no row.
     rows: list[Check] = []
     # MSE beside the two simplest models of the PSF.
     for label, reference in (("one mean PSF", MEAN_PSF), ("linear MMSE", "lmmse")):
@@ -239,7 +240,7 @@ def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
 
 
 def checks_html(rows: Sequence[Check]) -> str:
-    """Return a table of checks, each passed or to be inspected."""
+    """Return an HTML table of checks, each passed or to be inspected."""
     words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
     cells = [(escape(a), escape(b), words[bool(is_passed)]) for a, b, is_passed in rows]
     return html_table(("check", "result", ""), cells)
@@ -328,7 +329,15 @@ def _image_tag(picture: Figure | bytes) -> str:
 
 
 def _errors_table(errors: Table, model_method: str) -> str:
-    """Return the table of MSE with standard errors: rows are methods, columns S/N."""
+    """Return the HTML table of MSE with standard errors: rows are methods, columns S/N.
+
+    Parameters
+    ----------
+    errors : Table
+        Columns of `report.csv`.
+    model_method : str
+        Name of the method that is marked as the model.
+    """
     levels = np.unique(errors["snr"])
     # A method that was not measured at a S/N has an empty cell.
     cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
@@ -344,7 +353,10 @@ def _errors_table(errors: Table, model_method: str) -> str:
 
 
 def _photometry_table(photometry: Table) -> str:
-    """Return the table of flux and centre of held-out stars that nothing was stated about."""
+    """Return the HTML table of photometry of held-out stars, given nothing but their stamps.
+
+    `photometry` has the columns of `found.csv`.
+    """
     rows = [
         [
             f"{row['snr']:.3g}",
@@ -363,7 +375,10 @@ def _photometry_table(photometry: Table) -> str:
 
 
 def _verdict_tables(stars: Mapping[str, np.ndarray]) -> str:
-    """Return the counts of stars by verdict of their selection, and by flag of the model."""
+    """Return HTML tables: counts of stars by verdict of their selection, and by flag of the model.
+
+    `stars` has the columns `verdict` and `flags`; a star may have several flags.
+    """
     verdicts, flags = stars["verdict"], stars["flags"]
     rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
     counts = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
@@ -385,7 +400,15 @@ def _method_labels(errors: Table) -> dict[str, str]:
 
 @styled
 def errors_figure(errors: Table, model_method: str) -> Figure:
-    """Draw MSE against S/N for each method, with the noise of the bright images as a floor."""
+    """Draw MSE against S/N for each method, with the noise of the bright images as a floor.
+
+    Parameters
+    ----------
+    errors : Table
+        Columns of `report.csv`.
+    model_method : str
+        Name of the method with the thick line.
+    """
     figure = new_figure(3.4, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="MSE")
     for index, (name, label) in enumerate(_method_labels(errors).items()):
@@ -465,6 +488,7 @@ def shapes_figure(
     `quality_page`, with the images by S/N.
     """
     snr = nearest_snr(degraded)
+    # Shapes of flagged stars mean nothing.
     usable = ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
     size_error, ellipticity_error = size_errors(degraded[snr])
@@ -495,7 +519,11 @@ def shapes_figure(
 
 @styled
 def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
-    """Draw χ² per pixel of all stars against S/N: flagged, used for training, and neither."""
+    """Draw χ² per pixel of all stars against S/N: flagged, used for training, and neither.
+
+    `stars` has the columns flags, part, chi2 and snr, shape (n,) each. χ² is 1 where the model and
+    the noise are right.
+    """
     flagged, learnt = stars["flags"] != 0, stars["part"] == "training"
     # Both axes are logarithmic.
     positive = (stars["chi2"] > 0) & (stars["snr"] > 0)

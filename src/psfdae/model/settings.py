@@ -38,7 +38,25 @@ IMAGE_GROUPS = ("calibration_stars", "framing", "parts", "seed")
 
 
 class Settings(Group):
-    """Settings of a training on the bright stars of an image, without those of the methods."""
+    """Settings of a training on the bright stars of an image, without those of the methods.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of all random streams.
+    methods : list of str
+        Methods that are fitted; one of them becomes the model.
+    calibration_stars : CalibrationStars
+        Choice of the bright stars, and the S/N to which they are degraded.
+    framing : Stamp
+        Side of the stamps, and the jitter of their centres.
+    noise : Noise
+        Noise levels λ, their factor κ, and the sky.
+    parts : Parts
+        Numbers of training, validation and test images.
+    evaluation : Evaluation
+        Settings of metrics and of the linear algebra.
+    """
 
     seed: Seed = 20200611
     # Without a network, which takes longer than all of these together.
@@ -180,6 +198,6 @@ def with_keywords(
 
 
 def _keys(group: str) -> set[str]:
-    """Return the keys of a group of settings; none if it is a single value."""
+    """Return the keys of a group of settings; none if it is a single value such as the seed."""
     kind = settings_model().model_fields[group].annotation
     return {*kind.model_fields} if isinstance(kind, type) and issubclass(kind, Group) else set()

@@ -218,6 +218,7 @@ class Stars:
                 for observation in opened
             ]
             relaxed, candidates = collect_enough(opened, settings)
+        # The user learns that stars below the stated S/N take part.
         if relaxed.calibration_stars.least_snr < calibration.least_snr:
             notes.append(
                 f"few stars: those of S/N {relaxed.calibration_stars.least_snr:g} and above are "
@@ -227,6 +228,7 @@ class Stars:
         # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
         for source, observation, measured in zip(sources, opened, candidates, strict=True):
+            # Of several images, one may have few stars or none.
             if len(sources) == 1:
                 min_stars = relaxed.calibration_stars.stars_min
                 measured.require(observation.path, min_stars, observation.remarks)
@@ -250,6 +252,7 @@ class Stars:
         CalibrationStarsError
             If all together are too few.
         """
+        # The joined observation stands for all images, as large as the largest.
         first, observations = exposures[0], [image.observation for image in exposures]
         observation = replace(
             first.observation,
@@ -278,16 +281,28 @@ class Stars:
     def of_candidates(
         cls, source: Source, observation: Observation, candidates: Candidates, settings: Settings
     ) -> Stars:
-        """Return the bright stars among the measured stars of an observation."""
+        """Return the bright stars among the measured stars of an observation.
+
+        Parameters
+        ----------
+        source : Source
+        observation : Observation
+        candidates : Candidates
+            Measured stars of the observation.
+        settings : Settings
+            Settings by which the stars were chosen.
+        """
         bright = candidates.bright
         # A single star stands twice: the model is trained on it and tested on it.
         if len(bright) == 1:
             bright = bright.of(np.array([0, 0]))
             candidates = replace(candidates, bright=bright)
+        # Median offset (x, y) between stars and list; a large one is refused unless accepted.
         offset_note = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
         notes = [observation.said(), *filter(None, [offset_note])]
+        # Advice on stamps and saturation needs enough stars for a median.
         if len(bright) >= settings.calibration_stars.stars_min:
             notes += advice(candidates, observation, settings.framing.stamp_px)
         # Noise levels follow from the noise-equivalent area of the bright stars.
@@ -310,6 +325,7 @@ class Stars:
     @cached_property
     def columns(self) -> dict[str, Column]:
         """Arrays of the product "stars"."""
+        # Positions on a lattice over each image, by which stars are held out evenly over its field.
         settings, calibration = self.settings, self.settings.calibration_stars
         grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.images])
         return training_columns(
@@ -326,6 +342,7 @@ class Stars:
     @property
     def is_crowded(self) -> bool:
         """True if so many bright stars have neighbours that it pays to subtract these."""
+        # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
         has_image = self.observation.shape is not None
         if not has_image or not np.isfinite(self.candidates.bright.position).all():
             return False
@@ -513,11 +530,13 @@ def enlarge_stamps(
         brightest pixels in their middle.
     """
     calibration, framing = settings.calibration_stars, settings.framing
+    # A stated size of stamps and a stated centring leave nothing to adapt.
     if not calibration.light_min and calibration.centring_px is not None:
         return None
     largest = _largest_size(opened, candidates)
     if largest is None:
         return None
+    # The side of stamps that hold the stated part of the light, at least that of the settings.
     side = framing.stamp_px
     if calibration.light_min:
         side = max(side, largest.side(calibration.light_min))
@@ -563,7 +582,19 @@ def enlarge_stamps(
 def _largest_size(
     opened: Sequence[Observation], candidates: Sequence[Candidates]
 ) -> SourceSize | None:
-    """Return the size of stars in the image where it is largest; None if no star is detected."""
+    """Return the size of stars in the image where it is largest.
+
+    Parameters
+    ----------
+    opened : sequence of Observation
+    candidates : sequence of Candidates
+        Measured stars of each observation.
+
+    Returns
+    -------
+    SourceSize or None
+        None for cubes of stamps, or if no star is detected.
+    """
     sizes = []
     for observation, measured in zip(opened, candidates, strict=True):
         if observation.shape is not None and observation.positions is not None:
@@ -576,7 +607,11 @@ def _largest_size(
 
 
 def few_stars_notes(stars: Stars) -> list[str]:
-    """Return notes on a model of few stars."""
+    """Return notes on a model of few stars: none, or one line.
+
+    Errors of a model rest on the stars held out, a fifth of all: with fewer than 20 stars they are
+    rough, with fewer than 5 not stated.
+    """
     count, held_out = len(stars), int(stars.held_out.sum())
     if count >= ENOUGH_STARS:
         return []
@@ -592,7 +627,13 @@ def few_stars_notes(stars: Stars) -> list[str]:
 
 
 def _require_unique_names(sources: Sequence[Source]) -> None:
-    """Refuse images whose models would have the same name."""
+    """Refuse images whose models would have the same name.
+
+    Raises
+    ------
+    ObservationError
+        If two files have the same name without suffix.
+    """
     paths: dict[str, Path] = {}
     for source in sources:
         if source.name in paths:
@@ -602,11 +643,23 @@ def _require_unique_names(sources: Sequence[Source]) -> None:
 
 
 def _require_one_camera(opened: Sequence[Observation]) -> None:
-    """Refuse several images with pixels of several sizes, or several cameras or filters."""
+    """Refuse several images with pixels of several sizes, or several cameras or filters.
+
+    Parameters
+    ----------
+    opened : sequence of Observation
+        A single one is accepted, a cube of stamps as well.
+
+    Raises
+    ------
+    ObservationError
+        Names the first difference from the first image.
+    """
     first = opened[0]
     for observation in opened if len(opened) > 1 else ():
         if observation.shape is None:
             raise ObservationError(observation.path, "a cube of stamps; expected an image")
+        # Telescope, camera and filter of the headers, then the pixel scale, which is named first.
         differences = [
             (key, repr(first_value), repr(value))
             for key, first_value, value in other_instruments(
@@ -627,6 +680,13 @@ def _with_noise(settings: Settings, bright: BrightStars, sky_photons: float) -> 
     """Return settings with the noise levels λ of the stated S/N, for noise-free stars of flux 1.
 
     S/N = 1 / (κ λ √A), with A the median noise-equivalent area of the bright stars.
+
+    Parameters
+    ----------
+    settings : Settings
+    bright : BrightStars
+    sky_photons : float
+        Photons of the sky in a pixel.
     """
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
     degraded_snr = settings.calibration_stars.degraded()

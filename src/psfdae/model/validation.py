@@ -94,7 +94,14 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
 
 
 def _require_unseen(model: PsfModel, stars: Stars) -> None:
-    """Refuse a model of other stars of the same image, and one of another camera."""
+    """Refuse a model that may have learnt from the stars held out, and one of another camera.
+
+    Raises
+    ------
+    PredictionError
+        If pixels or stamps differ from those of the model, or if it was trained on other stars of
+        the same image.
+    """
     info, product, path = model.info, stars.product, stars.observation.path
     model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
@@ -116,7 +123,15 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
 
 
 def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
-    """Measure fitted methods, and photometry of the model, on held-out stars at every λ."""
+    """Measure fitted methods, and photometry of the model, on held-out stars at every λ.
+
+    Parameters
+    ----------
+    model : PsfModel
+    stars : Stars
+    methods : mapping of str to Method
+        Fits by name, that of the model included.
+    """
     settings, product, test = stars.settings, stars.product, stars.split.test
     truth, star = product[REFERENCE][test], product["field_index"][test]
     position, data_range = field_positions(product)[test], settings.evaluation.data_range
@@ -157,7 +172,19 @@ def _measure_photometry(
 ) -> Table:
     """Predict held-out stars of flux 1 at each λ from their places alone (`Report.found`).
 
-    The bright star that is the truth has noise of its own, which counts in every error.
+    The bright star that is the truth has noise itself, which counts in every error.
+
+    Parameters
+    ----------
+    model : PsfModel
+    stars : Stars
+    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Degraded images (`noisy`) by noise level λ.
+
+    Returns
+    -------
+    Table
+        Rows by S/N, ascending.
     """
     product, test = stars.product, stars.split.test
     kappa, background = stars.settings.noise.kappa, stars.settings.noise.background_photons
@@ -244,10 +271,17 @@ def _error_table(
 ) -> Table:
     """Return MSE and SSIM by S/N and method, the table `Report.table`.
 
-    `statistics` has a row for each noise level, method and metric.
+    Parameters
+    ----------
+    statistics : sequence of mappings
+        Mean and standard error of each metric, by noise level and method.
+    stars : Stars
+    methods : mapping of str to Method
+        Methods in the order of the rows; one mean PSF comes last.
     """
     settings, product, split = stars.settings, stars.product, stars.split
     area = star_area(product, split.train)
+    # Mean and standard error of each metric, by noise level and method.
     cells = {(row["noise_level"], row["method"], row["metric"]): row for row in statistics}
     # Noise of the bright images: the variance of their pixels is a part of every MSE.
     sky_photons = settings.noise.background_photons
@@ -386,10 +420,12 @@ class Report:
         held_out = np.flatnonzero(selection["part"] == "held out")
         shown = held_out[_evenly_spread(stars.candidates.position[held_out], 8)]
         columns, psf, residuals = _predict_all(model, stars, shown)
+        # Stamps without sky are the PSF plus its residual; σ is the noise of the sky.
         residual_figure = None
         if len(shown):
             sigma = columns["noise"][shown, None, None]
             residual_figure = residual_strip(psf[shown] + residuals, residuals / sigma)
+        # The map has the PSFs of bright stars whose stamps do not overlap.
         field_map = None
         if stars.observation.positions is not None:
             names = FieldStars.__dataclass_fields__
@@ -397,6 +433,7 @@ class Report:
             field_psf = psf[field_stars.stamp_stars()]
             field_map = psf_map(field_psf, field_stars, stars.observation.path.name)
         columns |= {name: selection[name] for name in ("verdict", "part")}
+        # Row of the prediction for each held-out image; a star has several images.
         degraded_rows = product["row"][product["field_index"][stars.split.test]]
         return quality_page(self, columns, degraded_rows, field_map, residual_figure)
 
