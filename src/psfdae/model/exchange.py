@@ -10,6 +10,7 @@ centred there would get.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -122,10 +123,7 @@ class PsfexField(FieldPsfs):
         # Coordinates of the polynomial: none, or x and y in one group.
         axis_count = int(header["POLNAXIS"])
         names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axis_count)]
-        is_position = len(names) == 2 and all(
-            name.startswith(axis) and name.endswith("_IMAGE")
-            for axis, name in zip("XY", names, strict=True)
-        )
+        is_position = re.fullmatch(r"X\S*_IMAGE Y\S*_IMAGE", " ".join(names))
         if names and not (is_position and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
         self._order = int(header["POLDEG1"]) if names else 0

@@ -21,8 +21,8 @@ from psfdae.splits import Split, held_out_split, random_split
 def read_stars(path: Path, *references: str) -> Product:
     """Read stars with their noise-free images, fields and the given references."""
     # The realisation, the noise-free image, is the first of the references.
-    names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
-    return read_product(path, "stars", names)
+    names = dict.fromkeys(("realisation", *references, "field_index", "grid"))
+    return read_product(path, "stars", tuple(names))
 
 
 def of_image(stars: Product) -> bool:

@@ -81,10 +81,9 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     # Every table has the noisy images and linear MMSE; both are quick to fit.
     baselines = ("noisy", "lmmse")
     names = [name for name in settings.methods if name in fits or name in baselines]
-    names += [name for name in (model.info.method, *baselines) if name not in names]
     methods: dict[str, Method] = {}
     with fixed_threads(settings.evaluation.threads):
-        for name in names:
+        for name in dict.fromkeys([*names, model.info.method, *baselines]):
             if name not in fits:
                 method_class = method_of(name)
                 data = training_set(settings, method_class, product, SPLIT, REFERENCE)
