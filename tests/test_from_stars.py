@@ -254,7 +254,7 @@ def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypat
     made = out / training.bundle.name
     made.unlink()
     monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "field.h5"))
-    monkeypatch.setattr(stage, "packed", lambda *args: training.model)
+    monkeypatch.setattr(stage, "pack_model", lambda *args: training.model)
     monkeypatch.setattr(Report, "page", lambda self: "page")
     words = [*training.words, "--out", out, "--report", page, *WORDS]
     words += ["methods=[noisy,field]", "--method", "field"]

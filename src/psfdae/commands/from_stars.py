@@ -32,8 +32,22 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
-from psfdae.model.settings import CHOSEN, IMAGE_GROUPS, Settings, Words, of_config, with_keywords
+from psfdae.model.fitting import (
+    choose_method,
+    described,
+    fitted_to,
+    makes_models,
+    pack_model,
+    worth_trying,
+)
+from psfdae.model.settings import (
+    DATASET_CHOICE,
+    IMAGE_GROUPS,
+    Settings,
+    SettingsReader,
+    of_config,
+    with_keywords,
+)
 from psfdae.model.stars import ALL, Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder
@@ -96,7 +110,7 @@ class ModelFiles:
         return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
 
 
-@command("from-stars", Words())
+@command("from-stars", SettingsReader())
 def from_stars(
     config: Settings,
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
@@ -327,14 +341,14 @@ def _write_model(
     # Choose bright stars without neighbours, and cut them out.
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
-    for image_stars in stars.each:
+    for image_stars in stars.images:
         if image_stars.observation.found is not None:
             write_list(image_stars.observation, files.star_list(image_stars.name))
     write_table(files.path / "selection.csv", stars.table)
     write_product(files.stars, "stars", stars.columns, stars.described())
     # The settings as words of a command line that repeats this run.
     overrides = as_overrides(stars.settings.model_dump(exclude={"calibration_stars"}))
-    write_text(files.path / "overrides.txt", "\n".join([CHOSEN, *overrides]) + "\n")
+    write_text(files.path / "overrides.txt", "\n".join([DATASET_CHOICE, *overrides]) + "\n")
     # Fit the candidates, and the other methods that the report compares with them. With few
     # stars only one candidate is tried.
     tried_methods = worth_trying(stars, candidates)
@@ -344,12 +358,12 @@ def _write_model(
     # The method with the smallest MSE on validation stars becomes the model.
     model_method = tried_methods[0]
     if len(tried_methods) > 1:
-        best_name, errors = best(stars, {m.name: fitted[m.name] for m in tried_methods})
+        best_name, errors = choose_method(stars, {m.name: fitted[m.name] for m in tried_methods})
         model_method = method(best_name)
         for name, error in errors.items():
             print(f"{method(name).look.label}: MSE {error:.3g} on validation stars")
     print(f"packing {model_method.look.label}")
-    model = packed(stars, fitted[model_method.name], files.name, licence)
+    model = pack_model(stars, fitted[model_method.name], files.name, licence)
     for fact in facts_of(fitted[model_method.name]):
         print(f"{model_method.look.label}: {fact}")
     if model.wings is not None:

@@ -335,7 +335,7 @@ class PsfModel(FieldPsfs):
             )
         return field
 
-    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+    def _psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         return self._field().psf_at(place, oversampling)
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
