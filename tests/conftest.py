@@ -16,10 +16,10 @@ from psfdae.model.psf_model import PsfModel
 from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import annular_pupil
 from psfdae_paper.alignment.telescope import (
+    StateTracer,
     design_states,
     fit_quadratic,
     grid_states,
-    zernike_tracer,
 )
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
@@ -96,7 +96,7 @@ def noise():
 def tracer():
     """Ray tracer of scene 3."""
     config = load(CHOICE)
-    return zernike_tracer(config.telescope, config.prescription, config.alignment)
+    return StateTracer(config.telescope, config.prescription, config.alignment)
 
 
 @pytest.fixture(scope="session")

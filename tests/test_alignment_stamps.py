@@ -10,7 +10,7 @@ import pytest
 from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.telescope.raytracing import annulus_points, misaligned
+from psfdae.telescope.raytracing import annulus_points, misalign
 from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae_paper.alignment.telescope import uniform_states
 from psfdae_paper.configuration.alignment import CHOICE
@@ -97,7 +97,7 @@ def test_derivatives_by_coefficients_are_differences(kind, product_cost):
     modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
     rng = np.random.default_rng(0)
     coefficients = 0.2 * rng.standard_normal((2, 8))
-    stamps, slopes = modal.derivatives(coefficients)
+    stamps, slopes = modal.derivatives(coefficients, np.eye(8)[None])
     assert stamps == pytest.approx(modal.stamps(coefficients), abs=1e-14)
     for mode, step in enumerate(1e-5 * np.eye(8)):
         difference = modal.stamps(coefficients + step) - modal.stamps(coefficients - step)
@@ -172,8 +172,8 @@ def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
     import batoid
     from batoid.analysis import drdth
 
-    optic = misaligned(tracer.optic, np.array(state) * tracer.unit)
-    theta, wavelength = tracer.fields[field], telescope.wavelength_m
+    optic = misalign(tracer.optic, np.array(state) * tracer.misalignment_range)
+    theta, wavelength = tracer.field_rad[field], telescope.wavelength_m
     rays = batoid.RayVector.asGrid(
         optic=optic, wavelength=wavelength, theta_x=theta[0], theta_y=theta[1], nx=rays_across
     )

@@ -5,23 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psfdae.optics.wavefronts import zernike_basis
+from psfdae.optics.wavefronts import zernike_images
 from psfdae.settings import ConfigError
 from psfdae.telescope.raytracing import (
-    DEGREES_OF_FREEDOM,
     RayTracingError,
     annulus_points,
     build_optic,
-    misaligned,
+    misalign,
 )
 from psfdae_paper.alignment.telescope import (
+    DEGREES_OF_FREEDOM,
     ModelError,
+    StateTracer,
     design_states,
     field_points,
     fit_quadratic,
     uniform_states,
     verify,
-    zernike_tracer,
 )
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
@@ -36,7 +36,7 @@ def config():
 
 @pytest.fixture(scope="module")
 def fields_deg(tracer):
-    return np.rad2deg(tracer.fields)
+    return np.rad2deg(tracer.field_rad)
 
 
 def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
@@ -46,7 +46,7 @@ def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
     wavelength = config.telescope.wavelength_m
     focal = drdth(optic, 0.0, 0.0, wavelength)[0, 0]
     assert focal / config.telescope.diameter_m == pytest.approx(5.99, abs=0.005)
-    for field in tracer.fields:
+    for field in tracer.field_rad:
         x, y = spot(optic, *field, wavelength, nx=32, reference="mean")
         assert np.sqrt(x.var() + y.var()) / focal < 0.05 * ARCSEC
 
@@ -87,11 +87,11 @@ def test_batoid_s_own_zernike_fit(tracer):
     from batoid import zernike
 
     state = np.array([0.7, -1.0, 0.4, 0.9])
-    optic = misaligned(tracer.optic, state * tracer.unit)
+    optic = misalign(tracer.optic, state * tracer.misalignment_range)
     ours = tracer(state[None])[0]
     for field in (0, 3, 6):
         theirs = zernike(
-            optic, *tracer.fields[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
+            optic, *tracer.field_rad[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
         )
         assert ours[field] == pytest.approx(theirs[4:], abs=2e-6)
 
@@ -99,10 +99,12 @@ def test_batoid_s_own_zernike_fit(tracer):
 def test_weights_of_the_annulus_integrate_zernike_products():
     """Means of Z_j² over the annulus agree with a fine midpoint sum."""
     x, y, weights = annulus_points(22, 0.42)
-    basis = zernike_basis(22, x, y)
+    basis = zernike_images(range(1, 23), x, y)
     radius = np.sqrt(0.42**2 + (1 - 0.42**2) * (np.arange(400) + 0.5) / 400)
     angle = 2 * np.pi * np.arange(64) / 64
-    fine = zernike_basis(22, np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)))
+    fine = zernike_images(
+        range(1, 23), np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
+    )
     assert weights.sum() == pytest.approx(1, abs=1e-12)
     assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
 
@@ -125,7 +127,7 @@ def test_vignetted_field_is_refused():
     config = load([*CHOICE, "alignment.field_radius_deg=0.7"])
     message = r"state 0, field \(0\.7, 0\)°: \d+ of 132 rays are vignetted; 8 of 9 fields are"
     with pytest.raises(RayTracingError, match=message):
-        zernike_tracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
+        StateTracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from scipy.stats import multivariate_t
 
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
-from psfdae.sensing.sampling import FREEDOM
 from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.mixture import FREEDOM
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
 from psfdae_paper.bounds.sampling import (
     Knowledge,

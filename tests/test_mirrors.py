@@ -40,7 +40,7 @@ def zernikes(telescope, prescription=None, defocus=0.0):
     """OPD in metres RMS at `FIELD` along x, shape (3, 19), from Z4 on."""
     optic = build_optic(prescription or telescope.aberrations.prescription, telescope, defocus)
     fields = np.stack([FIELD, 0 * FIELD], axis=1)
-    tracer = ZernikeTracer(optic, telescope.wavelength_m, fields, np.zeros(4), 22)
+    tracer = ZernikeTracer(optic, telescope.wavelength_m, fields, 22)
     return -tracer(np.zeros((1, 4)))[0] * telescope.wavelength_m
 
 

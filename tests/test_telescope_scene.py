@@ -17,7 +17,7 @@ from psfdae.optics.wavefronts import (
 from psfdae.settings import ConfigError
 from psfdae.telescope.field import static_zernikes
 from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
-from psfdae_paper.alignment.telescope import zernike_tracer
+from psfdae_paper.alignment.telescope import StateTracer
 from psfdae_paper.configuration.alignment import CHOICE as SCENE3
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
@@ -99,7 +99,7 @@ def traced():
 
 def test_ray_trace_is_that_of_scene_3(traced):
     alignment = load(SCENE3)
-    tracer = zernike_tracer(alignment.telescope, alignment.prescription, alignment.alignment)
+    tracer = StateTracer(alignment.telescope, alignment.prescription, alignment.alignment)
     noll, ours = static_zernikes(traced.telescope, angles_of(traced.grid))
     theirs = -tracer(np.zeros((1, 4)))[0]
     assert noll == tuple(range(4, 23))
@@ -154,7 +154,7 @@ def test_random_aberrations_have_both_spreads():
     assert drawn.coefficients.std(axis=0) == pytest.approx(
         np.hypot(0.2 * static[8], jitter), rel=0.03
     )
-    assert (drawn.drawn["zernike"][0] == drawn.coefficients).all()
+    assert (drawn.star_columns["zernike"][0] == drawn.coefficients).all()
     again = star_wavefronts(config, field)
     assert (again.coefficients == drawn.coefficients).all()
 

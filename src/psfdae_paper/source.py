@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from psfdae.cli import found
+from psfdae.cli import command_modules
 
 SOURCES = Path(__file__).resolve().parents[1]
 """Folder of the packages."""
@@ -39,7 +39,7 @@ def source_hash(*names: str) -> str:
     ValueError
         If there is no such command, module or file.
     """
-    commands = found()
+    commands = command_modules()
     queue = [commands[name][0] if name in commands else name for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)

@@ -232,7 +232,7 @@ def _run_of_fit(
     # Methods that are trained in epochs have a history.
     epochs: Sequence[Mapping[str, float]] = ()
     if HISTORY in fits.storage_of(kind).diagnostics:
-        epochs = _epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
+        epochs = _epochs(fits.path_beside(kind, model, HISTORY), "train_mse", "validation_mse")
     return replace(
         _named_after_fit(kind, **key, experiment=experiment),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
@@ -265,7 +265,7 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """List the files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
     diagnostics = fits.storage_of(kind).diagnostics
-    return model | {name: fits.beside(kind, place, name) for name in diagnostics}
+    return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:

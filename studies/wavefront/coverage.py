@@ -23,8 +23,8 @@ import pandas as pd
 
 import psfdae
 from psfdae.sensing import stars as engine
-from psfdae.sensing.joint import FieldPosterior
-from psfdae.telescope.field import field_model, terms_of
+from psfdae.sensing.joint import TelescopePosterior
+from psfdae.telescope.field import telescope_model, terms_of
 from psfdae.threads import limit_threads
 
 TELESCOPE = Path(__file__).parents[2] / "config" / "telescope" / "example_zernike.yaml"
@@ -127,16 +127,16 @@ def joint(out, fits=50, count=100, snr=50.0):
     for fit in range(fits):
         rng = np.random.default_rng([29, fit])
         angle = rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
-        model = field_model(telescope, angle)
+        model = telescope_model(telescope, angle)
         t = rng.standard_normal(model.sd.size)
         truth = model.mean + model.sd * t
         terms = terms_of(telescope, angle)
         optics = engine.StarOptics(telescope, terms, STAMP_PX)
         place = rng.uniform(-0.5, 0.5, (count, 2))
         waves = np.einsum("mk,mkj->mj", model.coefficients(truth), terms.to_modes)
-        coarse, engine.SIZES = engine.SIZES, FINE
+        coarse, engine.PUPIL_SIZES = engine.PUPIL_SIZES, FINE
         images = optics.propagation(STAMP_PX).stamps(np.concatenate([waves, place], axis=1))
-        engine.SIZES = coarse
+        engine.PUPIL_SIZES = coarse
         images = images.astype(float)
         counts = noisy(images, snr, rng)
         started = time.process_time()
@@ -144,7 +144,7 @@ def joint(out, fits=50, count=100, snr=50.0):
             counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5, joint=True
         )
         took, state = time.process_time() - started, found.joint
-        field = FieldPosterior(found.search, model, state.star)
+        field = TelescopePosterior(found.search, model, state.star, found.search.optics)
         flux = snr * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))[state.star]
         own = np.column_stack([place[state.star], flux / found.search.flux[state.star]])
         own = np.column_stack([own, np.zeros(len(own))])

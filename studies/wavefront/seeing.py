@@ -18,7 +18,7 @@ import pandas as pd
 
 import psfdae
 from psfdae.sensing.stars import StarOptics
-from psfdae.telescope.field import field_model, terms_of
+from psfdae.telescope.field import telescope_model, terms_of
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.base import config_dir
@@ -41,7 +41,7 @@ def main(out: Path) -> None:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(-1.0, 1.0, (STARS, 2)) * telescope.field_edge_deg
         there = seen(THERE, 0.0)
-        model, terms = field_model(there, angle), terms_of(there, angle)
+        model, terms = telescope_model(there, angle), terms_of(there, angle)
         truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
         waves = np.einsum("mk,mkj->mj", model.coefficients(truth), terms.to_modes)
         place = rng.uniform(-0.5, 0.5, (STARS, 2))

@@ -51,7 +51,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         If the image cannot be used, or has too few bright stars.
     """
     model.field_range()
-    info, field = model.info, model.engine.estimator
+    info, field = model.info, model.method
     if not isinstance(field, FieldMixture):
         raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
     if info.adapted:
@@ -100,7 +100,7 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
         By the images' names without suffix, as `psfdae exposure` adapts a model to an exposure;
         `model` itself where its method knows no field, or an image has fewer than 5 bright stars.
     """
-    field, models = model.engine.estimator, {}
+    field, models = model.method, {}
     for part in stars.exposures:
         bright, exposure_model = part.candidates.bright, model
         if isinstance(field, FieldMixture) and len(bright) >= FEWEST_STARS:

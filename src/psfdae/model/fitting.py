@@ -14,7 +14,7 @@ from psfdae.method import KnowsField, Method, with_free_flux
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
-from psfdae.model.psf_model import MARGIN_PX, PsfModel
+from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
 from psfdae.model.star_sets import (
     field_positions,
@@ -163,10 +163,10 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
         if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
             return model
         wings_of_each = [
-            part.wings or wings_of_stars(model, part.observation.with_margin(MARGIN_PX))
+            part.wings or wings_of_stars(model, part.observation.with_margin(model.margin_px))
             for part in stars.each
         ]
     known_wings = [wings for wings in wings_of_each if wings is not None]
     if not known_wings:
         return model
-    return PsfModel(with_wings(model.bundle, Wings.joined(known_wings)), model.engine.estimator)
+    return PsfModel(with_wings(model.bundle, Wings.joined(known_wings)), model.method)

@@ -19,7 +19,7 @@ from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.image.tables import html_table
 from psfdae.model.plot import SPOILT
-from psfdae.moments import measure_shapes, moved
+from psfdae.moments import measure_shapes, shift_stamps
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -59,7 +59,7 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
     """
 
     def at(places: np.ndarray) -> np.ndarray:
-        psf = cut(moved(mean[None], places, np.zeros(len(places), int)), side)
+        psf = cut(shift_stamps(mean[None], places, np.zeros(len(places), int)), side)
         return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]

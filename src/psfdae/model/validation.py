@@ -22,7 +22,7 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
-from psfdae.model.psf_model import MARGIN_PX, PsfModel
+from psfdae.model.psf_model import PsfModel
 from psfdae.model.report import (
     MEAN_PSF,
     SHOWN_STARS,
@@ -87,7 +87,7 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     """
     _require_unseen(model, stars)
     settings, own = stars.settings, model.info.method
-    known = {**(others or {}), own: model.engine.estimator}
+    known = {**(others or {}), own: model.method}
     names = [n for n in settings.methods if n in known or n in BESIDE]
     names += [n for n in (own, *BESIDE) if n not in names]
     with fixed_threads(settings.evaluation.threads):
@@ -299,7 +299,7 @@ class Report:
     restored: dict[float, dict[str, np.ndarray]]
 
     def __str__(self) -> str:
-        kind = type(self.model.engine.estimator)
+        kind = type(self.model.method)
         return standing(self.table, kind.name, kind.look.label)
 
     def __repr__(self) -> str:
@@ -371,7 +371,7 @@ class Report:
         found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
         columns = {name: selection[name] for name in ("verdict", "part")}
         shown = shown[:SHOWN_STARS]
-        kind = type(model.engine.estimator)
+        kind = type(model.method)
         product = stars.product
         test = split_stars(product, SPLIT, stars.settings).test
         row = product["row"][product["field_index"][test]]
@@ -392,7 +392,7 @@ class Report:
                 bright=psf[shown] + residual,
                 strip=self.strip_png,
                 field=None if stars.observation.positions is None else _map(found, psf, stars),
-                facts=facts_of(model.engine.estimator),
+                facts=facts_of(model.method),
             )
         )
 
@@ -411,8 +411,9 @@ def _all_stars(
     """Columns and PSFs of all stars of an image, and the residuals of those that are kept."""
     columns: dict[str, list[np.ndarray]] = {}
     psf, residual, done = [], [], 0
+    margin = model.margin_px
     of_images = (
-        model.stream(part.observation.with_margin(MARGIN_PX), threads=1) for part in stars.each
+        model.stream(part.observation.with_margin(margin), threads=1) for part in stars.each
     )
     for _, found in itertools.chain.from_iterable(of_images):
         for name, values in found.columns().items():

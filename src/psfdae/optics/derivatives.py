@@ -1,4 +1,4 @@
-"""A stamp and its derivatives with respect to coefficients of pupil modes.
+"""Stamps and their derivatives with respect to coefficients of pupil modes.
 
 The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is that of
 `psfdae.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
@@ -22,19 +22,28 @@ Three ways lead from the pupil to the pixels, a `Sampling` each:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
-from scipy import fft
 
-from psfdae.optics.propagation import Precision, image_points, in_batches
+from psfdae.optics.propagation import Precision, complex_field, image_points, in_batches, real_dtype
 from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
 from psfdae.optics.seeing import WholePeriod
-from psfdae.optics.wavefronts import Modes, legendre, legendre_expansion, mode_slopes, slope_ranges
+from psfdae.optics.wavefronts import (
+    PupilModes,
+    legendre,
+    legendre_expansion,
+    mode_slopes,
+    slope_ranges,
+)
+
+StampsAndSlopes = tuple[np.ndarray, np.ndarray]
+"""Stamps (B, d, d), or intensities at points, and derivatives of the stamps, (B, K, d, d)."""
 
 
 class Sampling(Protocol):
-    """Points of the image plane, and what they contribute to the pixels of a stamp."""
+    """Points of the image plane, and their contributions to the pixels of a stamp."""
 
     dtype: np.dtype
     """float32 or float64, of the pixels."""
@@ -43,13 +52,13 @@ class Sampling(Protocol):
     """Time of a product of polynomials over that of a direction by itself, as measured."""
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """Rows of the pupil to points, times P_a(x) for all degrees a.
+        """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
 
         Parameters
         ----------
         pupil_fields : ndarray, shape (B, M, M)
         degrees : sequence of A int
-            Of Legendre polynomials.
+            Degrees of Legendre polynomials.
 
         Returns
         -------
@@ -57,93 +66,91 @@ class Sampling(Protocol):
         """
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """Columns of those, (B, M, m), to points, times P_b(y) for all degrees b, (A, B, m, m).
+        """Propagate columns of those, (B, M, m), times P_b(y) for all degrees b, to points.
 
-        Together they give fields at the points, up to a common phase of each.
+        The result, (A, B, m, m), is the field at the points, up to a common phase of each.
         """
 
     def to_pixels(self, values: np.ndarray) -> np.ndarray:
-        """Pixels (..., d, d) of intensities, or of their slopes, at the points (..., m, m)."""
+        """Return pixels (..., d, d) of intensities, or their slopes, at the points (..., m, m)."""
 
 
-class Separable:
-    """Points of which one matrix P (d, m) makes pixels, P I Pᵀ."""
+class SeparableSampling:
+    """Points from which one matrix P (d, m) makes pixels, P I Pᵀ."""
 
-    pixels: np.ndarray
+    pixel_weights: np.ndarray
     dtype: np.dtype
 
     def to_pixels(self, values: np.ndarray) -> np.ndarray:
-        """See `Sampling`."""
-        return np.asarray(self.pixels @ (values @ self.pixels.T))
+        """Return pixels as `Sampling` does."""
+        return np.asarray(self.pixel_weights @ (values @ self.pixel_weights.T))
 
 
-class PointSampling(Separable):
-    """The points of `image_points` on both sides of the chief ray; its parameters."""
+class PointSampling(SeparableSampling):
+    """Points of `image_points` on both sides of the chief ray, with its parameters.
+
+    Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
+    meet cosines or sines, so that products are real and a quarter as large.
+    """
 
     product_cost = 0.1
 
-    # Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
-    # meet cosines or sines, so that products are real and a quarter as large.
-
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
-        half, even, odd = image_points(pupil, stamp_px, pixel)
+        self.dtype = real_dtype(precision)
+        half, even_weights, odd_weights = image_points(pupil, stamp_px, pixel)
+        # Cosines and sines over half of the pupil. The middle sample of an odd grid is its own
+        # mirror image and counts once.
         self._samples = (pupil.axis.size + 1) // 2
         self._axis = pupil.axis[-self._samples :]
-        # Of an odd grid the middle sample is its own mirror image.
-        alone = np.where(self._axis == 0.0, 0.5, 1.0)[:, None]
+        multiplicity = np.where(self._axis == 0.0, 0.5, 1.0)[:, None]
         angle = np.pi * np.outer(self._axis, half)
-        self._waves = np.stack([np.cos(angle), np.sin(angle)]) * alone
-        above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
-        # The middle pixel of an odd stamp is its own mirror image.
+        self._waves = np.stack([np.cos(angle), np.sin(angle)]) * multiplicity
+        # Weights of the pixels above the chief ray, and mirrored ones of those below; the middle
+        # pixel of an odd stamp is its own mirror image.
+        mirrored = (even_weights - odd_weights)[::-1]
+        above = 0.5 * np.hstack([mirrored.T, (even_weights + odd_weights).T])
         below = above[::-1, ::-1][: stamp_px // 2]
-        self.dtype = np.empty(0, precision).real.dtype
-        self.pixels = np.vstack([below, above]).astype(self.dtype)
-        self._weighted: dict[int, np.ndarray] = {}
+        self.pixel_weights = np.vstack([below, above]).astype(self.dtype)
+        # Waves times P_a(x), by the degree a.
+        self._weighted_waves: dict[int, np.ndarray] = {}
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`, m = all points."""
-        first, last = (
-            pupil_fields[..., self._samples - 1 :: -1],
-            pupil_fields[..., -self._samples :],
-        )
-        parts = _real_parts(last + first), _real_parts(last - first)
+        """Propagate along x as `Sampling` does, to all points."""
+        # Even and odd parts of the field; real and imaginary parts as rows of one matrix.
+        mirrored = pupil_fields[..., self._samples - 1 :: -1]
+        upper = pupil_fields[..., -self._samples :]
+        parts = [
+            np.stack([part.real, part.imag]).reshape(-1, self._samples)
+            for part in (upper + mirrored, upper - mirrored)
+        ]
         shape = (2, *pupil_fields.shape[:-1], -1)
-        found = []
-        for a in degrees:
-            waves = [parts[(a + k) % 2] @ self._matrix(a)[k] for k in (0, 1)]
-            found.append(_joined(*(wave.reshape(shape) for wave in waves)))
-        return np.stack(found)
+        fields = []
+        for degree in degrees:
+            # An even polynomial leaves the parity, an odd one changes it: the even part of the
+            # product meets the cosines, the odd part the sines.
+            if degree not in self._weighted_waves:
+                weighted = legendre([degree], self._axis)[0][:, None] * self._waves
+                self._weighted_waves[degree] = weighted.astype(self.dtype)
+            cosine_waves, sine_waves = self._weighted_waves[degree]
+            cos_re, cos_im = (parts[degree % 2] @ cosine_waves).reshape(shape)
+            sin_re, sin_im = (parts[(degree + 1) % 2] @ sine_waves).reshape(shape)
+            # C − iS at the points above the chief ray, C + iS below.
+            points = cos_re.shape[-1]
+            field_shape = (*cos_re.shape[:-1], 2 * points)
+            field = np.empty(field_shape, np.result_type(cos_re, np.complex64))
+            above, below = field[..., points:], field[..., points - 1 :: -1]
+            above.real, above.imag = cos_re + sin_im, cos_im - sin_re
+            below.real, below.imag = cos_re - sin_im, cos_im + sin_re
+            fields.append(field)
+        return np.stack(fields)
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`."""
+        """Propagate along y as `Sampling` does."""
         # Transposed, so that both ways are the same products.
         return self.along_x(rows.swapaxes(-1, -2), degrees).swapaxes(-1, -2)
 
-    def _matrix(self, degree: int) -> np.ndarray:
-        """Cosines and sines times P_a(x) over half of the pupil, shape (2, M/2, m/2)."""
-        if degree not in self._weighted:
-            weighted = legendre([degree], self._axis)[0][:, None] * self._waves
-            self._weighted[degree] = weighted.astype(self.dtype)
-        return self._weighted[degree]
 
-
-def _real_parts(array: np.ndarray) -> np.ndarray:
-    """Rows (n, M) of the real, then of the imaginary part: one matrix for one product."""
-    return np.stack([array.real, array.imag]).reshape(-1, array.shape[-1])
-
-
-def _joined(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
-    """C − iS at the points above the chief ray, C + iS below, of real and imaginary parts."""
-    (cos_re, cos_im), (sin_re, sin_im) = cosines, sines
-    half = cos_re.shape[-1]
-    out = np.empty((*cos_re.shape[:-1], 2 * half), np.result_type(cos_re, np.complex64))
-    above, below = out[..., half:], out[..., half - 1 :: -1]
-    above.real, above.imag = cos_re + sin_im, cos_im - sin_re
-    below.real, below.imag = cos_re - sin_im, cos_im + sin_re
-    return out
-
-
-class PeriodSampling(Separable, WholePeriod):
+class PeriodSampling(SeparableSampling, WholePeriod):
     """Equidistant points over the period of the image, 2/spacing λ/D.
 
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
@@ -153,35 +160,31 @@ class PeriodSampling(Separable, WholePeriod):
     """
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+        super().__init__(pupil, precision)
+        # Lags between samples, as frequencies of the image in cycles per λ/D.
         samples = pupil.axis.size
-        self._axis = pupil.axis
-        self.points = fft.next_fast_len(2 * samples)
         lags = np.arange(1 - samples, samples)
         frequency = 0.5 * pupil.spacing * lags
-        centres = _centres(stamp_px, pixel)
-        to_pixels = (
-            pixel * np.sinc(frequency * pixel) * np.exp(-2j * np.pi * np.outer(centres, frequency))
-        )
+        centres = (np.arange(stamp_px) - 0.5 * (stamp_px - 1)) * pixel
+        # From the points to c_l, and from c_l to the pixels.
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
-        self.dtype = np.empty(0, precision).real.dtype
-        # A pixel's width along the axis, a wave of the image gains this phase.
-        moved = to_pixels * (2j * np.pi * pixel * frequency)
-        self.pixels, self._moved = (
-            ((waves @ from_points).real / self.points).astype(self.dtype)
-            for waves in (to_pixels, moved)
+        waves = np.exp(-2j * np.pi * np.outer(centres, frequency))
+        to_pixels = pixel * np.sinc(frequency * pixel) * waves
+        # Moving the image by a pixel's width multiplies c_l by a phase; this is its derivative.
+        to_slopes = to_pixels * (2j * np.pi * pixel * frequency)
+        self.pixel_weights, self._slope_weights = (
+            ((matrix @ from_points).real / self.points).astype(self.dtype)
+            for matrix in (to_pixels, to_slopes)
         )
 
-    def slopes_by_place(self, values: np.ndarray) -> np.ndarray:
-        """Derivatives of the pixels of intensities (B, m, m) by the image's place.
+    def position_slopes(self, values: np.ndarray) -> np.ndarray:
+        """Return derivatives by the image's position along x and y, per pixel, (B, 2, d, d).
 
-        Along x and y, per pixel; shape (B, 2, d, d).
+        `values` (B, m, m) are the intensities at the points.
         """
-        pairs = (self.pixels, self._moved), (self._moved, self.pixels)
-        return np.stack([of_y @ (values @ of_x.T) for of_y, of_x in pairs], axis=1)
-
-
-def _centres(stamp_px: int, pixel: float) -> np.ndarray:
-    return (np.arange(stamp_px) - 0.5 * (stamp_px - 1)) * pixel
+        along_x = self.pixel_weights @ (values @ self._slope_weights.T)
+        along_y = self._slope_weights @ (values @ self.pixel_weights.T)
+        return np.stack([along_x, along_y], axis=1)
 
 
 class ModalStamps:
@@ -191,33 +194,35 @@ class ModalStamps:
     ----------
     pupil : Pupil
         Transmission on an M × M grid.
-    modes : Modes
+    modes : PupilModes
     sampling : Sampling
         Made for the same pupil.
     pixel : float
         Pixel width in λ/D; the unit of offsets.
     """
 
-    def __init__(self, pupil: Pupil, modes: Modes, sampling: Sampling, pixel: float) -> None:
+    def __init__(self, pupil: Pupil, modes: PupilModes, sampling: Sampling, pixel: float) -> None:
         self.dtype = dtype = sampling.dtype
         self.shape = pupil.amplitude.shape
         self._sampling = sampling
         self._pixel = pixel
         self._axis = pupil.axis.astype(dtype)
+        # Images of the modes as rows of a matrix, and the transmission for a whole light of 1.
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
         degrees, coefficients = legendre_expansion(modes)
         self._coefficients = coefficients.astype(dtype)
+        # Degrees (a, b) of the Legendre products in the modes.
         self._products = [*map(tuple, degrees)]
-        # What is needed along y with each degree along x; the constant first, it is the field.
+        # Degrees along y that go with each degree along x; the constant first, it is the field.
         self._degrees = [
             [0] * (a == 0) + [b for c, b in self._products if c == a]
             for a in range(degrees[:, 0].max() + 1)
         ]
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Stamps of a batch.
+        """Compute the stamps of a batch.
 
         Parameters
         ----------
@@ -231,6 +236,7 @@ class ModalStamps:
             Fraction of the light through the pupil on each pixel.
         """
         sampling = self._sampling
+        # The field by two products of matrices, and the light on the pixels from its intensity.
         (rows,) = sampling.along_x(self._pupil_fields(coefficients, offset_px))
         (field,) = sampling.along_y(rows)
         return sampling.to_pixels(field.real**2 + field.imag**2)
@@ -238,98 +244,95 @@ class ModalStamps:
     def derivatives(
         self,
         coefficients: np.ndarray,
-        directions: np.ndarray | None = None,
+        directions: np.ndarray,
         offset_px: np.ndarray | None = None,
-        places: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps of a batch and their derivatives along directions of the coefficients.
+        by_position: bool = False,
+    ) -> StampsAndSlopes:
+        """Compute stamps of a batch and their derivatives along directions of the coefficients.
 
         Parameters
         ----------
         coefficients : ndarray, shape (B, J)
-        directions : ndarray, shape (B, K, J) or (K, J), optional
-            Changes of the coefficients per unit parameter, the Jacobian's
-            transpose; by default the coefficients themselves, K = J.
+        directions : ndarray, shape (B, K, J), or (1, K, J) for all stamps
+            Changes of the coefficients per unit parameter, the Jacobian's transpose.
         offset_px : ndarray, shape (B, 2), optional
             As in `stamps`; kept fixed.
-        places : bool
-            Two more derivatives, by the place of the image along x and y, in pixels. They follow
-            from the image, which is why they cost little; its sampling must be `PeriodSampling`.
+        by_position : bool
+            Add two derivatives, by the position of the image along x and y, in pixels. They follow
+            from the image and cost little; the sampling must be `PeriodSampling`.
 
         Returns
         -------
         stamps : ndarray, shape (B, d, d)
-        derivatives : ndarray, shape (B, K, d, d), or (B, K + 2, d, d) with `places`
+        derivatives : ndarray, shape (B, K, d, d), or (B, K + 2, d, d) with `by_position`
             Per unit parameter.
         """
-        if directions is None:
-            directions = np.eye(len(self._modes))
         directions = directions.astype(self.dtype)
-        if directions.ndim == 2:
-            directions = directions[None]
         pupil_fields = self._pupil_fields(coefficients, offset_px)
-        few = directions.shape[1] < self._sampling.product_cost * len(self._products)
-        derivatives = self._by_direction if few else self._by_product
-        intensity, slopes = derivatives(pupil_fields, directions)
-        if places:
+        # The cheaper way: a field for each direction, or for each product of polynomials.
+        if directions.shape[1] < self._sampling.product_cost * len(self._products):
+            intensity, slopes = self._by_direction(pupil_fields, directions)
+        else:
+            intensity, slopes = self._by_product(pupil_fields, directions)
+        if by_position:
             assert isinstance(self._sampling, PeriodSampling)
-            slopes = np.concatenate([slopes, self._sampling.slopes_by_place(intensity)], axis=1)
+            slopes = np.concatenate([slopes, self._sampling.position_slopes(intensity)], axis=1)
         return self._sampling.to_pixels(intensity), slopes
 
-    def _by_direction(
-        self, pupil_fields: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Intensities at the points and slopes of the pixels, each direction a field of its own."""
+    def _by_direction(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
+        """Return intensities at the points and slopes of the pixels, by a field per direction."""
         sampling, (count, *shape) = self._sampling, pupil_fields.shape
-        changed = np.empty((count, 1 + directions.shape[1], *shape), pupil_fields.dtype)
-        changed[:, 0] = pupil_fields
+        # Pupil fields, and those times the OPD of each direction: E and G with dE = 2πi G.
+        fields = np.empty((count, 1 + directions.shape[1], *shape), pupil_fields.dtype)
+        fields[:, 0] = pupil_fields
         opd = (directions @ self._modes).reshape(*directions.shape[:2], *shape)
-        np.multiply(pupil_fields[:, None], opd, out=changed[:, 1:])
-        (rows,) = sampling.along_x(changed.reshape(-1, *shape))
-        (fields,) = sampling.along_y(rows)
-        image, *changes = np.moveaxis(fields.reshape(*changed.shape[:2], *fields.shape[1:]), 1, 0)
+        np.multiply(pupil_fields[:, None], opd, out=fields[:, 1:])
+        # All of them are propagated as one batch.
+        (rows,) = sampling.along_x(fields.reshape(-1, *shape))
+        (images,) = sampling.along_y(rows)
+        images = images.reshape(*fields.shape[:2], *images.shape[1:])
+        image, *changes = np.moveaxis(images, 1, 0)
+        # 2 Re(E* dE) = 4π Re(i E* G) = 4π (Im E Re G − Re E Im G).
         slopes = np.empty((count, len(changes), *image.shape[1:]), self.dtype)
         for k, change in enumerate(changes):
             slopes[:, k] = image.imag * change.real - image.real * change.imag
         return image.real**2 + image.imag**2, (4.0 * np.pi) * sampling.to_pixels(slopes)
 
-    def _by_product(
-        self, pupil_fields: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Intensities and slopes as above, from those of all products of Legendre polynomials."""
-        sampling, weights = self._sampling, directions @ self._coefficients
+    def _by_product(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
+        """Return intensities and slopes as above, by a field per product of polynomials."""
+        sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
         for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
-            degrees = self._degrees[a]
-            changes = sampling.along_y(rows, degrees)
+            # P_a(x) along x serves all P_b(y) that go with it; P_0 P_0 is the field itself.
+            changes = sampling.along_y(rows, self._degrees[a])
             if a == 0:
                 image = changes[0]
-            for b, change in zip(degrees, changes, strict=True):
-                # Half of 2 Re(E* i G)
+            for b, change in zip(self._degrees[a], changes, strict=True):
+                # Im E Re G − Re E Im G, as by direction; kept as pixels, which are fewer.
                 slope = image.imag * change.real - image.real * change.imag
                 slopes[a, b] = sampling.to_pixels(slope)
-        each = (4.0 * np.pi) * np.stack([slopes[place] for place in self._products], axis=1)
-        shape = (len(each), weights.shape[1], *each.shape[2:])
-        found = (weights @ each.reshape(*each.shape[:2], -1)).reshape(shape)
-        return image.real**2 + image.imag**2, found
+        # Slopes along a direction are those of the products times their coefficients in it.
+        weights = directions @ self._coefficients
+        by_product = [slopes[degrees] for degrees in self._products]
+        product_slopes = (4.0 * np.pi) * np.stack(by_product, axis=1)
+        flat = weights @ product_slopes.reshape(*product_slopes.shape[:2], -1)
+        shape = (len(product_slopes), weights.shape[1], *product_slopes.shape[2:])
+        return image.real**2 + image.imag**2, flat.reshape(shape)
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
-        """OPD maps in waves, shape (B, M, M)."""
+        """Return OPD maps in waves, shape (B, M, M)."""
         opd = np.asarray(coefficients, self._modes.dtype) @ self._modes
         return np.asarray(opd.reshape(-1, *self.shape))
 
     def _pupil_fields(self, coefficients: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
+        """Return A exp(2πiW) of a batch, with the tilt that shows the image at an offset."""
         phase = self.opd(coefficients) * (2.0 * np.pi)
         if offset_px is not None:
             # Looking at a stamp moved by +u is the tilt that moves the image by −u.
             tilt = (np.pi * self._pixel * np.asarray(offset_px, float)).astype(phase.dtype)
             phase -= tilt[:, 0, None, None] * self._axis[:, None]
             phase -= tilt[:, 1, None, None] * self._axis
-        fields = np.empty(phase.shape, np.result_type(phase.dtype, np.complex64))
-        np.cos(phase, out=fields.real)
-        np.sin(phase, out=fields.imag)
-        fields *= self._amplitude
-        return fields
+        return complex_field(phase, self._amplitude)
 
 
 class SampledStamps:
@@ -341,13 +344,14 @@ class SampledStamps:
     ----------
     obscuration : float
         Linear central obscuration of the pupil.
-    modes : Modes
+    modes : PupilModes
     sampling : callable
-        From a pupil to its `Sampling`.
+        Function of pupil, stamp_px, pixel and the keyword precision that returns a `Sampling`.
     stamp_px : int
         Pixels d along a side.
     pixel : float
         Pixel width in λ/D.
+    precision : "complex64" or "complex128"
     sizes : sequence of int
         Pupil samples N to choose from, ascending.
     reach : float
@@ -359,10 +363,11 @@ class SampledStamps:
     def __init__(
         self,
         obscuration: float,
-        modes: Modes,
-        sampling: Callable[[Pupil], Sampling],
+        modes: PupilModes,
+        sampling: Callable[..., Sampling],
         stamp_px: int,
         pixel: float,
+        precision: Precision,
         sizes: Sequence[int],
         reach: float = 0.0,
         batch: int = 16,
@@ -370,21 +375,23 @@ class SampledStamps:
     ) -> None:
         self.stamp_px, self.pixel, self.sizes, self.reach = stamp_px, pixel, tuple(sizes), reach
         self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
-        self._batch, self._threads = batch, threads
+        self._precision, self._batch, self._threads = precision, batch, threads
+        self._dtype = real_dtype(precision)
         self._slopes = mode_slopes(modes)
         self._operators: dict[int, ModalStamps] = {}
 
     def operator(self, samples: int) -> ModalStamps:
-        """The operator on a pupil grid with N samples across; made once, then kept."""
+        """Return the operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
             pupil = annular_pupil(samples, self._obscuration)
-            self._operators[samples] = ModalStamps(
-                pupil, self._modes, self._sampling(pupil), self.pixel
-            )
+            sampling = self._sampling(pupil, self.stamp_px, self.pixel, precision=self._precision)
+            self._operators[samples] = ModalStamps(pupil, self._modes, sampling, self.pixel)
         return self._operators[samples]
 
     def samples(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Pupil samples N of each wavefront, (B, J) to (B,); offsets as in `ModalStamps.stamps`.
+        """Return the pupil samples N of each wavefront, (B,), for coefficients (B, J).
+
+        Offsets are those of `ModalStamps.stamps`.
 
         Raises
         ------
@@ -392,28 +399,24 @@ class SampledStamps:
             If the largest grid size is below what a wavefront needs.
         """
         offset_px = np.zeros((len(coefficients), 2)) if offset_px is None else offset_px
+        # Edges of the stamp along x and y, in λ/D, and the region that sheds light on it.
         half = np.array([-0.5, 0.5]) * self.stamp_px
-        edges = (offset_px[:, ::-1, None] + half) * self.pixel  # (x, y) from (row, column)
+        edges = (offset_px[:, ::-1, None] + half) * self.pixel
         edges = edges + np.array([-self.reach, self.reach])
-        return choose_samples(
-            required_samples(slope_ranges(self._slopes, coefficients), edges), self.sizes
-        )
+        # The sampling guard chooses by the slopes of each wavefront.
+        needed = required_samples(slope_ranges(self._slopes, coefficients), edges)
+        return choose_samples(needed, self.sizes)
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps as `ModalStamps.stamps` does; raises as `samples`."""
-        out = np.empty((len(coefficients), self.stamp_px, self.stamp_px), self._dtype)
+        stamps = np.empty((len(coefficients), self.stamp_px, self.stamp_px), self._dtype)
 
-        def prepare(samples: int) -> Callable[[np.ndarray], None]:
-            operator = self.operator(samples)
+        def propagate(operator: ModalStamps, batch: np.ndarray) -> None:
+            offset = None if offset_px is None else offset_px[batch]
+            stamps[batch] = operator.stamps(coefficients[batch], offset)
 
-            def propagate(part: np.ndarray) -> None:
-                offset = None if offset_px is None else offset_px[part]
-                out[part] = operator.stamps(coefficients[part], offset)
-
-            return propagate
-
-        in_batches(self.samples(coefficients, offset_px), self._batch, self._threads, prepare)
-        return out
+        self._run(propagate, self.samples(coefficients, offset_px), self._batch)
+        return stamps
 
     def derivatives(
         self,
@@ -421,52 +424,48 @@ class SampledStamps:
         directions: np.ndarray,
         offset_px: np.ndarray | None = None,
         samples: np.ndarray | None = None,
-        places: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives along directions (B, K, J); raises as `samples`.
+        by_position: bool = False,
+    ) -> StampsAndSlopes:
+        """Return stamps and derivatives along directions (B, K, J), as `ModalStamps` does.
 
-        `samples` (B,) are pupil samples, by default as many as the stamps need.
+        `samples` (B,) are pupil samples, by default as many as the stamps need; raises as
+        `samples` does.
         """
-        count, side = directions.shape[1] + 2 * places, self.stamp_px
+        side = self.stamp_px
+        count = directions.shape[1] + 2 * by_position
         stamps = np.empty((len(coefficients), side, side), self._dtype)
         slopes = np.empty((len(coefficients), count, side, side), self._dtype)
 
-        def prepare(samples: int) -> Callable[[np.ndarray], None]:
-            operator = self.operator(samples)
+        def differentiate(operator: ModalStamps, batch: np.ndarray) -> None:
+            offset = None if offset_px is None else offset_px[batch]
+            wavefronts = coefficients[batch], directions[batch], offset
+            stamps[batch], slopes[batch] = operator.derivatives(*wavefronts, by_position)
 
-            def differentiate(part: np.ndarray) -> None:
-                offset = None if offset_px is None else offset_px[part]
-                stamps[part], slopes[part] = operator.derivatives(
-                    coefficients[part], directions[part], offset, places
-                )
-
-            return differentiate
-
-        if samples is None:
-            samples = self.samples(coefficients, offset_px)
-        in_batches(samples, max(1, self._batch // count), self._threads, prepare)
+        samples = self.samples(coefficients, offset_px) if samples is None else samples
+        self._run(differentiate, samples, max(1, self._batch // count))
         return stamps, slopes
 
-    @property
-    def _dtype(self) -> np.dtype:
-        return self.operator(self.sizes[0]).dtype
+    def _run(self, work: Callable[..., None], samples: np.ndarray, size: int) -> None:
+        """Call `work` with the operator and the numbers of each batch of wavefronts."""
+        in_batches(samples, size, self._threads, lambda n: partial(work, self.operator(n)))
 
 
 def normalise_with_derivatives(
     stamps: np.ndarray, derivatives: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide stamps (..., d, d) by their own flux, and differentiate the quotient.
+    """Divide stamps p (..., d, d) by their flux f = Σ p, and differentiate the quotient.
 
     Returns
     -------
     normalised : ndarray, shape (..., d, d)
         Sum 1.
     derivatives : ndarray, shape (..., K, d, d)
-        Of `normalised`; each sums to 0.
+        (∂p − (p/f) ∂f)/f; each sums to 0.
     flux : ndarray, shape (...)
     """
+    # Derivative of the quotient p/f.
     flux = stamps.sum(axis=(-2, -1))
     normalised = stamps / flux[..., None, None]
-    change = derivatives.sum(axis=(-2, -1))[..., None, None]
-    slope = (derivatives - normalised[..., None, :, :] * change) / flux[..., None, None, None]
+    flux_slope = derivatives.sum(axis=(-2, -1))[..., None, None]
+    slope = (derivatives - normalised[..., None, :, :] * flux_slope) / flux[..., None, None, None]
     return normalised, slope, flux

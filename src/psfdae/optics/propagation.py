@@ -1,4 +1,4 @@
-"""Fraunhofer propagation from a pupil to the pixels of a stamp, and to nothing else.
+"""Fraunhofer propagation from a pupil to the pixels of a stamp.
 
 The field at the image angle u (in λ/D) of a pupil with transmission A(x) and
 OPD W(x) in waves, x in pupil radii, is
@@ -6,7 +6,7 @@ OPD W(x) in waves, x in pupil radii, is
     E(u) = Σ A(x) exp(2πi W(x)) exp(−πi u·x),
 
 two matrix products per stamp (a matrix DFT, Soummer et al. 2007, Opt. Express
-15, 15935). Only the wanted points are computed; there is no padded grid. Pupil
+15, 15935). Only the points that are needed are computed; there is no padded grid. Pupil
 and points are symmetric about the chief ray. With s and t the even and odd part
 of the phase 2πW over y, two rows of the pupil together are
 
@@ -40,16 +40,27 @@ Precision = Literal["complex64", "complex128"]
 EXTRA_POINTS = 6
 """Points beyond two per λ/D; they integrate a wave to 5e-4 of a pixel's width."""
 
-IN_CACHE = 2**17
-"""Samples of the pupil that are worked on together: their phases stay in a core's cache."""
+
+def real_dtype(precision: Precision) -> np.dtype:
+    """Return float32 or float64, the type of the real part in a precision."""
+    return np.empty(0, precision).real.dtype
+
+
+def complex_field(phase: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """Return A exp(iφ) of real phases φ (..., M, M) in rad and an amplitude A (M, M)."""
+    field = np.empty(phase.shape, np.result_type(phase.dtype, np.complex64))
+    np.cos(phase, out=field.real)
+    np.sin(phase, out=field.imag)
+    field *= amplitude
+    return field
 
 
 def image_points(
     pupil: Pupil, stamp_px: int, pixel: float, extra: int = EXTRA_POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on one side of a stamp's axis, and what intensities there say about the pixels.
+    """Choose points on one side of a stamp's axis, and weights that make pixels of intensities.
 
-    Chebyshev points of the stamp that are spread as far as a wanted error allows, until they
+    Chebyshev points of the stamp that are spread as far as the error permits, until they
     are nearly equidistant (Kosloff & Tal-Ezer 1993, J. Comput. Phys. 104, 457). The weights
     integrate every wave that an intensity can hold, by least squares.
 
@@ -67,28 +78,32 @@ def image_points(
     -------
     points : ndarray, shape (m,)
         In λ/D from the chief ray, ascending.
-    even, odd : ndarray, shape (m, ⌈d/2⌉)
+    even_weights, odd_weights : ndarray, shape (m, ⌈d/2⌉)
         An intensity that is the same on both sides has eᵀI on the pixels from the chief
         ray on; one that changes its sign has oᵀI.
     """
-    edge, highest = 0.5 * stamp_px * pixel, 0.5 * (pupil.axis.size - 1) * pupil.spacing
+    # Two points per λ/D resolve the highest frequency, half the pupil's width in λ/D.
+    edge = 0.5 * stamp_px * pixel
+    highest = 0.5 * (pupil.axis.size - 1) * pupil.spacing
     m = max(1, (int(np.ceil(4.0 * edge * highest)) + extra + 1) // 2)
+    # Points arcsin(s x)/arcsin(s) of Chebyshev's x, with s = 1/cosh(ln(10^digits)/2m).
     digits = max(1.0, 0.5 * extra)
     spread = 1.0 / np.cosh(np.log(10.0) * digits / (2 * m))
     chebyshev = np.sin(0.5 * np.pi * (np.arange(m) + 0.5) / m)
     points = edge * np.arcsin(spread * chebyshev) / np.arcsin(spread)
+    # Integrals of cosines and sines over the pixels: value at the centre × width × sinc.
     centres = (np.arange(stamp_px // 2, stamp_px) - 0.5 * (stamp_px - 1)) * pixel
     wave = 2.0 * np.pi * np.linspace(0.0, highest, 4 * m)[:, None]
     width = pixel * np.sinc(wave / (2.0 * np.pi) * pixel)
-    even, odd = (
+    even_weights, odd_weights = (
         np.linalg.lstsq(part(wave * points), part(wave * centres) * width, rcond=1e-12)[0]
         for part in (np.cos, np.sin)
     )
-    return points, even, odd
+    return points, even_weights, odd_weights
 
 
 class StampPropagator:
-    """Batched operator from OPD maps to pixel-integrated stamps.
+    """Operator from batches of OPD maps to pixel-integrated stamps.
 
     The stamp is centred on the chief ray moved by an offset per star, which
     enters as a tilt: all stars share the same matrices. For an even stamp the
@@ -111,7 +126,7 @@ class StampPropagator:
     Raises
     ------
     ValueError
-        If the pupil's halves differ, or the backend is another.
+        If the pupil's halves differ, or the backend is unknown.
     """
 
     def __init__(
@@ -125,26 +140,35 @@ class StampPropagator:
     ) -> None:
         if not np.allclose(pupil.amplitude, pupil.amplitude[::-1], atol=1e-9):
             raise ValueError("pupil: its halves above and below the chief ray differ")
+        self._xp: Any = np
+        if backend == "torch":
+            import torch
+
+            self._xp = torch
+        elif backend != "numpy":
+            raise ValueError(f"optics.backend = {backend!r}: expected 'numpy' or 'torch'")
         self.stamp_px = stamp_px
         self.pixel = pixel
-        self._xp = _array_module(backend)
-        self.real_dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
+        self.real_dtype = real_dtype(precision)
         self._half = half = (pupil.axis.size + 1) // 2
-        points, even, odd = image_points(pupil, stamp_px, pixel, extra)
+        # Cosines and sines from the pupil's columns to the points along x.
+        points, even_weights, odd_weights = image_points(pupil, stamp_px, pixel, extra)
         angle = np.pi * np.outer(pupil.axis, points)
         waves = np.stack([np.cos(angle), np.sin(angle)])
         self._from_x = self._array(waves)
-        # Both halves in one. Of an odd grid the middle row is its own mirror image.
-        alone = np.where(pupil.axis[-half:] == 0.0, 1.0, 2.0)
-        self._from_y = self._array((waves[:, -half:] * alone[:, None]).swapaxes(1, 2))
-        bins = np.stack([even, odd]) / np.sqrt(pupil.light)
-        self._to_x, self._to_y = self._array(bins), self._array(bins.swapaxes(1, 2))
+        # The same along y for both halves of the pupil at once. The middle row of an odd grid is
+        # its own mirror image and counts once.
+        multiplicity = np.where(pupil.axis[-half:] == 0.0, 1.0, 2.0)
+        self._from_y = self._array((waves[:, -half:] * multiplicity[:, None]).swapaxes(1, 2))
+        # Weights from intensities to pixels, even and odd ones.
+        weights = np.stack([even_weights, odd_weights]) / np.sqrt(pupil.light)
+        self._to_x, self._to_y = self._array(weights), self._array(weights.swapaxes(1, 2))
         self._amplitude = self._array(pupil.amplitude[-half:])
         self._axis = self._array(pupil.axis)
-        self._work = threading.local()
+        self._scratch = threading.local()
 
     def __call__(self, opd: np.ndarray | Tensor, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Propagate a batch.
+        """Propagate a batch of wavefronts to stamps.
 
         Parameters
         ----------
@@ -166,20 +190,27 @@ class StampPropagator:
         # Looking at a stamp moved by +u is the tilt that moves the image by −u.
         tilt = np.zeros((batch, 2)) if offset_px is None else np.asarray(offset_px, float)
         tilt = self._array(-np.pi * self.pixel * tilt)
-        # Axes: [cosine or sine in y, real or imaginary, star, point in y, pupil x].
+        # Along y. Axes: [cosine or sine in y, real or imaginary, star, point in y, pupil x]. Stars
+        # with 2^17 samples are worked on together: their phases stay in a core's cache.
         rows = self._buffer("rows", 2, 2, batch, m, n)
-        size = max(1, IN_CACHE // n**2)
+        size = max(1, 2**17 // n**2)
         for part in (slice(start, start + size) for start in range(0, batch, size)):
-            fields = self._folded(opd[part], tilt[part])
+            fields = self._folded_fields(opd[part], tilt[part])
             xp.matmul(self._from_y[:, None, None], fields, out=rows[:, :, part])
+        # Along x, with a leading axis: cosine or sine in x.
         field = self._buffer("field", 2, 2, 2, batch, m, m)
         xp.matmul(rows, self._from_x[:, None, None, None], out=field)
         return self._pixels(self._intensities(field))
 
-    def _folded(self, opd: Any, tilt: Any) -> Any:
-        """exp(is) cos t and exp(is) sin t of the pupil field, each (re, im), (2, 2, b, half, M)."""
+    def _folded_fields(self, opd: Any, tilt: Any) -> Any:
+        """Return exp(is) cos t and exp(is) sin t over half of the pupil, (2, 2, b, half, M).
+
+        s and t are the even and odd part of the phase over y. The second axis is the real or
+        imaginary part.
+        """
         xp, half, shape = self._xp, self._half, (len(opd), self._half, opd.shape[-1])
         upper, mirrored = opd[:, -half:], xp.flip(opd[:, :half], (1,))
+        # s = π (W(y) + W(−y)) and t = π (W(y) − W(−y)); tilts along x are even, along y odd.
         phase = self._buffer("phase", 2, *shape)
         xp.add(upper, mirrored, out=phase[0])
         xp.subtract(upper, mirrored, out=phase[1])
@@ -194,51 +225,59 @@ class StampPropagator:
         return xp.multiply(waves[:, 0], waves[:, None, 1], out=fields)
 
     def _intensities(self, field: Any) -> Any:
-        """Even and odd parts over x and over y, shape (2, 2, B, m, m), those odd in x halved.
+        """Return the even and odd parts of |E|² over x and over y, (2, 2, B, m, m).
 
-        `field` holds [cosine or sine in x, in y, real or imaginary]. At ±x and ±y the field
-        is (C ± S)_cos ∓ i (C ± S)_sin.
+        Those that are odd in x are halved. `field` holds [cosine or sine in x, in y, real or
+        imaginary]. At ±x and ±y the field is (C ± S)_cos ∓ i (C ± S)_sin.
         """
         xp, shape = self._xp, tuple(field.shape[3:])
         product = self._buffer("product", 2, 2, 2, *shape)
-        found = self._buffer("intensity", 2, 2, *shape)
-        (cos_re, cos_im), (sin_re, sin_im) = field[0].swapaxes(0, 1), field[1].swapaxes(0, 1)
-        found[0, 0] = xp.multiply(field, field, out=product).reshape(8, *shape).sum(0)
+        intensity = self._buffer("intensity", 2, 2, *shape)
+        # Even over x and y: the squares of all parts.
+        intensity[0, 0] = xp.multiply(field, field, out=product).reshape(8, *shape).sum(0)
+        # Even over x and odd over y: twice the products of cosines and sines in y.
         half = product[0]
         xp.multiply(field[:, 0], field[:, 1], out=half)
-        found[0, 1] = 2.0 * half.reshape(4, *shape).sum(0)
-        for parity, (re, im) in enumerate(
-            ((sin_re, sin_im), (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,))))
-        ):
+        intensity[0, 1] = 2.0 * half.reshape(4, *shape).sum(0)
+        # Odd over x: products of real and imaginary parts across cosines and sines in x. They are
+        # even over y for equal parts in y, and odd for different ones.
+        (cos_re, cos_im), (sin_re, sin_im) = field[0].swapaxes(0, 1), field[1].swapaxes(0, 1)
+        crossed = (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,)))
+        for parity, (re, im) in enumerate(((sin_re, sin_im), crossed)):
             xp.multiply(cos_re, im, out=half[0])
             xp.multiply(cos_im, re, out=half[1])
-            found[1, parity] = half[0].sum(0) - half[1].sum(0)
-        return found
+            intensity[1, parity] = half[0].sum(0) - half[1].sum(0)
+        return intensity
 
     def _pixels(self, intensity: Any) -> np.ndarray:
-        """Pixels of the stamp from the parts of the intensity at the points."""
-        along = self._xp.matmul(intensity, self._to_x[:, None, None])
-        parts = np.asarray(self._xp.matmul(self._to_y[:, None], along))
+        """Return stamps (B, d, d) of the parts of the intensity at the points."""
+        along_x = self._xp.matmul(intensity, self._to_x[:, None, None])
+        parts = np.asarray(self._xp.matmul(self._to_y[:, None], along_x))
         d, half = self.stamp_px, (self.stamp_px + 1) // 2
         above, below = slice(d // 2, None), slice(half - 1, None, -1)
-        # The middle pixel of an odd stamp is written by both sides, which agree.
+        # Pixels at ±x and ±y are even ± odd parts. The middle pixel of an odd stamp is written by
+        # both sides, which agree.
         stamp = np.empty((len(parts[0, 0]), d, d), self.real_dtype)
         for sign, columns in ((2.0, above), (-2.0, below)):
-            even, odd = parts[0] + sign * parts[1]
-            stamp[:, above, columns] = even + odd
-            stamp[:, below, columns] = even - odd
+            even_rows, odd_rows = parts[0] + sign * parts[1]
+            stamp[:, above, columns] = even_rows + odd_rows
+            stamp[:, below, columns] = even_rows - odd_rows
         return stamp
 
     def _array(self, array: np.ndarray) -> Any:
+        """Return an array of the backend in the propagator's precision."""
         array = np.ascontiguousarray(array, dtype=self.real_dtype)
         return array if self._xp is np else self._xp.from_numpy(array)
 
     def _buffer(self, name: str, *shape: int) -> Any:
-        """Scratch space kept between calls: fresh pages would cost more than the arithmetic."""
-        kept: dict[tuple[int, ...], Any] = vars(self._work).setdefault(name, {})
-        if shape not in kept:
-            kept[shape] = self._array(np.empty(shape, self.real_dtype))
-        return kept[shape]
+        """Return scratch space that is kept between calls, one for each thread.
+
+        Fresh pages of memory would cost more than the arithmetic.
+        """
+        buffers: dict[tuple[int, ...], Any] = vars(self._scratch).setdefault(name, {})
+        if shape not in buffers:
+            buffers[shape] = self._array(np.empty(shape, self.real_dtype))
+        return buffers[shape]
 
 
 def in_batches(
@@ -254,23 +293,14 @@ def in_batches(
     samples : ndarray of int, shape (B,)
         Pupil samples N of every wavefront.
     size : int
-        Most wavefronts in a batch.
+        Largest number of wavefronts in a batch.
     threads : int
         Batches at once; linear algebra should be on one thread meanwhile.
     prepare : callable
-        From N to the work on a batch, which gets its wavefronts' numbers, shape (b,).
+        Function of N that returns the work on a batch: a function of its wavefronts' numbers,
+        shape (b,).
     """
     for count in np.unique(samples):
         members = np.flatnonzero(samples == count)
         batches = np.array_split(members, range(size, members.size, size))
         side_by_side(prepare(int(count)), batches, threads)
-
-
-def _array_module(backend: Backend) -> Any:
-    if backend == "numpy":
-        return np
-    if backend == "torch":
-        import torch
-
-        return torch
-    raise ValueError(f"optics.backend = {backend!r}: expected 'numpy' or 'torch'")

@@ -1,4 +1,4 @@
-"""Pupil grids: their transmission, and how finely they must be sampled against aliasing."""
+"""Pupil grids: their transmission, and the number of samples that aliasing requires."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from psfdae.errors import Error
 
 @dataclass(frozen=True)
 class Pupil:
-    """A sampled pupil.
+    """Pupil sampled on a square grid.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Pupil:
 
 
 def pupil_axis(samples: int, guard: int = 0) -> np.ndarray:
-    """Cell-centred coordinates of a pupil grid along one axis.
+    """Return the cell-centred coordinates of a pupil grid along one axis.
 
     Parameters
     ----------
@@ -58,10 +58,8 @@ def pupil_axis(samples: int, guard: int = 0) -> np.ndarray:
     return (2.0 * np.arange(-guard, samples + guard) + 1.0) / samples - 1.0
 
 
-def disc_coverage(
-    samples: int, radius: float, guard: int = 0, oversampling: int = 64
-) -> np.ndarray:
-    """Fraction of each cell of a pupil grid that lies inside a centred disc.
+def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
+    """Compute the fraction of each cell of a pupil grid that lies inside a centred disc.
 
     Only the cells that the rim crosses are subdivided, so the cost of a fine
     subdivision grows with the rim's length and not with the area.
@@ -72,29 +70,31 @@ def disc_coverage(
         Grid as in `pupil_axis`.
     radius : float
         Radius of the disc in pupil radii, 0 … 1.
-    oversampling : int
-        Sub-samples per axis inside a rim cell.
 
     Returns
     -------
     ndarray, shape (M, M), float64
         Coverage, 0 … 1.
     """
+    # By symmetry, distances from the centre are all that counts.
     x = np.abs(pupil_axis(samples, guard))
     half = 1.0 / samples
-    near = np.hypot(np.maximum(x - half, 0)[:, None], np.maximum(x - half, 0)[None, :])
-    far: np.ndarray = np.hypot((x + half)[:, None], (x + half)[None, :])
-    coverage = (far <= radius).astype(np.float64)
-    rows, cols = np.nonzero((near < radius) & (far > radius))
-    sub = pupil_axis(oversampling) * half
-    yy = x[rows][:, None, None] + sub[None, :, None]
-    xx = x[cols][:, None, None] + sub[None, None, :]
-    coverage[rows, cols] = (yy**2 + xx**2 <= radius**2).mean(axis=(1, 2))
+    # Distance of the nearest and of the farthest point of each cell from the centre.
+    low, high = np.maximum(x - half, 0), x + half
+    nearest = np.hypot(low[:, None], low)
+    farthest: np.ndarray = np.hypot(high[:, None], high)
+    # Cells are inside, outside, or crossed by the rim: of those, count 64 × 64 sub-samples.
+    coverage = (farthest <= radius).astype(np.float64)
+    rows, columns = np.nonzero((nearest < radius) & (farthest > radius))
+    offset = pupil_axis(64) * half
+    y = x[rows][:, None, None] + offset[None, :, None]
+    x = x[columns][:, None, None] + offset[None, None, :]
+    coverage[rows, columns] = (y**2 + x**2 <= radius**2).mean(axis=(1, 2))
     return coverage
 
 
 def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pupil:
-    """Annular pupil with grey edges.
+    """Make an annular pupil with grey edges.
 
     A grey (area-weighted) edge is the pupil convolved with one cell, which
     dims the outer image by a second moment of 1/12 cell². `sharpen` takes
@@ -119,10 +119,12 @@ def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pup
     """
     if not 0.0 <= obscuration < 1.0:
         raise ValueError(f"obscuration = {obscuration} is outside [0, 1)")
+    # Lit part of every cell: the outer disc less the central obscuration.
     grey = disc_coverage(samples, 1.0, guard=1)
     if obscuration:
         grey = grey - disc_coverage(samples, obscuration, guard=1)
     if sharpen:
+        # A − ∇²A/24.
         framed = np.pad(grey, 1)
         neighbours = framed[:-2, 1:-1] + framed[2:, 1:-1] + framed[1:-1, :-2] + framed[1:-1, 2:]
         grey = grey - (neighbours - 4.0 * grey) / 24.0
@@ -134,11 +136,11 @@ ARCSEC = np.pi / 180.0 / 3600.0
 
 
 class SamplingError(Error, ValueError):
-    """The pupil grid is too coarse for a wavefront or for the stamp's position."""
+    """Error of a pupil grid that is too coarse for a wavefront or for the stamp's position."""
 
 
 def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Smallest number of pupil samples that represents a wavefront and its stamp.
+    """Compute the smallest number of pupil samples that represents a wavefront and its stamp.
 
     Two conditions per axis. The OPD may change by half a wave per sample:
     N ≥ 4·max|∂W/∂ρ|. And the images of the pupil grid repeat every N λ/D, so
@@ -160,13 +162,13 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
     SamplingError
         If a slope is not finite.
     """
-    steepest = 4.0 * np.abs(slopes).max(axis=(-2, -1))
+    # Half a wave per sample of 2/N radii: N ≥ 4 |∂W/∂ρ|.
+    for_slope = 4.0 * np.abs(slopes).max(axis=(-2, -1))
+    # Replicas, N λ/D away, of the geometric blur 2 ∂W/∂ρ stay clear of the stamp on both sides.
     blur = 2.0 * slopes
-    replica = np.maximum(
-        blur[..., 1] - reach[..., 0],
-        reach[..., 1] - blur[..., 0],
-    ).max(axis=-1)
-    needed = np.maximum(steepest, replica)
+    upper, lower = blur[..., 1] - reach[..., 0], reach[..., 1] - blur[..., 0]
+    for_replica = np.maximum(upper, lower).max(axis=-1)
+    needed = np.maximum(for_slope, for_replica)
     if not np.isfinite(needed).all():
         wavefront = int(np.flatnonzero(~np.isfinite(needed))[0])
         raise SamplingError(f"wavefront {wavefront} is not finite: no grid can sample it")
@@ -175,12 +177,12 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> float:
-    """Width of a pixel in units of λ/D."""
+    """Return the width of a pixel in units of λ/D."""
     return scale_arcsec * ARCSEC * diameter_m / wavelength_m
 
 
 def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
-    """Smallest of some grid sizes that serves each wavefront.
+    """Choose the smallest of some grid sizes that serves each wavefront.
 
     Parameters
     ----------
@@ -198,11 +200,11 @@ def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
     SamplingError
         If a wavefront needs more than the largest; names the N that would do.
     """
-    worst = int(needed.max())
-    if worst > sizes[-1]:
+    largest = int(needed.max())
+    if largest > sizes[-1]:
         star = int(needed.argmax())
         raise SamplingError(
-            f"optics.pupil_samples = {list(sizes)}: wavefront {star} needs N ≥ {worst} pupil "
+            f"optics.pupil_samples = {list(sizes)}: wavefront {star} needs N ≥ {largest} pupil "
             f"samples (half a wave per sample, replicas clear of the stamp); "
             f"{int((needed > sizes[-1]).sum())} of {needed.size} wavefronts exceed the last value"
         )

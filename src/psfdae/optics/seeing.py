@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfdae.optics.propagation import Precision
+from psfdae.optics.propagation import Precision, complex_field, real_dtype
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import legendre
 
-FAINT = 1e-4
-"""Fraction of the maximum below which wings of the next period do not matter.
+NEGLIGIBLE_WING = 1e-4
+"""Fraction of the profile's maximum below which wings of the next period do not matter.
 
 In a stamp that is some 1e-5 of the light on single pixels at its edge, an MSE of 1e-10.
 """
@@ -30,7 +30,7 @@ In a stamp that is some 1e-5 of the light on single pixels at its edge, an MSE o
 
 @dataclass(frozen=True)
 class Profile:
-    """A round profile of sum 1: Moffat (1969, A&A 3, 455), or a Gaussian.
+    """Round profile of sum 1: Moffat (1969, A&A 3, 455), or a Gaussian.
 
     Attributes
     ----------
@@ -46,12 +46,13 @@ class Profile:
     @property
     def scale(self) -> float:
         """Core radius a, or the Gaussian's standard deviation, in λ/D."""
+        # Half of the maximum at half of the FWHM.
         if self.beta is None:
             return float(self.fwhm / np.sqrt(8.0 * np.log(2.0)))
         return float(0.5 * self.fwhm / np.sqrt(2.0 ** (1.0 / self.beta) - 1.0))
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Fourier transform at frequencies in cycles per λ/D, 1 at 0; any shape.
+        """Return the Fourier transform at frequencies in cycles per λ/D, 1 at 0; any shape.
 
         That of the Moffat profile is 2 (z/2)^ν K_ν(z) / Γ(ν) with ν = β − 1, z = 2πaf.
         """
@@ -60,80 +61,93 @@ class Profile:
             return np.exp(-0.5 * z**2)
         from scipy.special import gamma, kv
 
-        order = self.beta - 1.0
-        at_zero, z = z == 0.0, np.where(z == 0.0, 1.0, z)
-        return np.where(at_zero, 1.0, 2.0 * (0.5 * z) ** order * kv(order, z) / gamma(order))
+        # K_ν is infinite at 0; the limit there is 1.
+        order, is_zero = self.beta - 1.0, z == 0.0
+        z = np.where(is_zero, 1.0, z)
+        return np.where(is_zero, 1.0, 2.0 * (0.5 * z) ** order * kv(order, z) / gamma(order))
 
     @property
     def reach(self) -> float:
-        """Radius in λ/D at which the profile has fallen to `FAINT` of its maximum."""
+        """Radius in λ/D at which the profile has fallen to `NEGLIGIBLE_WING` of its maximum."""
         if self.beta is None:
-            return float(self.scale * np.sqrt(-2.0 * np.log(FAINT)))
-        return float(self.scale * np.sqrt(FAINT ** (-1.0 / self.beta) - 1.0))
-
-
-STEP = 1e-3
-"""Relative step of the central difference over the width of a profile."""
+            return float(self.scale * np.sqrt(-2.0 * np.log(NEGLIGIBLE_WING)))
+        return float(self.scale * np.sqrt(NEGLIGIBLE_WING ** (-1.0 / self.beta) - 1.0))
 
 
 @dataclass(frozen=True)
 class Broadening:
     """Derivative of a profile by the logarithm of its width, in the place of the profile.
 
-    A stamp is linear in the profile's transfer function: what is blurred by this is the stamp's
-    derivative.
+    A stamp is linear in the profile's transfer function: a stamp that is blurred by this is the
+    derivative of the stamp.
     """
 
     profile: Profile
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the change of the transfer function, 0 at 0."""
-        wide, narrow = (
-            replace(self.profile, fwhm=self.profile.fwhm * np.exp(step)).transfer(frequency)
-            for step in (STEP, -STEP)
+        """Return the derivative of the transfer function, 0 at 0."""
+        # Central difference over ± 0.1 % of the width.
+        step = 1e-3
+        broad, narrow = (
+            replace(self.profile, fwhm=self.profile.fwhm * np.exp(change)).transfer(frequency)
+            for change in (step, -step)
         )
-        return np.asarray((wide - narrow) / (2.0 * STEP))
+        # d/d ln(width), because the widths are scaled by exp(± step).
+        return np.asarray((broad - narrow) / (2.0 * step))
 
 
 class WholePeriod:
     """Fields over the whole period of the image, by Fourier transforms.
 
     Part of a `psfdae.optics.derivatives.Sampling`.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    precision : "complex64" or "complex128"
     """
 
     product_cost = 0.6
-    points: int
-    dtype: np.dtype
-    _axis: np.ndarray
+
+    def __init__(self, pupil: Pupil, precision: Precision) -> None:
+        from scipy import fft  # here, because every configuration knows the profiles
+
+        self.dtype = real_dtype(precision)
+        self._axis = pupil.axis
+        # Twice as many points as samples determine the intensity.
+        self.points = fft.next_fast_len(2 * pupil.axis.size)
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`, m = points."""
+        """Propagate along x as `Sampling` does, to m = `points` points."""
         return self._transformed(pupil_fields, degrees, -1)
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`."""
+        """Propagate along y as `Sampling` does."""
         return self._transformed(rows, degrees, -2)
 
     def _transformed(self, fields: np.ndarray, degrees: Sequence[int], axis: int) -> np.ndarray:
-        """Fields (B, ., .) times Legendre polynomials along an axis, transformed along it."""
+        """Return fields (B, ., .) times Legendre polynomials, transformed along an axis."""
         from scipy import fft
 
+        # Zeros behind the pupil's samples, up to the number of points.
         shape = [len(degrees), *fields.shape]
         shape[axis] = self.points
         padded = np.zeros(shape, fields.dtype)
-        own = padded[..., : len(self._axis)] if axis == -1 else padded[..., : len(self._axis), :]
+        # The axis that is transformed comes last.
+        along = padded if axis == -1 else padded.swapaxes(-1, -2)
+        lit = along[..., : len(self._axis)]
+        values = fields if axis == -1 else fields.swapaxes(-1, -2)
+        # P_0 = 1 needs no product.
         if max(degrees):
             weights = legendre(degrees, self._axis).astype(self.dtype)
-            np.multiply(
-                fields, weights[:, None, :, None] if axis == -2 else weights[:, None, None], out=own
-            )
+            np.multiply(values, weights[:, None, None], out=lit)
         else:
-            own[:] = fields
+            lit[:] = values
         return np.asarray(fft.fft(padded, axis=axis, overwrite_x=True))
 
 
 class BlurredSampling(WholePeriod):
-    """The whole period of the image, blurred; a `psfdae.optics.derivatives.Sampling`.
+    """Whole period of the image, blurred; a `psfdae.optics.derivatives.Sampling`.
 
     Parameters
     ----------
@@ -154,32 +168,36 @@ class BlurredSampling(WholePeriod):
         profile: Profile | Broadening,
         precision: Precision,
     ) -> None:
-        from scipy import fft  # here, because every configuration knows the profiles
+        from scipy import fft
 
-        self.dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
-        self.complex = np.dtype(precision)
-        self._axis = pupil.axis
-        self.points = n = fft.next_fast_len(2 * pupil.axis.size)
-        # Cycles per pixel of the lags; those of one sign stand for both, the image is real.
+        super().__init__(pupil, precision)
+        # Cycles per pixel of the lags l along rows and columns. The image is real: lags of one
+        # sign along the columns stand for both and count twice.
+        n = self.points
         step = 0.5 * pupil.spacing * pixel * n
-        self.rows, self.columns = step * fft.fftfreq(n), step * fft.rfftfreq(n)
-        rows, columns = self.rows[:, None], self.columns
-        both = np.where(columns == 0.0, 1.0, 2.0)
+        self._row_frequency = step * fft.fftfreq(n)
+        self._column_frequency = step * fft.rfftfreq(n)
+        rows, columns = self._row_frequency[:, None], self._column_frequency
+        multiplicity = np.where(columns == 0.0, 1.0, 2.0)
+        # Transfer functions of the pixel and of the profile.
         blur = profile.transfer(np.hypot(rows, columns) / pixel)
-        weights = both * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
+        weights = multiplicity * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
         self._transfer = (weights * blur).astype(self.dtype)
+        self._complex = np.dtype(precision)
         self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
 
     def to_pixels(
         self, values: np.ndarray, offset_px: Sequence[float] | np.ndarray = (0, 0)
     ) -> np.ndarray:
-        """Pixels (..., d, d) of intensities (..., n, n) around a place (row, column) in pixels."""
+        """Return pixels (..., d, d) of intensities (..., n, n) around a place (row, column)."""
         from scipy import fft
 
+        # Lags of the intensity, and the inverse transform at the centres of the pixels alone.
         spectrum = fft.rfft2(values) * self._transfer
+        frequencies = (self._row_frequency, self._column_frequency)
         to_rows, to_columns = (
-            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self.complex)
-            for offset, frequency in zip(offset_px, (self.rows, self.columns), strict=True)
+            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self._complex)
+            for offset, frequency in zip(offset_px, frequencies, strict=True)
         )
         return np.asarray(((to_rows @ spectrum) @ to_columns.T).real)
 
@@ -205,13 +223,11 @@ class BlurredPropagator:
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, moved by (B, 2) pixels."""
         offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
-        return np.stack([self._stamp(*star) for star in zip(opd, offset_px, strict=True)])
-
-    def _stamp(self, opd: np.ndarray, offset_px: np.ndarray) -> np.ndarray:
-        phase = (2.0 * np.pi) * opd.astype(self.real_dtype)
-        pupil_field = np.empty(phase.shape, self._sampling.complex)
-        pupil_field.real, pupil_field.imag = np.cos(phase), np.sin(phase)
-        pupil_field *= self._amplitude
-        (rows,) = self._sampling.along_x(pupil_field[None])
-        image = self._sampling.along_y(rows)[0, 0]
-        return self._sampling.to_pixels(image.real**2 + image.imag**2, offset_px)
+        # Field of the pupil, field at the points of a period, and blurred pixels of each star.
+        stamps = []
+        for waves, offset in zip(opd, offset_px, strict=True):
+            phase = (2.0 * np.pi) * waves.astype(self.real_dtype)
+            (rows,) = self._sampling.along_x(complex_field(phase, self._amplitude)[None])
+            image = self._sampling.along_y(rows)[0, 0]
+            stamps.append(self._sampling.to_pixels(image.real**2 + image.imag**2, offset))
+        return np.stack(stamps)

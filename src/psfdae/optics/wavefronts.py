@@ -1,7 +1,7 @@
-"""Wavefronts that are sums of modes, on whatever pupil grid.
+"""Wavefronts that are sums of modes, on any pupil grid.
 
 A mode is the OPD in waves of a unit coefficient: a Seidel monomial, a Zernike
-polynomial. Scenes differ in their modes and in how they draw coefficients, no more.
+polynomial. Scenes differ only in their modes and in how they draw coefficients.
 
 The third-order (Seidel) wavefront of a telescope over its field is
 
@@ -37,7 +37,7 @@ MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 
 
 def monomial_coefficients(seidel: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Seidel coefficients at field points, as coefficients of pupil monomials.
+    """Convert Seidel coefficients at field points to coefficients of pupil monomials.
 
     Parameters
     ----------
@@ -51,6 +51,7 @@ def monomial_coefficients(seidel: np.ndarray, field: np.ndarray) -> np.ndarray:
     ndarray, shape (..., 8)
         Coefficients in waves in the order of `MONOMIALS`.
     """
+    # W040 ρ⁴ + W131 (h·ρ) ρ² + W222 (h·ρ)² + W220 h² ρ² + W311 h² (h·ρ), term by term.
     w040, w131, w222, w220, w311 = np.moveaxis(np.asarray(seidel, float), -1, 0)
     hx, hy = np.moveaxis(np.asarray(field, float), -1, 0)
     h2 = hx**2 + hy**2
@@ -68,7 +69,7 @@ def monomial_coefficients(seidel: np.ndarray, field: np.ndarray) -> np.ndarray:
 
 
 def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Values of the eight monomials at pupil points.
+    """Return the values of the eight monomials at pupil points.
 
     Parameters
     ----------
@@ -79,13 +80,14 @@ def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (8, ...)
     """
+    # In the order of `MONOMIALS`.
     x, y = np.broadcast_arrays(x, y)
     r2 = x**2 + y**2
     return np.stack([r2**2, r2 * x, r2 * y, x**2, x * y, y**2, x, y])
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
-    """Radial order n and signed azimuthal order m of Noll index j ≥ 1.
+    """Return radial order n and signed azimuthal order m of Noll index j ≥ 1.
 
     m > 0 marks cosine terms, m < 0 sine terms; even j are cosines.
 
@@ -96,26 +98,29 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     """
     if j < 1:
         raise ValueError(f"Noll index {j}: must be at least 1")
+    # Order n has n + 1 terms, the first one after n (n + 1)/2 of lower orders.
     n = 0
     while (n + 1) * (n + 2) // 2 < j:
         n += 1
+    # |m| is even for even n and grows by 2 with every pair of terms.
     position = j - n * (n + 1) // 2 - 1
     m = 2 * ((position + 1) // 2) if n % 2 == 0 else 2 * (position // 2) + 1
     return n, m if j % 2 == 0 else -m
 
 
 def radial_polynomial(n: int, m: int, r: np.ndarray) -> np.ndarray:
-    """R_n^|m|(r), 1 at r = 1."""
+    """Return Zernike's R_n^|m|(r), 1 at r = 1."""
     m = abs(m)
-    found: np.ndarray = sum(
+    # Σ_k (−1)^k (n−k)! / (k! ((n+m)/2−k)! ((n−m)/2−k)!) r^(n−2k), as two binomials.
+    polynomial: np.ndarray = sum(
         (-1) ** k * comb(n - k, k) * comb(n - 2 * k, (n - m) // 2 - k) * r ** (n - 2 * k)
         for k in range((n - m) // 2 + 1)
     )
-    return found
+    return polynomial
 
 
 def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Noll polynomial Z_j on the unit disc, of RMS 1 there.
+    """Return the Noll polynomial Z_j, whose RMS over the unit disc is 1.
 
     Parameters
     ----------
@@ -129,6 +134,7 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     -------
     ndarray of the broadcast shape of x and y
     """
+    # √(n+1) R_n⁰ for m = 0, else √(2(n+1)) R_n^m times cos mθ or sin mθ.
     n, m = noll_to_nm(j)
     r, theta = np.hypot(x, y), np.arctan2(y, x)
     if m == 0:
@@ -138,19 +144,14 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def zernike_images(noll: Iterable[int], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Values of some Noll polynomials at pupil points in pupil radii, shape (J, ...)."""
+    """Return values of Noll polynomials at pupil points in pupil radii, shape (J, ...)."""
     return np.stack([zernike(j, x, y) for j in noll])
-
-
-def zernike_basis(count: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Z_1 … Z_count, shape (count, ...)."""
-    return zernike_images(range(1, count + 1), x, y)
 
 
 def field_coefficients(
     polynomials: Sequence[Mapping[tuple[int, int], float]], field: np.ndarray
 ) -> np.ndarray:
-    """Coefficients whose field dependence is polynomial, at field points.
+    """Evaluate coefficients that are polynomials of the field, at field points.
 
     Nodal aberration theory writes every Zernike coefficient of a telescope, aligned or
     not, as a polynomial of the field vector (Thompson 2005, JOSA A 22, 1389). Pupil and
@@ -159,7 +160,7 @@ def field_coefficients(
     Parameters
     ----------
     polynomials : sequence of length J
-        Per term: coefficient in waves by the powers (of x, of y) of the field.
+        For each term, coefficients in waves by the powers (of x, of y) of the field.
     field : ndarray, shape (F, 2)
         Field vector (x, y), 1 at the edge of the field on an axis.
 
@@ -168,6 +169,7 @@ def field_coefficients(
     ndarray, shape (F, J)
         In waves.
     """
+    # Σ waves x^a y^b of every term; a term without powers is 0.
     x, y = field[:, 0], field[:, 1]
     terms = [
         sum((waves * x**a * y**b for (a, b), waves in polynomial.items()), np.zeros(len(field)))
@@ -176,27 +178,26 @@ def field_coefficients(
     return np.stack(terms, axis=1)
 
 
-Modes = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Modes at pupil points (x, y) in pupil radii, shapes (...) to (J, ...)."""
+PupilModes = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Function of pupil points (x, y) in pupil radii, shapes (...), that returns J modes (J, ...)."""
 
 
-def movable_modes(modes: Modes, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
+def movable_modes(modes: PupilModes, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return modes and two tilts that move the image by a pixel along x and y, (J + 2, ...).
+
+    A tilt of a waves per pupil radius moves the image by 2a λ/D; `pixel` is in λ/D.
+    """
     tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
     return np.concatenate([modes(x, y), tilts])
 
 
-HIGHEST_DEGREE = 16
-"""Highest degree of modes, in either coordinate of the pupil."""
-
-
 def legendre(degrees: Sequence[int], x: np.ndarray) -> np.ndarray:
-    """Legendre polynomials at x (n,), shape (A, n)."""
+    """Return Legendre polynomials at x (n,), shape (A, n)."""
     return np.polynomial.legendre.legvander(x, max(degrees)).T[list(degrees)]
 
 
-def legendre_expansion(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-    """Modes as sums of products P_a(x) P_b(y) of Legendre polynomials.
+def legendre_expansion(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
+    """Expand modes as sums of products P_a(x) P_b(y) of Legendre polynomials.
 
     Returns
     -------
@@ -207,63 +208,64 @@ def legendre_expansion(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     ValueError
-        If modes are no polynomials of a degree below `HIGHEST_DEGREE`.
+        If modes are no polynomials of a degree below 16 in either coordinate.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(HIGHEST_DEGREE + 1)
+    # Gauss–Legendre quadrature of (a + ½) (b + ½) ∫∫ M P_a(x) P_b(y) dx dy, exact for polynomials.
+    highest = 16
+    nodes, weights = np.polynomial.legendre.leggauss(highest + 1)
     values = modes(nodes[None, :], nodes[:, None])
-    norm = np.arange(HIGHEST_DEGREE + 1) + 0.5
-    onto = legendre(range(HIGHEST_DEGREE + 1), nodes) * weights * norm[:, None]
-    found = (onto @ values @ onto.T).swapaxes(1, 2)  # [mode, a, b]
-    size = np.abs(found).max(axis=(1, 2), keepdims=True)
-    occurs = (np.abs(found) > 1e-11 * size).any(axis=0)
+    norm = np.arange(highest + 1) + 0.5
+    projection = legendre(range(highest + 1), nodes) * weights * norm[:, None]
+    coefficients = (projection @ values @ projection.T).swapaxes(1, 2)  # [mode, a, b]
+    # Products that occur in a mode, beyond rounding. The highest ones are there to show modes
+    # that are no polynomials.
+    largest = np.abs(coefficients).max(axis=(1, 2), keepdims=True)
+    occurs = (np.abs(coefficients) > 1e-11 * largest).any(axis=0)
     if occurs[-1].any() or occurs[:, -1].any():
-        raise ValueError(f"modes: no polynomials of a degree below {HIGHEST_DEGREE}")
+        raise ValueError(f"modes: no polynomials of a degree below {highest}")
     occurs[0, 0] = False
-    return np.argwhere(occurs), found[:, occurs]
-
-
-SLOPE_POINTS = 65
-"""Points per axis at which slopes are measured."""
-
-SLOPE_BATCH = 256
-"""Wavefronts whose slopes are held at a time: 8 MB per axis."""
-
-STEP = 1e-4
-"""Step of the central differences of polynomials; they err by less than 1e-6."""
+    return np.argwhere(occurs), coefficients[:, occurs]
 
 
 class WavefrontSource(Protocol):
-    """A batch of wavefronts that can be put on any pupil grid."""
+    """Batch of wavefronts that can be put on any pupil grid."""
 
     def __len__(self) -> int: ...
 
     def slopes(self) -> np.ndarray:
-        """[wavefront, axis (x, y), (min, max)] slope in waves per pupil radius, (B, 2, 2)."""
+        """Return extreme slopes in waves per pupil radius, (B, 2, 2).
+
+        The axes are [wavefront, axis (x, y), (min, max)].
+        """
 
     def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        """OPD in waves of the wavefronts `index` on the grid of `pupil`, shape (b, M, M)."""
+        """Return the OPD in waves of the wavefronts `index` on the grid of `pupil`, (b, M, M)."""
 
 
-def mode_slopes(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of modes by x and by y over the full disc and its rim, shape (J, points) each.
+def mode_slopes(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
+    """Compute slopes of modes by x and by y over the full disc and its rim, (J, points) each.
 
     An obscured centre is included: its slopes are the smaller ones and never decide.
     """
-    axis = np.linspace(-1.0, 1.0, SLOPE_POINTS)
-    x, y = np.meshgrid(axis, axis)
-    inside = x**2 + y**2 <= 1.0
-    angle = np.linspace(0.0, 2.0 * np.pi, 8 * SLOPE_POINTS, endpoint=False)
-    u, v = np.append(x[inside], np.cos(angle)), np.append(y[inside], np.sin(angle))
+    # 65 points along the diameter, and 520 on the rim.
+    axis = np.linspace(-1.0, 1.0, 65)
+    grid_x, grid_y = np.meshgrid(axis, axis)
+    is_inside = grid_x**2 + grid_y**2 <= 1.0
+    angle = np.linspace(0.0, 2.0 * np.pi, 8 * axis.size, endpoint=False)
+    x = np.append(grid_x[is_inside], np.cos(angle))
+    y = np.append(grid_y[is_inside], np.sin(angle))
+    # Central differences; those of polynomials err by less than 1e-6.
+    step = 1e-4
     return (
-        (modes(u + STEP, v) - modes(u - STEP, v)) / (2.0 * STEP),
-        (modes(u, v + STEP) - modes(u, v - STEP)) / (2.0 * STEP),
+        (modes(x + step, y) - modes(x - step, y)) / (2.0 * step),
+        (modes(x, y + step) - modes(x, y - step)) / (2.0 * step),
     )
 
 
 def slope_ranges(
     mode_slopes: tuple[np.ndarray, np.ndarray], coefficients: np.ndarray
 ) -> np.ndarray:
-    """Extreme slopes of wavefronts.
+    """Compute the extreme slopes of wavefronts.
 
     Parameters
     ----------
@@ -276,10 +278,11 @@ def slope_ranges(
     ndarray, shape (B, 2, 2)
         [wavefront, axis (x, y), (min, max)] in waves per pupil radius.
     """
+    # Slopes of 256 wavefronts are in memory at a time: 8 MB per axis.
     ranges = np.empty((len(coefficients), 2, 2))
     for axis, gradient in enumerate(mode_slopes):
-        for start in range(0, len(coefficients), SLOPE_BATCH):
-            part = slice(start, start + SLOPE_BATCH)
+        for start in range(0, len(coefficients), 256):
+            part = slice(start, start + 256)
             slopes = coefficients[part] @ gradient
             ranges[part, axis, 0] = slopes.min(axis=1)
             ranges[part, axis, 1] = slopes.max(axis=1)
@@ -287,49 +290,49 @@ def slope_ranges(
 
 
 class ModalWavefronts:
-    """Wavefronts as sums of modes, one per row of coefficients; a `WavefrontSource`.
+    """Wavefronts that are sums of modes, one per row of coefficients; a `WavefrontSource`.
 
     Parameters
     ----------
-    modes : Modes
+    modes : PupilModes
     coefficients : ndarray, shape (B, J)
         In waves.
-    drawn : mapping of str to (ndarray, str), optional
-        What a product of stars keeps of them: by name, values in waves and their meaning.
+    star_columns : mapping of str to (ndarray, str), optional
+        Columns of a product of stars, by name: coefficients in waves and their meaning.
     """
 
     def __init__(
         self,
-        modes: Modes,
+        modes: PupilModes,
         coefficients: np.ndarray,
-        drawn: Mapping[str, tuple[np.ndarray, str]] | None = None,
+        star_columns: Mapping[str, tuple[np.ndarray, str]] | None = None,
     ) -> None:
         self.modes = modes
         self.coefficients = coefficients
-        self.drawn = drawn or {}
+        self.star_columns = star_columns or {}
         self._images: dict[tuple[int, str], np.ndarray] = {}
 
     def __len__(self) -> int:
         return len(self.coefficients)
 
     def slopes(self) -> np.ndarray:
-        """Extreme slopes, shape (B, 2, 2); see `slope_ranges`."""
+        """Return extreme slopes, shape (B, 2, 2); see `slope_ranges`."""
         return slope_ranges(mode_slopes(self.modes), self.coefficients)
 
     def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        """OPD in waves of the wavefronts `index`, shape (b, M, M)."""
+        """Return the OPD in waves of the wavefronts `index`, shape (b, M, M)."""
+        # Images of the modes are kept for each grid and precision.
         size = pupil.axis.size
         key = (size, np.dtype(dtype).str)
         if key not in self._images:
             images = self.modes(pupil.axis[None, :], pupil.axis[:, None])
             self._images[key] = images.reshape(len(images), -1).astype(dtype)
-        return np.asarray(
-            (self.coefficients[index].astype(dtype) @ self._images[key]).reshape(-1, size, size)
-        )
+        opd = self.coefficients[index].astype(dtype) @ self._images[key]
+        return np.asarray(opd.reshape(-1, size, size))
 
 
 def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:
-    """Third-order wavefronts of field points.
+    """Make third-order wavefronts of field points.
 
     Parameters
     ----------
@@ -338,12 +341,12 @@ def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:
     field : ndarray, shape (B, 2)
         Relative field vector (h_x, h_y).
     """
-    drawn = {"seidel": (seidel, "W040, W131, W222, W220, W311 at H = 1")}
-    return ModalWavefronts(monomial_images, monomial_coefficients(seidel, field), drawn)
+    columns = {"seidel": (seidel, "W040, W131, W222, W220, W311 at H = 1")}
+    return ModalWavefronts(monomial_images, monomial_coefficients(seidel, field), columns)
 
 
 def zernike_wavefronts(noll: Sequence[int], coefficients: np.ndarray) -> ModalWavefronts:
-    """Sums of Zernike polynomials.
+    """Make wavefronts that are sums of Zernike polynomials.
 
     Parameters
     ----------
@@ -353,5 +356,5 @@ def zernike_wavefronts(noll: Sequence[int], coefficients: np.ndarray) -> ModalWa
         OPD in waves RMS.
     """
     about = f"Noll coefficients j = {', '.join(map(str, noll))}"
-    drawn = {"zernike": (coefficients, about)}
-    return ModalWavefronts(partial(zernike_images, tuple(noll)), coefficients, drawn)
+    columns = {"zernike": (coefficients, about)}
+    return ModalWavefronts(partial(zernike_images, tuple(noll)), coefficients, columns)

@@ -1,60 +1,58 @@
-"""Modes of posteriors of Poisson counts, many at once.
+"""Maxima of posteriors of Poisson counts, many at once.
 
-Fisher scoring: Gauss–Newton steps with the expected information of the current parameters,
-damped after Levenberg and Marquardt where a step does not raise the posterior. What the counts
-are expected to be is the caller's: one star's aberrations, those of a whole field, or the state
-of a misaligned telescope.
+Each climb is Fisher scoring: Gauss–Newton steps with the expected information of the current
+parameters, damped after Levenberg and Marquardt where a step does not raise the posterior. The
+caller computes the expected counts: from the aberrations of one star, from those of a whole
+field, or from the state of a misaligned telescope.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Function of the numbers of some starts, (a,), and their parameters, (a, K): logarithm of the
-posterior (a,), its slope (a, K), and the expected information with that of the prior (a, K, K)."""
+Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
 
-DAMPING_FACTOR = 10.0
-"""Levenberg–Marquardt damping factor, down after a good step and up after a bad one."""
+Evaluate = Callable[[np.ndarray, np.ndarray], Evaluation]
+"""Function of the numbers of some starts, (a,), and their parameters, (a, K), that evaluates the
+logarithm of their posterior."""
 
 
 class Steps(NamedTuple):
-    """When a climb ends, and how carefully it starts."""
+    """Settings of a climb: how long it goes on, and how carefully it starts."""
 
-    most: int = 12
-    least_gain: float = 0.02
-    """Least gain in the logarithm of the posterior: a step that promises less is the last one."""
-    decisive: int | None = None
-    """First so many parameters, of which alone that gain is counted, whatever the others are."""
-    first_damping: float = 1e-2
-    most_damping: float = 1e6
+    max_steps: int = 12
+    min_gain: float = 0.02
+    """Smallest promised gain in the logarithm of the posterior; a step below it is the last."""
+    counted_parameters: int | None = None
+    """Number of leading parameters whose gain alone is compared with `min_gain`; None: all."""
+    initial_damping: float = 1e-2
+    max_damping: float = 1e6
     """Damping at which a climb is given up."""
-    rounding: float = 0.0
-    """Relative fall of the posterior that rounding may cause."""
-    depth: float = np.inf
-    """A climb is given up where even twice the promised gain leaves it this far below the best
-    of its group."""
-
-
-STEPS = Steps()
+    relative_rounding: float = 0.0
+    """Relative fall of the posterior that a step may cause by rounding."""
+    max_drop: float = np.inf
+    """Largest distance in ln of the posterior below the best climb of a group. A climb is given up
+    where even twice its promised gain leaves it farther below."""
 
 
 @dataclass
 class Peaks:
-    """Local maxima that the climbs have found.
+    """Local maxima that the climbs have reached.
 
     Attributes
     ----------
     parameters : ndarray, shape (M, K)
     height : ndarray, shape (M,)
-        Logarithm of the posterior; with what the last step promised, where that was taken.
+        Logarithm of the posterior, including the promised gain of the last step if it was taken.
     slope, information : ndarray, shapes (M, K) and (M, K, K)
-        Before the last step.
+        Gradient and expected information before the last step.
     evaluations : ndarray of int, shape (M,)
+        Number of evaluations of the posterior.
     converged : ndarray of bool, shape (M,)
     """
 
@@ -62,75 +60,82 @@ class Peaks:
     height: np.ndarray
     slope: np.ndarray
     information: np.ndarray
-    evaluations: np.ndarray = field(default_factory=lambda: np.empty(0, int))
-    converged: np.ndarray = field(default_factory=lambda: np.empty(0, bool))
+    evaluations: np.ndarray
+    converged: np.ndarray
 
-    def take(self, own: np.ndarray, others: Peaks, theirs: np.ndarray) -> None:
-        """Put the results `theirs` of other climbs in place of those at `own`."""
+    def overwrite(self, rows: np.ndarray, peaks: Peaks, peak_rows: np.ndarray) -> None:
+        """Replace the peaks at `rows` by those at `peak_rows` of `peaks`, counts aside."""
         for name in ("parameters", "height", "slope", "information", "converged"):
-            getattr(self, name)[own] = getattr(others, name)[theirs]
+            getattr(self, name)[rows] = getattr(peaks, name)[peak_rows]
 
 
-def poisson(
-    counts: np.ndarray, expected: np.ndarray, slopes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Deviance (n,), score (n, K) and Fisher information (n, K, K) of Poisson counts.
+def poisson_information(counts: np.ndarray, expected: np.ndarray, slopes: np.ndarray) -> Evaluation:
+    """Return deviance (n,), score (n, K) and Fisher information (n, K, K) of Poisson counts.
 
     Parameters
     ----------
     counts : ndarray, shape (n, P)
         NaN where a pixel is not used.
     expected : ndarray, shape (n, P)
-        Mean of the counts, above 0.
+        Mean μ of the counts, above 0.
     slopes : ndarray, shape (n, K, P)
-        Its derivatives.
+        Derivatives of μ by the parameters.
     """
+    # Relative excess e = n/μ − 1 of each pixel.
     used = np.isfinite(counts)
     excess = np.where(used, counts / expected - 1.0, 0.0)
-    # 2 Σ (n ln(n/μ) − (n − μ)), each term μ ((1 + e) ln(1 + e) − e), without cancellation.
-    logarithm = np.log1p(np.maximum(excess, -1.0 + 1e-12))
-    deviance = 2.0 * (expected * ((1.0 + excess) * logarithm - excess)).sum(axis=-1)
+    # Deviance 2 Σ (n ln(n/μ) − (n − μ)). Each term is written as μ ((1 + e) ln(1 + e) − e), which
+    # does not cancel for small e; the limit keeps the logarithm of a pixel without counts finite.
+    log_ratio = np.log1p(np.maximum(excess, -1.0 + 1e-12))
+    deviance = 2.0 * (expected * ((1.0 + excess) * log_ratio - excess)).sum(axis=-1)
+    # Score Σ e ∂μ, and information Σ ∂μ ∂μᵀ / μ.
     weighted = slopes * np.where(used, 1.0 / expected, 0.0)[:, None]
     score = (slopes @ excess[:, :, None])[:, :, 0]
     return deviance, score, weighted @ slopes.swapaxes(1, 2)
 
 
-def together(
+def combine_images(
     score: np.ndarray, information: np.ndarray, shared: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Score (n, K) and information (n, K, K) of images that share their first parameters.
+    """Add up score and information of images that share their first parameters.
 
     Parameters
     ----------
     score, information : ndarray, shapes (n, F, k) and (n, F, k, k)
-        Of F images, by the k parameters of each.
+        Score and information of F images by the k parameters of each.
     shared : int
-        Number s of the first that are common; K = s + F (k − s): after them, the others of each
-        image in turn.
+        Number s of leading parameters that all images have in common.
+
+    Returns
+    -------
+    score, information : ndarray, shapes (n, K) and (n, K, K)
+        K = s + F (k − s): the common parameters, then those of each image in turn.
     """
     count, images, k = score.shape
-    own = k - shared
-    size = shared + images * own
-    all_scores, joint = np.zeros((count, size)), np.zeros((count, size, size))
+    size = shared + images * (k - shared)
+    # Likelihoods multiply: scores and informations of independent images add up.
+    total_score = np.zeros((count, size))
+    total_information = np.zeros((count, size, size))
     for image in range(images):
-        first = shared + image * own
-        place = np.r_[0:shared, first : first + own]
-        all_scores[:, place] += score[:, image]
-        joint[:, place[:, None], place] += information[:, image]
-    return all_scores, joint
+        # Places of this image's parameters among all.
+        first = shared + image * (k - shared)
+        columns = np.r_[0:shared, first : first + k - shared]
+        total_score[:, columns] += score[:, image]
+        total_information[:, columns[:, None], columns] += information[:, image]
+    return total_score, total_information
 
 
 def climb(
     evaluate: Evaluate,
     start: np.ndarray,
-    limit: np.ndarray | float = np.inf,
-    steps: Steps = STEPS,
+    limit: np.ndarray | float,
+    steps: Steps,
     group: np.ndarray | None = None,
 ) -> Peaks:
-    """Follow starts to the modes of their posteriors.
+    """Follow starts to the maxima of their posteriors.
 
-    A whole step that promises little is the last: it is taken, and its gain is what slope and
-    information say, without another look.
+    An undamped step that promises little is the last one. It is taken without another evaluation:
+    its gain is the one that slope and information predict.
 
     Parameters
     ----------
@@ -140,62 +145,80 @@ def climb(
         Parameters stay within ± this.
     steps : Steps
     group : ndarray of int, shape (M,), optional
-        Starts of one posterior, of which those far below the best are given up.
+        Number of the posterior of each start; climbs far below the best of their group are given
+        up.
     """
+    # All climbs begin together; those that arrive or are given up leave `active`.
     start = np.clip(np.asarray(start, np.float64), -limit, limit)
-    active, trial = np.arange(len(start)), start
-    now = Peaks(start.copy(), *evaluate(active, trial))
-    now.evaluations = np.ones(len(start), int)
-    now.converged = np.zeros(len(start), bool)
-    damping = np.full(len(start), steps.first_damping)
+    active = np.arange(len(start))
+    evaluations = np.ones(len(start), int)
+    peaks = Peaks(start.copy(), *evaluate(active, start), evaluations, np.zeros(len(start), bool))
+    damping = np.full(len(start), steps.initial_damping)
     gain = np.full(len(start), np.inf)
-    for _ in range(steps.most):
-        # What damping makes small says nothing about how far the maximum is.
-        whole = _step(now, active, np.zeros(active.size), limit)
-        gain[active] = np.einsum("nk,nk->n", whole, now.slope[active])
-        gain[active] -= 0.5 * np.einsum("nk,nkl,nl->n", whole, now.information[active], whole)
+    for _ in range(steps.max_steps):
+        # Gain sᵀg − ½ sᵀIs that the undamped step s promises. Damping makes a step small, which
+        # says nothing about the distance of the maximum.
+        step = _damped_step(peaks, active, np.zeros(active.size), limit)
+        gain[active] = np.einsum("nk,nk->n", step, peaks.slope[active])
+        gain[active] -= 0.5 * np.einsum("nk,nkl,nl->n", step, peaks.information[active], step)
         promise = gain[active]
-        if steps.decisive is not None:
-            own = slice(steps.decisive)
-            marginal = np.linalg.inv(np.linalg.inv(now.information[active])[:, own, own])
-            promise = 0.5 * np.einsum("nk,nkl,nl->n", whole[:, own], marginal, whole[:, own])
-        last = promise <= steps.least_gain
-        done = active[last]
-        now.parameters[done] += whole[last]
-        now.height[done] += gain[done]
-        now.converged[done] = True
-        going = ~now.converged & (damping < steps.most_damping)
+        # If some parameters count alone, the others are marginalised: the information on the
+        # first ones is the inverse of their block of the covariance.
+        if steps.counted_parameters is not None:
+            counted = slice(steps.counted_parameters)
+            covariance = np.linalg.inv(peaks.information[active])[:, counted, counted]
+            step_counted, marginal = step[:, counted], np.linalg.inv(covariance)
+            promise = 0.5 * np.einsum("nk,nkl,nl->n", step_counted, marginal, step_counted)
+        # The last step of climbs that have arrived.
+        is_last = promise <= steps.min_gain
+        arrived = active[is_last]
+        peaks.parameters[arrived] += step[is_last]
+        peaks.height[arrived] += gain[arrived]
+        peaks.converged[arrived] = True
+        # Climbs that go on.
+        goes_on = ~peaks.converged & (damping < steps.max_damping)
         if group is not None:
-            going &= now.height + 2.0 * gain > best_of_group(now.height, group) - steps.depth
-        active = np.flatnonzero(going)
+            lowest = group_maximum(peaks.height, group) - steps.max_drop
+            goes_on &= peaks.height + 2.0 * gain > lowest
+        active = np.flatnonzero(goes_on)
         if not active.size:
             break
-        trial = now.parameters[active] + _step(now, active, damping[active], limit)
-        tried = Peaks(trial, *evaluate(active, trial), converged=now.converged[active])
-        better = tried.height >= now.height[active] - steps.rounding * np.abs(now.height[active])
-        now.take(active[better], tried, better)
-        now.evaluations[active] += 1
-        damping[active] *= np.where(better, 1.0 / DAMPING_FACTOR, DAMPING_FACTOR)
-    return now
+        # A damped step is kept if it raises the posterior. The damping falls by a factor of 10
+        # after a good step, and rises by as much after a bad one.
+        parameters = peaks.parameters[active]
+        parameters = parameters + _damped_step(peaks, active, damping[active], limit)
+        peaks.evaluations[active] += 1
+        state = peaks.evaluations[active], peaks.converged[active]
+        trial = Peaks(parameters, *evaluate(active, parameters), *state)
+        tolerance = steps.relative_rounding * np.abs(peaks.height[active])
+        is_improved = trial.height >= peaks.height[active] - tolerance
+        peaks.overwrite(active[is_improved], trial, is_improved)
+        damping[active] *= np.where(is_improved, 1.0 / 10.0, 10.0)
+    return peaks
 
 
-def _step(
-    now: Peaks, active: np.ndarray, damping: np.ndarray, limit: np.ndarray | float
+def _damped_step(
+    peaks: Peaks, active: np.ndarray, damping: np.ndarray, limit: np.ndarray | float
 ) -> np.ndarray:
-    """Damped steps, cut at the limit; parameters held there leave the equations."""
-    parameters, slope = now.parameters[active], now.slope[active]
-    information = now.information[active].copy()
-    held = ((parameters >= limit) & (slope > 0)) | ((parameters <= -limit) & (slope < 0))
+    """Return the steps (a, K) of the peaks `active` with a damping (a,), cut at the limit.
+
+    A step s solves (I + damping · diag I) s = g, I the information and g the slope.
+    """
+    parameters, slope = peaks.parameters[active], peaks.slope[active]
+    information = peaks.information[active].copy()
     diagonal = np.arange(parameters.shape[1])
     information[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-    information[held[:, :, None] | held[:, None, :]] = 0.0
-    information[:, diagonal, diagonal] += held
-    step = np.linalg.solve(information, np.where(held, 0.0, slope)[:, :, None])[:, :, 0]
+    # A parameter that stands at its limit and would be pushed beyond leaves the equations.
+    is_fixed = ((parameters >= limit) & (slope > 0)) | ((parameters <= -limit) & (slope < 0))
+    information[is_fixed[:, :, None] | is_fixed[:, None, :]] = 0.0
+    information[:, diagonal, diagonal] += is_fixed
+    # Its row and column are those of the unit matrix: its step is 0.
+    step = np.linalg.solve(information, np.where(is_fixed, 0.0, slope)[:, :, None])[:, :, 0]
     return np.asarray(np.clip(parameters + step, -limit, limit) - parameters)
 
 
-def best_of_group(height: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Greatest height in each one's group, shape (M,)."""
-    best = np.full(group.max() + 1, -np.inf)
-    np.maximum.at(best, group, height)
-    return np.asarray(best[group])
+def group_maximum(height: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return for each member the greatest height in its group; all of shape (M,)."""
+    highest = np.full(group.max() + 1, -np.inf)
+    np.maximum.at(highest, group, height)
+    return np.asarray(highest[group])

@@ -1,274 +1,300 @@
-"""State of the telescope, common to all stars of an image, by one fit.
+"""Joint fit of the state of a telescope to all stars of an image.
 
-All stars follow from a few numbers of the telescope (`psfdae.telescope.field.FieldModel`); each
-has its own place, flux and sky besides.
+The aberrations of all stars follow from a few numbers of the telescope
+(`psfdae.telescope.field.TelescopeModel`); each star has its own place, flux and sky besides.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from psfdae.optics.derivatives import SampledStamps
 from psfdae.optics.pupil import SamplingError
-from psfdae.sensing.climbing import Peaks, Steps, climb, poisson, together
-from psfdae.sensing.stars import (
-    BESIDE,
-    FARTHEST_Z,
-    POOR_FIT,
-    WEAK,
-    Modes,
-    Search,
-    SensingError,
-    StarOptics,
-    expected_deviance,
+from psfdae.sensing.climbing import (
+    Evaluation,
+    Peaks,
+    Steps,
+    climb,
+    combine_images,
+    poisson_information,
 )
-from psfdae.telescope.field import FieldModel
+from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, WavefrontSearch
+from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
 from psfdae.telescope.settings import Seeing
 
-MOST_STARS = 500
-"""Most stars that take part, the brightest ones; cost grows with their number."""
+MAX_ROUNDS = 4
+"""Rounds in which stars choose the mode nearest to the state and the state follows them, and in
+which stamps are computed again for a fitted seeing."""
 
-CLIMB = Steps(most=30, least_gain=0.005, rounding=1e-7)
-
-ROUNDS = 4
-"""Rounds in which stars choose the mode nearest to the field, and the field follows them; and in
-which stamps are computed anew for a seeing that was found."""
-
-MOST_CHANGE, SEEING_ERROR = 0.5, 2e-3
-"""Relative changes of the seeing's FWHM: the most that is allowed, from what is stated and
-downwards in a round, and one that needs no other round."""
+MAX_SEEING_CHANGE = 0.5
+"""Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM that
+the telescope's file states."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """State of a telescope.
+    """Fitted state of a telescope.
 
     Attributes
     ----------
-    model : FieldModel
+    model : TelescopeModel
     value, error : ndarray, shape (Q,)
-        In the units of the model.
+        Numbers of the telescope in the units of the model.
     correlation : ndarray, shape (Q, Q)
     probability : float
-        Of this state against its twin, whose even aberrations have the other sign.
+        Probability of this state against its twin, whose even aberrations have the other sign.
     twin : ndarray or None, shape (Q,)
-        The twin's numbers, if one was found.
+        Numbers of the twin, if there is one.
     star : ndarray of int, shape (m,)
         Stars that took part.
-    deviance, expected, scatter : ndarray, shape (m,)
-        Of each, with what is expected of it and its standard deviation.
+    disagrees : ndarray of bool, shape (m,)
+        True for stars whose deviance is above the limit: the state does not explain them.
     """
 
-    model: FieldModel
+    model: TelescopeModel
     value: np.ndarray
     error: np.ndarray
     correlation: np.ndarray
     probability: float
     twin: np.ndarray | None
     star: np.ndarray
-    deviance: np.ndarray
-    expected: np.ndarray
-    scatter: np.ndarray
-
-    @property
-    def disagrees(self) -> np.ndarray:
-        """True for stars that the state does not explain, (m,)."""
-        return self.deviance > self.expected + POOR_FIT * self.scatter
+    disagrees: np.ndarray
 
 
-class FieldPosterior:
-    """The posterior of the numbers of a field, and of the places, fluxes and skies of its stars.
+class TelescopePosterior:
+    """Posterior of the numbers of a telescope, and of the places, fluxes and skies of its stars.
 
-    Stamps are those of `optics`; where the FWHM of the seeing is among the numbers, they depend on
-    it by a straight line about that of `optics`.
-    """
-
-    def __init__(
-        self, search: Search, model: FieldModel, stars: np.ndarray, optics: StarOptics
-    ) -> None:
-        self.search, self.model, self.stars, self.optics = search, model, stars, optics
-        self.shared = model.sd.size
-
-    def seeing(self, t: np.ndarray) -> float:
-        """FWHM of the seeing at standardised numbers t (Q,), in that of `optics`."""
-        fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
-        return float(fwhm / self._stated.fwhm_arcsec)
-
-    @property
-    def _stated(self) -> Seeing:
-        assert self.optics.telescope.seeing is not None, "the model has one"
-        return self.optics.telescope.seeing
-
-    def refocused(self, t: np.ndarray) -> FieldPosterior:
-        """The same with optics of the seeing at standardised numbers t (Q,)."""
-        fwhm = max(self.seeing(t), 1.0 - MOST_CHANGE) * self._stated.fwhm_arcsec
-        seeing = self._stated.model_copy(update={"fwhm_arcsec": fwhm})
-        changed = self.optics.telescope.model_copy(update={"seeing": seeing})
-        optics = replace(self.optics, telescope=changed)
-        return FieldPosterior(self.search, self.model, self.stars, optics)
-
-    def coefficients(self, t: np.ndarray) -> np.ndarray:
-        """Coefficients of the stars (m, K) in waves, of standardised numbers t (Q,)."""
-        return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.stars])
-
-    def slopes(self, t: np.ndarray) -> np.ndarray:
-        """Their derivatives by t, (m, Q, K)."""
-        whole = self.model.jacobian(self.model.mean + self.model.sd * t)
-        return np.asarray(np.moveaxis(whole * self.model.sd[:, None, None], 0, 1)[self.stars])
-
-    def evaluate(
-        self, _: np.ndarray, numbers: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `psfdae.sensing.climbing.Evaluate`; states without an image are impossible."""
-        parts = [self._one(each) for each in numbers]
-        height, score, information = (np.stack(part) for part in zip(*parts, strict=True))
-        return height, score, information
-
-    def deviance(self, numbers: np.ndarray) -> np.ndarray:
-        """Deviance of every star, (m,)."""
-        return self._images(numbers)[0]
-
-    def _images(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        q, optics, photons = self.shared, self.optics, self.search.photons
-        own, stars = numbers[q:].reshape(len(self.stars), BESIDE), self.stars
-        to_modes = optics.terms.to_modes[stars]
-        coefficients = np.einsum("mk,mkj->mj", self.coefficients(numbers[:q]), to_modes)
-        directions = np.pad(self.slopes(numbers[:q]) @ to_modes, ((0, 0), (0, 2), (0, 2)))
-        directions[:, [-2, -1], [-2, -1]] = 1.0
-        modes = np.concatenate([coefficients, own[:, :2]], axis=1)
-        stamps, slopes = optics.operator.derivatives(modes, directions)
-        stamps = stamps.reshape(len(stars), -1).astype(np.float64)
-        slopes = slopes.reshape(len(stars), q + 2, -1).astype(np.float64)
-        if self.model.seeing:
-            wider = optics.broadening.stamps(modes).reshape(len(stars), -1).astype(np.float64)
-            here = self.seeing(numbers[:q])
-            stamps = stamps + (here - 1.0) * wider
-            slopes[:, q - 1] = self.model.sd[-1] / self._stated.fwhm_arcsec * wider
-        return poisson(photons.counts[stars], *self.search.expected(stars, stamps, slopes, own))
-
-    def _one(self, numbers: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        q = self.shared
-        try:
-            deviance, score, information = self._images(numbers)
-        except (RayTracingError, SamplingError):
-            return -np.inf, np.zeros(numbers.size), np.eye(numbers.size)
-        both = together(score[None], information[None], q)
-        score, information = both[0][0], both[1][0]
-        score[:q] -= numbers[:q]
-        information[range(q), range(q)] += 1.0
-        information[range(q, len(score)), range(q, len(score))] += WEAK
-        height = -0.5 * (deviance.sum() + (numbers[:q] ** 2).sum())
-        return height, score, information
-
-
-def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
-    """Fit the numbers of a field to the stamps of all its stars.
+    Its parameters are Q standardised numbers t of the telescope, normal with σ = 1, and then the
+    place (x, y), flux and sky of each star in turn. If the FWHM of the seeing is one of the
+    numbers, stamps are linear in it about the seeing of `optics`.
 
     Parameters
     ----------
-    search : Search
-    modes : Modes
-        Of the single stars; those that no mode explains take no part.
-    model : FieldModel
-        Of all stars of the search.
+    search : WavefrontSearch
+    model : TelescopeModel
+    stars : ndarray of int, shape (m,)
+        Stars that take part.
+    optics : StarOptics
+    """
+
+    def __init__(
+        self, search: WavefrontSearch, model: TelescopeModel, stars: np.ndarray, optics: StarOptics
+    ) -> None:
+        self.search, self.model, self.stars, self.optics = search, model, stars, optics
+        self.number_count = model.sd.size
+
+    @cached_property
+    def _broadening(self) -> SampledStamps:
+        """Propagation to derivatives of the stamps by the logarithm of the FWHM of the seeing."""
+        return self.optics.propagation(self.optics.stamp_px, broadening=True)
+
+    @property
+    def _seeing(self) -> Seeing:
+        assert self.optics.telescope.seeing is not None, "the model has one"
+        return self.optics.telescope.seeing
+
+    def relative_seeing(self, t: np.ndarray) -> float:
+        """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
+        # The FWHM is the last number of the model.
+        fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
+        return float(fwhm / self._seeing.fwhm_arcsec)
+
+    def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
+        """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
+        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._seeing.fwhm_arcsec
+        # The same telescope but for its seeing.
+        seeing = self._seeing.model_copy(update={"fwhm_arcsec": fwhm})
+        telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
+        optics = replace(self.optics, telescope=telescope)
+        return TelescopePosterior(self.search, self.model, self.stars, optics)
+
+    def coefficients(self, t: np.ndarray) -> np.ndarray:
+        """Return the coefficients of the stars (m, K) in waves at standardised numbers t (Q,)."""
+        return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.stars])
+
+    def slopes(self, t: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the coefficients of the stars by t, (m, Q, K)."""
+        # ∂c/∂t = σ ∂c/∂number, from [number, star, coefficient] to [star, number, coefficient].
+        jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
+        return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.stars])
+
+    def evaluate(self, _: np.ndarray, parameters: np.ndarray) -> Evaluation:
+        """Evaluate the posterior as `psfdae.sensing.climbing.Evaluate`, at parameters (a, K).
+
+        A telescope through which no rays pass, or whose wavefronts no grid can sample, is
+        impossible.
+        """
+        q, (count, size) = self.number_count, parameters.shape
+        # Parameters without an image keep a height of −∞.
+        height, score = np.full(count, -np.inf), np.zeros((count, size))
+        information = np.tile(np.eye(size), (count, 1, 1))
+        for row, values in enumerate(parameters):
+            with suppress(RayTracingError, SamplingError):
+                deviance, star_score, star_information = self.evaluate_stars(values)
+                height[row] = -0.5 * (deviance.sum() + (values[:q] ** 2).sum())
+                (score[row],), (information[row],) = combine_images(
+                    star_score[None], star_information[None], q
+                )
+                # Normal prior of the numbers, and a trace of information on places, fluxes and
+                # skies, so that no matrix is singular.
+                score[row, :q] -= values[:q]
+                information[row, range(q), range(q)] += 1.0
+                information[row, range(q, size), range(q, size)] += 1e-9
+        return height, score, information
+
+    def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
+        """Return deviance (m,), score (m, Q + 4) and information of every star by itself.
+
+        They are derivatives by the Q numbers of the telescope and the four of the star.
+        """
+        q, optics = self.number_count, self.optics
+        t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.stars), 4)
+        place = star_parameters[:, :2]
+        # Images of all stars, and derivatives by t, along the modes, and by the place.
+        modes = optics.mode_coefficients(self.stars, self.coefficients(t), place)
+        directions = self.slopes(t) @ optics.terms.to_modes[self.stars]
+        stamps, slopes = optics.derivatives(modes, directions)
+        if self.model.has_seeing:
+            # p(w) = p(1) + (w − 1) ∂p/∂ln w about w = 1, the relative FWHM of the seeing.
+            broadened = self._broadening.stamps(modes).reshape(len(self.stars), -1)
+            broadened = broadened.astype(np.float64)
+            stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
+            slopes[:, q - 1] = self.model.sd[-1] / self._seeing.fwhm_arcsec * broadened
+        expected = self.search.expected_counts(self.stars, stamps, slopes, star_parameters)
+        return poisson_information(self.search.photons.counts[self.stars], *expected)
+
+
+def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeModel) -> Joint:
+    """Fit the numbers of a telescope to the stamps of all its stars.
+
+    Parameters
+    ----------
+    search : WavefrontSearch
+    modes : StarModes
+        Modes of the single stars; stars that no mode explains take no part.
+    model : TelescopeModel
+        Model of all stars of the search.
 
     Raises
     ------
     SensingError
-        If there are fewer stars than half the numbers, or no number is free.
+        If the prior fixes all numbers, or there are fewer stars than half the numbers.
     """
     if not model.sd.size:
-        raise SensingError("the prior leaves nothing of the telescope free: its widths are 0")
-    first = modes.take(modes.first)
-    explained = search.explained(first)
-    stars = first.star[explained]
-    # In units of the sky's noise.
-    light = search.flux[stars] * first.numbers[explained, -2] / np.sqrt(search.photons.sky[stars])
-    stars = np.sort(stars[np.argsort(-light, kind="stable")[:MOST_STARS]])
+        raise SensingError("the prior fixes all numbers of the telescope: there is nothing to fit")
+    # The 500 explained stars with the most light in units of the sky's noise; the cost grows
+    # with their number.
+    optics, best_modes = search.optics, modes.best_modes
+    best_modes = best_modes.take(np.flatnonzero(search.is_explained(best_modes)))
+    stars = best_modes.star
+    light = search.flux[stars] * best_modes.parameters[:, -2]
+    light = light / np.sqrt(search.photons.sky_counts[stars])
+    stars = np.sort(stars[np.argsort(-light, kind="stable")[:500]])
     if stars.size * 2 < model.sd.size or not stars.size:
         raise SensingError(
             f"{stars.size} stars that a wavefront explains are too few for "
             f"{model.sd.size} numbers of the telescope"
         )
-    kept = modes.take(np.flatnonzero(np.isin(modes.star, stars)))
-    field = FieldPosterior(search, model, stars, search.optics)
-    ahead = _start(field, kept, np.zeros(field.shared))
-    starts = [ahead]
-    with suppress(RayTracingError):  # where there is no such telescope
-        starts.append(_start(field, kept, _twin(field, ahead[: field.shared])))
-    limit = np.full(ahead.size, np.inf)
-    limit[: field.shared] = FARTHEST_Z
-    if model.seeing:
-        limit[field.shared - 1] = MOST_CHANGE * model.mean[-1] / model.sd[-1]
-    limit[field.shared :].reshape(-1, BESIDE)[:, :2] = search.optics.reach_px
-    peaks = climb(field.evaluate, np.stack(starts), limit, CLIMB)
-    for _ in range(ROUNDS if model.seeing else 0):
-        best = peaks.parameters[peaks.height.argmax(), : field.shared]
-        if abs(field.seeing(best) - 1.0) < SEEING_ERROR:
+    modes = modes.of_stars(stars)
+    posterior = TelescopePosterior(search, model, stars, optics)
+    # Two starts: near the prior's mean, and near the twin of that, unless no telescope is there.
+    q = posterior.number_count
+    starts = [_start_near(posterior, modes, np.zeros(q))]
+    with suppress(RayTracingError):
+        starts.append(_start_near(posterior, modes, _twin(posterior, starts[0][:q])))
+    # Limits of the numbers, and of the places of the stars.
+    limit = np.full(starts[0].size, np.inf)
+    limit[:q] = MAX_Z
+    if model.has_seeing:
+        limit[q - 1] = MAX_SEEING_CHANGE * model.mean[-1] / model.sd[-1]
+    limit[q:].reshape(-1, 4)[:, :2] = optics.reach_px
+    steps = Steps(max_steps=30, min_gain=0.005, relative_rounding=1e-7)
+    peaks = climb(posterior.evaluate, np.stack(starts), limit, steps)
+    # Stamps are linear in the seeing: they are computed again at the fitted FWHM until it changes
+    # by less than 0.2 %.
+    for _ in range(MAX_ROUNDS if model.has_seeing else 0):
+        t = peaks.parameters[peaks.height.argmax(), :q]
+        if abs(posterior.relative_seeing(t) - 1.0) < 2e-3:
             break
-        field = field.refocused(best)
-        peaks = climb(field.evaluate, peaks.parameters, limit, CLIMB)
-    return _joint(field, peaks)
+        posterior = posterior.with_seeing_of(t)
+        peaks = climb(posterior.evaluate, peaks.parameters, limit, steps)
+    return _summarise(posterior, peaks)
 
 
-def _joint(field: FieldPosterior, peaks: Peaks) -> Joint:
-    q, model = field.shared, field.model
+def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
+    """Return the most probable state with its errors, and its twin if there is another peak."""
+    model, stars = posterior.model, posterior.stars
+    t = peaks.parameters[:, : posterior.number_count]
+    # Laplace's approximation: mass = height of the peak × √|covariance|.
     covariance = np.linalg.inv(peaks.information)
     evidence = peaks.height + 0.5 * np.linalg.slogdet(covariance)[1]
-    best = int(evidence.argmax())
-    t = peaks.parameters[:, :q]
-    own = covariance[best, :q, :q]
-    sigma = np.sqrt(np.diagonal(own))
-    apart = [m for m in range(len(t)) if m != best and np.abs((t[m] - t[best]) / sigma).max() > 1]
-    mass = np.exp(evidence - evidence[best])
-    total = 1.0 + sum(mass[m] for m in apart)
-    expected, scatter = expected_deviance(field.search.photons, field.stars)
+    best_peak = int(evidence.argmax())
+    state_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
+    sigma = np.sqrt(np.diagonal(state_covariance))
+    # Peaks that are more than a standard deviation from the best one share the probability.
+    twins = np.flatnonzero(np.abs((t - t[best_peak]) / sigma).max(axis=1) > 1)
+    # Masses relative to that of the best peak.
+    mass = np.exp(evidence - evidence[best_peak])
+    deviance = posterior.evaluate_stars(peaks.parameters[best_peak])[0]
     return Joint(
         model,
-        model.mean + model.sd * t[best],
-        model.sd * sigma,
-        own / sigma / sigma[:, None],
-        float(1.0 / total),
-        model.mean + model.sd * t[apart[0]] if apart else None,
-        field.stars,
-        field.deviance(peaks.parameters[best]),
-        expected,
-        scatter,
+        value=model.mean + model.sd * t[best_peak],
+        error=model.sd * sigma,
+        correlation=state_covariance / sigma / sigma[:, None],
+        probability=float(1.0 / (1.0 + mass[twins].sum())),
+        twin=model.mean + model.sd * t[twins[0]] if twins.size else None,
+        star=stars,
+        disagrees=deviance > posterior.search.photons.deviance_limit[stars],
     )
 
 
-def _start(field: FieldPosterior, modes: Modes, t: np.ndarray) -> np.ndarray:
-    """Numbers of the field and the stars from the stars' own modes, near standardised t (Q,)."""
-    terms, k = field.search.optics.terms, field.search.optics.count
-    mean, sd = terms.mean[modes.star], terms.sd[modes.star]
-    found = mean + sd * modes.numbers[:, :k]
-    spread = sd[:, :, None] * modes.covariance[:, :k, :k] * sd[:, None]
-    spread = spread + 1e-6 * np.eye(k)
-    row = np.searchsorted(field.stars, modes.star)
-    for _ in range(ROUNDS):
-        gap = found - field.coefficients(t)[row]
-        far = np.einsum("mk,mk->m", gap, np.linalg.solve(spread, gap[:, :, None])[:, :, 0])
-        chosen = np.lexsort((far, modes.star))
-        chosen = chosen[np.flatnonzero(np.diff(modes.star[chosen], prepend=-1))]
-        slopes = field.slopes(t)
-        weighted = slopes @ np.linalg.inv(spread[chosen])
+def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
+    """Return parameters that agree with the modes of the single stars, near t (Q,).
+
+    In each round every star chooses the mode nearest to the telescope, and the numbers are fitted
+    to the chosen modes, each weighed by its covariance.
+    """
+    # Coefficients of all modes in waves, with their covariance; a little is added to it, for
+    # coefficients that the prior fixes.
+    optics = posterior.search.optics
+    count, sd = optics.coefficient_count, optics.terms.sd[modes.star]
+    measured = optics.coefficients(modes.star, modes.parameters[:, :count])
+    covariance = sd[:, :, None] * modes.covariance[:, :count, :count] * sd[:, None]
+    covariance = covariance + 1e-6 * np.eye(count)
+    row = np.searchsorted(posterior.stars, modes.star)
+    for _ in range(MAX_ROUNDS):
+        # Squared Mahalanobis distance of each mode; the first of each star in this order is the
+        # nearest.
+        gap = measured - posterior.coefficients(t)[row]
+        precise = np.linalg.solve(covariance, gap[:, :, None])[:, :, 0]
+        order = np.lexsort((np.einsum("mk,mk->m", gap, precise), modes.star))
+        nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
+        # Gauss–Newton step of the numbers, with their prior.
+        slopes = posterior.slopes(t)
+        weighted = slopes @ np.linalg.inv(covariance[nearest])
         information = (weighted @ slopes.swapaxes(1, 2)).sum(axis=0) + np.eye(t.size)
-        pull = (weighted @ gap[chosen][:, :, None]).sum(axis=0)[:, 0] - t
-        t = np.clip(t + np.linalg.solve(information, pull), -FARTHEST_Z, FARTHEST_Z)
-    return np.concatenate([t, modes.numbers[chosen, k:].ravel()])
+        score = (weighted @ gap[nearest][:, :, None]).sum(axis=0)[:, 0] - t
+        t = np.clip(t + np.linalg.solve(information, score), -MAX_Z, MAX_Z)
+    return np.concatenate([t, modes.parameters[nearest, count:].ravel()])
 
 
-def _twin(field: FieldPosterior, t: np.ndarray) -> np.ndarray:
-    """Standardised numbers whose stars have the even coefficients of t (Q,) negated, nearly."""
-    even = field.search.optics.terms.even
-    wanted = np.where(even, -1.0, 1.0) * field.coefficients(t)
-    back = t
-    for _ in range(ROUNDS):
-        slopes = field.slopes(back).transpose(1, 0, 2).reshape(t.size, -1)
-        gap = (wanted - field.coefficients(back)).ravel()
-        back = back + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0]
-        back = np.clip(back, -FARTHEST_Z, FARTHEST_Z)
-    return back
+def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
+    """Return standardised numbers whose stars have the even coefficients of t (Q,) negated.
+
+    A least-squares solution by Gauss–Newton steps: often no telescope has exactly these.
+    """
+    is_even = posterior.search.optics.terms.is_even
+    # Coefficients that the twin should have; those of odd terms stay.
+    target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
+    for _ in range(MAX_ROUNDS):
+        # All coefficients of all stars are equations for the numbers; singular values below 1e-9
+        # are combinations of numbers that no coefficient shows.
+        slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)
+        gap = (target - posterior.coefficients(t)).ravel()
+        t = np.clip(t + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0], -MAX_Z, MAX_Z)
+    return t

@@ -1,4 +1,4 @@
-"""Wavefronts over the field: as measured, as the telescope's model has them, and what is left."""
+"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars."""
 
 from __future__ import annotations
 
@@ -12,49 +12,49 @@ from psfdae.sensing.results import Wavefronts
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SAMPLES = 48
-"""Samples of a pupil along its diameter."""
-
 CELLS = 8
 """Pupils along a side of the field, at most."""
 
 
 @styled
-def wavefront_map(found: Wavefronts, title: str) -> Figure:
-    """Wavefronts of bright stars at their places, those of the model, and residual stamps.
+def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
+    """Draw wavefronts of bright stars at their places, those of the model, and residual stamps.
 
     The model is the telescope's state if it was fitted, else the mean of the prior.
     """
-    chosen = _apart(found)
-    first = np.array([np.flatnonzero(found.summary["star"] == star)[0] for star in chosen], int)
-    measured = _pupils(found, chosen, found.summary["mean"][first])
-    joint = found.joint
-    expected = found.terms.mean if joint is None else joint.model.coefficients(joint.value)
-    model = _pupils(found, chosen, expected[chosen])
-    rows = found.search.photons
-    residual = found.stamps.data - rows.level[:, None, None] - found.model
-    residual[found.stamps.bad | found.stamps.saturated] = np.nan
+    stars = _bright_separate_stars(wavefronts)
+    # OPD of the most probable mode of each star, and of the model.
+    summary, joint = wavefronts.summary, wavefronts.joint
+    first = np.searchsorted(summary["star"], stars)
+    measured = _pupil_opd(wavefronts, stars, summary["mean"][first])
+    expected = wavefronts.terms.mean
+    if joint is not None:
+        expected = joint.model.coefficients(joint.value)
+    model = _pupil_opd(wavefronts, stars, expected[stars])
+    # Residuals in units of the sky's noise, less the median of each stamp.
+    stamps, photons = wavefronts.stamps, wavefronts.search.photons
+    residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
+    residual[stamps.bad | stamps.saturated] = np.nan
     residual -= np.nanmedian(residual, axis=(1, 2), keepdims=True)
-    residual = (residual / rows.noise[:, None, None])[chosen]
-    field = found.field_deg[chosen]
-    reach = np.ptp(found.field_deg, axis=0).max() or 1.0
-    cell = 0.92 * reach / CELLS
+    residual = (residual / photons.sky_noise[:, None, None])[stars]
+    # The colour scale ends at the 98th percentile: the rim alone would take the whole of it.
+    peak = float(np.nanpercentile(np.abs([measured, model]), 98)) if len(stars) else 1.0
+    model_name = "fitted telescope" if joint else "prior's mean"
+    panels = (
+        ("measured", measured, peak, "RdBu_r", "OPD (waves)"),
+        (model_name, model, peak, "RdBu_r", "OPD (waves)"),
+        ("residuals of the stars", residual, 4.0, "Greys", "noise of the sky"),
+    )
+    # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    # The rim alone would take the whole scale.
-    peak = float(np.nanpercentile(np.abs([measured, model]), 98)) if len(chosen) else 1.0
-    names = ("measured", "fitted telescope" if joint else "prior's mean", "residuals of the stars")
-    for panel, images, limit, colours, name in zip(
-        axes,
-        (measured, model, residual),
-        (peak, peak, 4.0),
-        ("RdBu_r", "RdBu_r", "Greys"),
-        names,
-        strict=True,
-    ):
-        for (x, y), image in zip(field, images, strict=True):
-            half = 0.5 * cell
-            shown = panel.imshow(
+    # Each image fills a cell about the place of its star, with a gap to the next one.
+    low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
+    cell = 0.92 * ((high - low).max() or 1.0) / CELLS
+    half = 0.5 * cell
+    for panel, (name, images, limit, colours, unit) in zip(axes, panels, strict=True):
+        for (x, y), image in zip(wavefronts.field_deg[stars], images, strict=True):
+            mappable = panel.imshow(
                 image,
                 origin="lower",
                 extent=(x - half, x + half, y - half, y + half),
@@ -63,7 +63,6 @@ def wavefront_map(found: Wavefronts, title: str) -> Figure:
                 vmax=limit,
                 interpolation="nearest",
             )
-        low, high = (getattr(found.field_deg, end)(axis=0) for end in ("min", "max"))
         panel.set(
             xlim=(low[0] - cell, high[0] + cell),
             ylim=(low[1] - cell, high[1] + cell),
@@ -71,37 +70,44 @@ def wavefront_map(found: Wavefronts, title: str) -> Figure:
             xlabel="x (deg)",
             title=name,
         )
-        if len(chosen):
-            unit = "noise of the sky" if colours == "Greys" else "OPD (waves)"
-            figure.colorbar(shown, ax=panel, location="bottom", shrink=0.8, label=unit)
+        if len(stars):
+            figure.colorbar(mappable, ax=panel, location="bottom", shrink=0.8, label=unit)
     axes[0].set_ylabel("y (deg)")
     figure.suptitle(title, parse_math=False)
     return figure
 
 
-def _apart(found: Wavefronts) -> np.ndarray:
-    """Bright stars that are explained, far enough from each other to be drawn at their places."""
-    left = np.intersect1d(found.star, np.flatnonzero(found.explained))
-    left = left[np.argsort(-found.snr[left], kind="stable")]
-    cell = (1.0 - 1e-6) * np.ptp(found.field_deg, axis=0).max() / CELLS
-    chosen = []
-    while left.size:
-        chosen.append(left[0])
-        gap = np.abs(found.field_deg[left] - found.field_deg[left[0]]).max(axis=1)
-        left = left[gap >= cell] if cell > 0 else left[:0]
-    return np.array(chosen, int)
+def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
+    """Return the brightest explained stars that are a cell or more from each other."""
+    stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
+    # Brightest first: of stars in one cell, the brightest is drawn.
+    stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
+    # Rounding must not part stars of a regular grid.
+    cell = (1.0 - 1e-6) * np.ptp(wavefronts.field_deg, axis=0).max() / CELLS
+    separate = []
+    while stars.size:
+        separate.append(stars[0])
+        offset = np.abs(wavefronts.field_deg[stars] - wavefronts.field_deg[stars[0]])
+        stars = stars[offset.max(axis=1) >= cell] if cell > 0 else stars[:0]
+    return np.array(separate, int)
 
 
-def _pupils(found: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """OPD in waves over the lit pupil, without piston and tilts, NaN outside, (m, s, s)."""
-    axis = np.linspace(-1.0, 1.0, SAMPLES)
+def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return the OPD in waves over the pupil, without piston and tilts, (m, 48, 48).
+
+    NaN where the pupil is not lit. `coefficients` (m, K) are in waves.
+    """
+    # The lit annulus on a grid.
+    axis = np.linspace(-1.0, 1.0, 48)
     x, y = axis[None, :], axis[:, None]
     radius = np.hypot(x, y)
-    lit = (radius <= 1.0) & (radius >= found.telescope.obscuration)
-    images = found.terms.modes(x, y)[:, lit]
-    opd = np.einsum("mk,mkj->mj", coefficients, found.terms.to_modes[star]) @ images
-    planes = np.stack([np.broadcast_to(each, lit.shape)[lit] for each in (1.0, x, y)], axis=1)
+    is_lit = (radius <= 1.0) & (radius >= wavefronts.telescope.obscuration)
+    # OPD Σ c_k T_kj M_j of each star.
+    modes = wavefronts.terms.modes(x, y)[:, is_lit]
+    opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ modes
+    # Take out the plane that fits best.
+    planes = np.stack([np.broadcast_to(term, is_lit.shape)[is_lit] for term in (1.0, x, y)], axis=1)
     opd -= (planes @ np.linalg.lstsq(planes, opd.T, rcond=None)[0]).T
-    out = np.full((len(star), *lit.shape), np.nan)
-    out[:, lit] = opd
-    return out
+    images = np.full((len(star), *is_lit.shape), np.nan)
+    images[:, is_lit] = opd
+    return images

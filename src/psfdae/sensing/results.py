@@ -1,4 +1,8 @@
-"""`wavefront`: stamps of stars and a telescope in; coefficients, PSFs and its state out."""
+"""Measurement of wavefronts: from stamps of stars and a telescope to coefficients and PSFs.
+
+`wavefront` runs the search, the draws and the joint fit; `Wavefronts` holds the posteriors of the
+stars and the state of the telescope, and derives coefficients, PSFs and tables from them.
+"""
 
 from __future__ import annotations
 
@@ -13,25 +17,13 @@ from numpy.typing import ArrayLike
 from psfdae.image.observation import central_pixel
 from psfdae.image.stamps import Stamps
 from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.sensing.joint import Joint, joint_fit
-from psfdae.sensing.stars import (
-    Modes,
-    Photons,
-    Search,
-    SensingError,
-    StarOptics,
-    expected_deviance,
-)
-from psfdae.telescope.field import Terms, field_model, terms_of
+from psfdae.sensing.joint import Joint, fit_telescope
+from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
+from psfdae.telescope.field import Terms, telescope_model, terms_of
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-NANOMETRE = 1e-9
-
-RMS_SAMPLES = 128
-"""Pupil samples on which the RMS of a wavefront is taken."""
 
 
 def wavefront(
@@ -44,15 +36,15 @@ def wavefront(
     joint: bool = False,
     seed: int = 0,
 ) -> Wavefronts:
-    """Wavefronts of stars that a known telescope has imaged.
+    """Measure the wavefronts of stars that a known telescope has imaged.
 
     Parameters
     ----------
     stars : array, shape (n, d, d), or Stamps
-        In any unit, sky included, the star about index [d/2, d/2], pixels of the telescope's
-        scale. Those that are not finite are not used.
+        Images in any unit, sky included, the star about index [d/2, d/2], pixels of the
+        telescope's scale. Pixels that are not finite are not used.
     telescope : OwnTelescope or path
-        A YAML file as in `config/telescope`, with the prior of its aberrations.
+        Telescope, or its YAML file as in `config/telescope`, with the prior of its aberrations.
     field_deg : array, shape (n, 2)
         Field angle (x, y) of each star in degrees, along columns and rows.
     noise, gain : float or array, shape (n,), optional
@@ -61,7 +53,7 @@ def wavefront(
     joint : bool
         Fit the state of the telescope to all stars together.
     seed : int
-        Of the candidates and of the draws.
+        Seed of the candidates and of the draws.
 
     Raises
     ------
@@ -75,94 +67,105 @@ def wavefront(
     >>> psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
     Wavefronts('refractor', 1 stars)
     """
+    # Telescope and stamps, read or converted where they are files or arrays.
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
-    stamps = stars if isinstance(stars, Stamps) else _stamps(stars, noise, gain)
+    stamps = stars if isinstance(stars, Stamps) else _as_stamps(stars, noise, gain)
     angle = np.asarray(field_deg, float)
     if angle.shape != (len(stamps), 2) or not np.isfinite(angle).all():
         raise SensingError(
             f"field_deg of shape {angle.shape}, expected ({len(stamps)}, 2) finite numbers"
         )
-    photons = Photons.of(stamps)
+    # The posterior of each star by itself, and then the telescope that explains them together.
     try:
         terms = terms_of(telescope, angle)
-        search = Search(StarOptics(telescope, terms, stamps.data.shape[-1]), photons, seed)
-        modes = search.modes()
-        state = joint_fit(search, modes, field_model(telescope, angle)) if joint else None
-        found = Wavefronts(search, stamps, angle, modes, state)
+        optics = StarOptics(telescope, terms, stamps.data.shape[-1])
+        search = WavefrontSearch(optics, Photons.from_stamps(stamps), seed)
+        modes = search.find_modes()
+        state = fit_telescope(search, modes, telescope_model(telescope, angle)) if joint else None
     except SamplingError as error:
-        largest = search.optics.operator.sizes[-1]
         raise SensingError(
-            f"{telescope.name}: aberrations or seeing need more than {largest} samples across the "
-            f"pupil ({error})"
+            f"{telescope.name}: aberrations or seeing need a finer pupil grid ({error})"
         ) from error
-    return found
+    return Wavefronts(search, stamps, angle, modes, state)
 
 
-def _stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
+def _as_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
+    """Return stamps of arrays, of which only noise and gain may be known.
+
+    Raises
+    ------
+    SensingError
+        If shapes do not fit, or noise or gain is not above 0.
+    """
+    # Square stamps, one or more.
     data = np.asarray(stars, float)
     if data.ndim != 3 or data.shape[1] != data.shape[2] or not len(data):
         raise SensingError(f"stars of shape {data.shape}, expected (n, d, d)")
     count = len(data)
-    unknown = np.full(count, np.nan)
 
-    def each(name: str, value: ArrayLike | None) -> np.ndarray:
+    def per_star(name: str, value: ArrayLike | None) -> np.ndarray:
+        # One number serves all stars; NaN stands for a number that is to be estimated.
         numbers = np.asarray(np.nan if value is None else value, float)
         if numbers.shape not in ((), (count,)):
-            raise SensingError(f"{name} of shape {numbers.shape}, expected one for {count} stars")
+            raise SensingError(
+                f"{name} of shape {numbers.shape}, expected one number or one for each of the "
+                f"{count} stars"
+            )
         if value is not None and not (numbers > 0).all():
             raise SensingError(f"{name}: expected numbers above 0")
         return np.broadcast_to(numbers, count).copy()
 
-    finite = np.isfinite(data)
+    # Pixels that are not finite are bad; nothing is known of flux, sky and place.
+    is_finite, unknown = np.isfinite(data), np.full(count, np.nan)
     return Stamps(
-        np.where(finite, data, 0.0),
-        ~finite,
-        np.zeros(data.shape, bool),
-        np.zeros(count, np.uint16),
-        np.arange(count),
-        x=unknown,
-        y=unknown,
-        flux=unknown,
-        background=unknown,
-        noise=each("noise", noise),
-        gain=each("gain", gain),
-        magnitude=unknown,
-        colour=unknown,
+        data=np.where(is_finite, data, 0.0),
+        bad=~is_finite,
+        saturated=np.zeros(data.shape, bool),
+        flags=np.zeros(count, np.uint16),
+        id=np.arange(count),
+        noise=per_star("noise", noise),
+        gain=per_star("gain", gain),
         listed=np.full((count, 2), np.nan),
+        **dict.fromkeys(("x", "y", "flux", "background", "magnitude", "colour"), unknown),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Wavefronts:
-    """Wavefronts of stars and the state of their telescope.
+    """Wavefronts of stars, and the state of their telescope.
+
+    Arrays have n rows for all stars, with NaN where a star has no usable pixels, or m rows for
+    the stars `star` that have some. K is the number of coefficients.
 
     Attributes
     ----------
-    search : Search
+    search : WavefrontSearch
     stamps : Stamps
-        Of n stars.
+        Stamps of n stars.
     field_deg : ndarray, shape (n, 2)
-    modes : Modes
-        Of the posteriors.
+        Field angle (x, y) of each star.
+    modes : StarModes
+        Modes of the posteriors.
     joint : Joint or None
-        State of the telescope.
+        State of the telescope, if it was fitted.
 
     Examples
     --------
-    >>> found = psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
-    >>> found.explained
+    >>> angle = [[0.0, 0.0]]
+    >>> wavefronts = psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=angle, gain=1.0)
+    >>> wavefronts.explained
     array([ True])
-    >>> found.psf().shape
+    >>> wavefronts.psf().shape
     (1, 16, 16)
-    >>> found.table.colnames[8:12]
+    >>> wavefronts.table.colnames[8:12]
     ['z4', 'z4_error', 'z5', 'z5_error']
     """
 
-    search: Search
+    search: WavefrontSearch
     stamps: Stamps
     field_deg: np.ndarray
-    modes: Modes
+    modes: StarModes
     joint: Joint | None = None
 
     def __repr__(self) -> str:
@@ -179,73 +182,76 @@ class Wavefronts:
         return self.search.optics.terms
 
     @property
+    def wavelength_nm(self) -> float:
+        """Wavelength of the telescope in nanometres: the OPD of one wave."""
+        return self.telescope.wavelength_m / 1e-9
+
+    @property
     def star(self) -> np.ndarray:
         """Stars with usable pixels, (m,)."""
-        return np.asarray(self.modes.star[self.modes.first])
+        return self.modes.best_modes.star
 
     @cached_property
     def draws(self) -> np.ndarray:
-        """Draws from their posteriors, (m, s, K + 4), as `Modes.numbers`; made on first use."""
-        return self.search.sampled(self.modes)
+        """Draws from the posteriors, (m, s, K + 4), as `StarModes.parameters`."""
+        return self.search.draw_parameters(self.modes)
 
     @cached_property
     def coefficients(self) -> np.ndarray:
         """Draws of the coefficients in waves, (m, s, K)."""
         k = len(self.terms.names)
-        return np.asarray(
-            self.terms.mean[self.star, None]
-            + self.terms.sd[self.star, None] * (self.draws[..., :k])
-        )
+        return self.search.optics.coefficients(self.star[:, None], self.draws[..., :k])
 
     @cached_property
     def mode_of_draw(self) -> np.ndarray:
-        """Mode that every draw (m, s) is nearest to."""
-        out = np.empty(self.draws.shape[:2], int)
+        """Mode that is nearest to every draw, (m, s), by the Mahalanobis distance."""
+        nearest = np.empty(self.draws.shape[:2], int)
         for row, star in enumerate(self.star):
-            own = np.flatnonzero(self.modes.star == star)
-            gap = self.draws[row][None] - self.modes.numbers[own][:, None]
-            scale = np.linalg.inv(self.modes.covariance[own])
-            out[row] = own[np.einsum("mni,mij,mnj->mn", gap, scale, gap).argmin(axis=0)]
-        return out
+            # Squared distance (x − μ)ᵀ C⁻¹ (x − μ) of all draws from all modes of the star.
+            modes = np.flatnonzero(self.modes.star == star)
+            gap = self.draws[row][None] - self.modes.parameters[modes][:, None]
+            precision = np.linalg.inv(self.modes.covariance[modes])
+            distance = np.einsum("mni,mij,mnj->mn", gap, precision, gap)
+            nearest[row] = modes[distance.argmin(axis=0)]
+        return nearest
 
     @cached_property
     def summary(self) -> dict[str, np.ndarray]:
-        """Table of posterior modes per star, most probable first.
+        """Table of posterior modes, by star and the most probable first.
 
         `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
         """
-        columns: dict[str, list[Any]] = {
-            name: [] for name in ("star", "probability", "mean", "covariance")
-        }
+        k = len(self.terms.names)
+        rows: list[tuple[Any, ...]] = []
         for row, star in enumerate(self.star):
-            own, count = np.unique(self.mode_of_draw[row], return_counts=True)
-            for mode in own[np.argsort(-count, kind="stable")]:
+            # The probability of a mode is its fraction of the star's draws.
+            modes, count = np.unique(self.mode_of_draw[row], return_counts=True)
+            for mode in modes[np.argsort(-count, kind="stable")]:
                 draws = self.coefficients[row, self.mode_of_draw[row] == mode]
-                laplace = self._laplace(mode)
-                # A mode of few draws has the covariance of its peak.
-                few = len(draws) <= 2 * draws.shape[1]
-                columns["star"].append(star)
-                columns["probability"].append(len(draws) / self.draws.shape[1])
-                columns["mean"].append(draws.mean(axis=0))
-                columns["covariance"].append(
-                    laplace if few else np.atleast_2d(np.cov(draws, rowvar=False))
-                )
-        return {name: np.array(values) for name, values in columns.items()}
-
-    def _laplace(self, mode: int) -> np.ndarray:
-        k, sd = len(self.terms.names), self.terms.sd[self.modes.star[mode]]
-        return np.asarray(self.modes.covariance[mode, :k, :k] * sd * sd[:, None])
+                # Too few draws have no useful covariance: that of the peak takes its place.
+                if len(draws) > 2 * k:
+                    covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+                else:
+                    sd = self.terms.sd[star]
+                    covariance = self.modes.covariance[mode, :k, :k] * sd * sd[:, None]
+                probability = len(draws) / self.draws.shape[1]
+                rows.append((star, probability, draws.mean(axis=0), covariance))
+        names = ("star", "probability", "mean", "covariance")
+        columns = zip(*rows, strict=True)
+        return {name: np.array(values) for name, values in zip(names, columns, strict=True)}
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
-        """Central intervals of the coefficients over all modes, (n, K, 2) in waves."""
+        """Return central intervals of the coefficients over all modes, (n, K, 2) in waves."""
+        # Quantiles at (1 ± probability)/2 leave out equal parts on both sides.
         half = 0.5 * probability
         ends = np.quantile(self.coefficients, [0.5 - half, 0.5 + half], axis=1)
-        return self._spread(np.moveaxis(ends, 0, -1))
+        return self._for_all_stars(np.moveaxis(ends, 0, -1))
 
     @cached_property
     def rms(self) -> tuple[np.ndarray, np.ndarray]:
         """RMS of the wavefront over the lit pupil in waves, without tilts, and its error, (n,)."""
-        pupil = annular_pupil(RMS_SAMPLES, self.telescope.obscuration)
+        # Modes on 128 samples across the pupil, less their least-squares planes.
+        pupil = annular_pupil(128, self.telescope.obscuration)
         weight = pupil.amplitude.ravel() / pupil.amplitude.sum()
         x, y = np.meshgrid(pupil.axis, pupil.axis)
         planes = np.stack([np.ones(x.size), x.ravel(), y.ravel()])
@@ -253,13 +259,16 @@ class Wavefronts:
         images = images.reshape(len(images), -1)
         fit = np.linalg.solve((planes * weight) @ planes.T, (planes * weight) @ images.T)
         images = images - fit.T @ planes
+        # Taking a plane off every mode takes it off every sum of modes.
+        # Mean square of Σ c_j M_j over the pupil: cᵀ G c with the Gram matrix G of the modes.
         gram = (images * weight) @ images.T
         modes = np.einsum("msk,mkj->msj", self.coefficients, self.terms.to_modes[self.star])
+        # Rounding can make the square of a perfect wavefront negative.
         rms = np.sqrt(np.maximum(np.einsum("msi,ij,msj->ms", modes, gram, modes), 0.0))
-        return self._spread(rms.mean(axis=1)), self._spread(rms.std(axis=1))
+        return self._for_all_stars(rms.mean(axis=1)), self._for_all_stars(rms.std(axis=1))
 
     def psf(self, oversampling: int = 1, side: int | None = None) -> np.ndarray:
-        """Posterior mean PSFs, (n, s, s), s = oversampling × side, the chief ray in the middle.
+        """Return posterior mean PSFs, (n, s, s), s = oversampling × side, the chief ray central.
 
         The whole light is 1 per oversampling²; `side` in pixels is that of the stamps by default.
         NaN for stars without usable pixels.
@@ -273,121 +282,130 @@ class Wavefronts:
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
-        k, count = len(self.terms.names), self.draws.shape[1]
+        # The star stands in the middle: its place is no part of the PSF.
+        centred = np.zeros((self.draws.shape[1], 2))
         mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
-            modes = optics.modes(np.full(count, star), self.draws[row, :, :k], np.zeros((count, 2)))
-            each = operator.stamps(modes) * oversampling**2
-            mean[star], error[star] = each.mean(axis=0), each.std(axis=0)
+            # Smaller pixels hold less light: their values are those of a whole pixel.
+            images = operator.stamps(self._pupil_modes(row, centred)) * oversampling**2
+            mean[star], error[star] = images.mean(axis=0), images.std(axis=0)
         return mean, error
 
     @cached_property
     def model(self) -> np.ndarray:
         """Posterior mean images of the stars without sky, in the unit of the stamps, (n, d, d)."""
-        optics, k = self.search.optics, len(self.terms.names)
-        found = np.full(self.stamps.data.shape, np.nan)
+        k = len(self.terms.names)
+        model = np.full(self.stamps.data.shape, np.nan)
         for row, star in enumerate(self.star):
-            numbers = self.draws[row]
-            modes = optics.modes(np.full(len(numbers), star), numbers[:, :k], numbers[:, k : k + 2])
-            light = self.search.flux[star] * numbers[:, k + 2] / self.search.photons.gain[star]
-            found[star] = (light[:, None, None] * optics.operator.stamps(modes)).mean(axis=0)
-        return found
+            place, flux = self.draws[row, :, k : k + 2], self.draws[row, :, k + 2]
+            images = self.search.optics.operator.stamps(self._pupil_modes(row, place))
+            # Fluxes of the draws, from units of the search to electrons to the stamps' unit.
+            light = self.search.flux[star] * flux / self.search.photons.gain[star]
+            model[star] = (light[:, None, None] * images).mean(axis=0)
+        return model
+
+    def _pupil_modes(self, row: int, place_px: np.ndarray) -> np.ndarray:
+        """Return the mode coefficients (s, J + 2) of the draws of `star[row]` at places (s, 2)."""
+        stars = np.full(len(place_px), self.star[row])
+        return self.search.optics.mode_coefficients(stars, self.coefficients[row], place_px)
 
     @property
     def snr(self) -> np.ndarray:
-        """S/N of a matched filter, (n,)."""
+        """S/N of a matched filter, (n,): √Σ model² over the noise of the sky in a pixel."""
         power = np.sqrt((self.model**2).sum(axis=(1, 2)))
-        return np.asarray(power / self.search.photons.noise)
+        return np.asarray(power / self.search.photons.sky_noise)
 
     @property
     def explained(self) -> np.ndarray:
-        """Whether a mode explains the star, (n,)."""
-        first = self.modes.take(self.modes.first)
-        found = np.zeros(len(self.stamps), bool)
-        found[first.star] = self.search.explained(first)
-        return found
+        """True for stars that a mode explains, (n,)."""
+        # Stars without usable pixels have no mode and count as unexplained.
+        explained = np.zeros(len(self.stamps), bool)
+        explained[self.star] = self.search.is_explained(self.modes.best_modes)
+        return explained
 
     @property
     def chi2(self) -> np.ndarray:
         """Deviance of the best mode over the number of pixels, (n,)."""
-        first = self.modes.take(self.modes.first)
-        found = np.full(len(self.stamps), np.nan)
-        found[first.star] = first.deviance / expected_deviance(self.search.photons, first.star)[0]
-        return found
+        pixels = self.search.photons.pixels[self.star]
+        return self._for_all_stars(self.modes.best_modes.deviance / pixels)
 
     def measured(self) -> dict[str, np.ndarray]:
-        """Place, flux and sky of every star with errors, (n,) each.
+        """Return place, flux and sky of every star with errors, (n,) each.
 
         The place of the chief ray is a 0-based pixel of the image, where stamps were cut from one,
         else of the stamp; flux is the whole light.
         """
-        photons, k = self.search.photons, len(self.terms.names)
-        side = self.stamps.data.shape[-1]
-        corners = [
-            np.where(np.isfinite(at), central_pixel(at) - side // 2, 0)[self.star]
-            for at in (self.stamps.x, self.stamps.y)
-        ]
-        own = self.draws[..., k:]
-        gain, star = photons.gain, self.star
-        scale = [np.ones(len(star))] * 2
-        scale += [self.search.flux[star] / gain[star], np.sqrt(photons.sky[star]) / gain[star]]
-        zero = [corner + 0.5 * (side - 1) for corner in corners]
-        zero += [np.zeros(len(star)), photons.level[star]]
+        star, photons, side = self.star, self.search.photons, self.stamps.data.shape[-1]
+        # Zero and unit of each parameter. Places count from the middle of the stamp, flux and sky
+        # are in electrons, the sky in units of the root of its counts.
+        gain = photons.gain[star]
+        unit_px = np.ones(len(star))
         columns: dict[str, np.ndarray] = {}
-        for i, name in enumerate(("x", "y", "flux", "sky")):
-            columns[name] = self._spread(zero[i] + scale[i] * own[..., i].mean(axis=1))
-            columns[f"{name}_error"] = self._spread(scale[i] * own[..., i].std(axis=1))
+        scales = {
+            "x": (self._corner(self.stamps.x) + 0.5 * (side - 1), unit_px),
+            "y": (self._corner(self.stamps.y) + 0.5 * (side - 1), unit_px),
+            "flux": (np.zeros(len(star)), self.search.flux[star] / gain),
+            "sky": (photons.sky_level[star], np.sqrt(photons.sky_counts[star]) / gain),
+        }
+        for index, (name, (zero, unit)) in enumerate(scales.items(), len(self.terms.names)):
+            # Mean and standard deviation over all modes.
+            draws = self.draws[..., index]
+            columns[name] = self._for_all_stars(zero + unit * draws.mean(axis=1))
+            columns[f"{name}_error"] = self._for_all_stars(unit * draws.std(axis=1))
         return columns
 
-    def _spread(self, values: np.ndarray) -> np.ndarray:
-        """Values of the usable stars (m, ...) for all, NaN for the others, (n, ...)."""
-        out = np.full((len(self.stamps), *values.shape[1:]), np.nan)
-        out[self.star] = values
-        return out
+    def _corner(self, position: np.ndarray) -> np.ndarray:
+        """Return the first pixel (m,) of stamps about positions (n,); 0 where these are unknown."""
+        corner = central_pixel(position) - self.stamps.data.shape[-1] // 2
+        return np.asarray(np.where(np.isfinite(position), corner, 0)[self.star])
+
+    def _for_all_stars(self, values: np.ndarray) -> np.ndarray:
+        """Return values (m, ...) of the usable stars as (n, ...), NaN for the others."""
+        spread = np.full((len(self.stamps), *values.shape[1:]), np.nan)
+        spread[self.star] = values
+        return spread
 
     @property
     def table(self) -> Table:
-        """A row for every star and mode, the likeliest mode of a star first.
+        """Table with a row for every star and mode, the likeliest mode of a star first.
 
         Coefficients and errors are in waves. `rms` and `rms_error` are in nanometres.
         """
-        from astropy.table import Table
+        from astropy.table import Column, Table
 
-        found, stamps = self.summary, self.stamps
-        star = np.append(found["star"], np.setdiff1d(np.arange(len(stamps)), self.star))
-        lost = star.size - found["star"].size
+        # Rows of the summary, then one for each star without usable pixels, ordered by star.
+        summary, stamps = self.summary, self.stamps
+        star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), self.star))
+        unusable = np.full(star.size - summary["star"].size, np.nan)
         order = np.argsort(star, kind="stable")
-        first = np.diff(star[order], prepend=-1) > 0
-        mode = np.arange(star.size) - np.maximum.accumulate(
-            np.where(first, np.arange(star.size), 0)
-        )
-
-        def filled(values: np.ndarray) -> np.ndarray:
-            return np.append(values, np.full(lost, np.nan))[order]
-
         star = star[order]
-        wave = self.telescope.wavelength_m / NANOMETRE
-        columns: dict[str, Any] = {
-            "id": stamps.id[star],
-            "mode": mode,
-            "probability": filled(found["probability"]),
-            "explained": self.explained[star],
-            "chi2": self.chi2[star],
-            "snr": self.snr[star],
-            "x_deg": self.field_deg[star, 0],
-            "y_deg": self.field_deg[star, 1],
-        }
+
+        def completed(values: np.ndarray) -> np.ndarray:
+            return np.append(values, unusable)[order]
+
+        columns: list[tuple[str, np.ndarray, str | None]] = [
+            ("id", stamps.id[star], None),
+            # Number of the mode: rows since the first one of the star.
+            ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
+            ("probability", completed(summary["probability"]), None),
+            ("explained", self.explained[star], None),
+            ("chi2", self.chi2[star], None),
+            ("snr", self.snr[star], None),
+            ("x_deg", self.field_deg[star, 0], "deg"),
+            ("y_deg", self.field_deg[star, 1], "deg"),
+        ]
         for k, name in enumerate(self.terms.names):
-            columns[name] = filled(found["mean"][:, k])
-            columns[f"{name}_error"] = filled(np.sqrt(found["covariance"][:, k, k]))
-        columns |= {"rms": wave * self.rms[0][star], "rms_error": wave * self.rms[1][star]}
-        columns |= {name: values[star] for name, values in self.measured().items()}
-        units = {name: "wave" for term in self.terms.names for name in (term, f"{term}_error")}
-        units |= {"x_deg": "deg", "y_deg": "deg", "rms": "nm", "rms_error": "nm"}
-        units |= dict.fromkeys(("x", "y", "x_error", "y_error"), "pix")
-        table = Table(columns)
-        for name, unit in units.items():
-            # A wave is no unit of the FITS standard.
-            table[name].unit = None if unit == "wave" else unit
-            table[name].description = unit
+            # Coefficients with the standard deviation of their mode.
+            error = np.sqrt(summary["covariance"][:, k, k])
+            columns.append((name, completed(summary["mean"][:, k]), "wave"))
+            columns.append((f"{name}_error", completed(error), "wave"))
+        for name, waves in zip(("rms", "rms_error"), self.rms, strict=True):
+            columns.append((name, self.wavelength_nm * waves[star], "nm"))
+        for name, values in self.measured().items():
+            columns.append((name, values[star], "pix" if name[0] in "xy" else None))
+        table = Table()
+        for name, values, unit in columns:
+            # A wave is no unit of the FITS standard; the description has it.
+            fits_unit = None if unit == "wave" else unit
+            table[name] = Column(values, unit=fits_unit, description=unit)
         return table

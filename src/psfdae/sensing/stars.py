@@ -1,11 +1,11 @@
-"""Wavefronts of single stars: the modes of each star's posterior, and what they say.
+"""Wavefronts of single stars: the modes of the posterior of each star, and draws from it.
 
-A star's image depends on the coefficients of its wavefront's terms, its place, its flux and the
-sky. Photons are Poisson; coefficients have the prior of the telescope, the other numbers none.
-Candidates drawn from the prior are matched with the stamp at whole pixels, the best ones
-lead to modes. As long as none explains the star, more are drawn. A pupil that is
-the same at opposite points hides the sign of the even part of a wavefront: the twin of every
-mode is a start, too, and both are given with their probabilities.
+The image of a star depends on the coefficients of its wavefront, its place, its flux and the sky.
+Photon counts are Poisson. The coefficients have the prior of the telescope; flux and sky have
+none. Candidates are drawn from the prior and matched with the stamp at whole pixels, and the best
+ones are followed to modes. More are drawn for stars that no mode explains. A pupil that is the
+same at opposite points hides the sign of the even part of a wavefront: the twin of every mode is
+a start, too, and both are given with their probabilities.
 """
 
 from __future__ import annotations
@@ -13,281 +13,290 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.bright_stars import LEAST_SKY, MOST_SKY
 from psfdae.errors import Error
 from psfdae.image.stamps import Stamps, border_median, border_scatter
-from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling
+from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
 from psfdae.progress import task
 from psfdae.rng import stream
-from psfdae.sensing.climbing import Steps, best_of_group, climb, poisson
-from psfdae.sensing.sampling import Mixture, sample_around
+from psfdae.sensing.climbing import Evaluation, Steps, climb, group_maximum, poisson_information
+from psfdae.sensing.sampling import sample_around
 from psfdae.telescope.field import Terms
 from psfdae.telescope.settings import OwnTelescope
 
-BLURRED_SIZE = 48
-"""Seeing forgives a coarser grid than `SIZES` begin with. Either errs by less than a thousandth
-of the noise of stars of S/N 200."""
+PUPIL_SIZES = (48, 64, 80, 96, 126, 158, 190, 222, 254, 318, 398, 478, 638, 830, 1000)
+"""Pupil samples to choose from; the sampling guard decides for each wavefront.
 
-SIZES = (64, 80, 96, 126, 158, 190, 222, 254, 318, 398, 478, 638, 830, 1000)
-"""Pupil samples to choose from; the sampling guard decides for each wavefront."""
+The first one serves stars in seeing alone, which forgives a coarser grid. Either way the error is
+below a thousandth of the noise of stars of S/N 200.
+"""
 
-FARTHEST_Z = 6.0
-"""Standard deviations of the prior beyond which no coefficient is looked for."""
-
-BESIDE = 4
-"""Numbers of a star besides its coefficients: x and y in pixels, flux in that of its start, and
-sky in units of the noise."""
-
-UNLIKELY = 12.0
-"""Modes whose probability is this far below the best one's, in its logarithm, are left out."""
-
-POOR_FIT = 4.0
-"""Standard deviations of χ² from which a star counts as not explained."""
-
-SHIFT_PX = 4
-"""Pixels by which candidates are moved to match a stamp."""
-
-LEAST_PIXELS = 0.5
-"""Part of the pixels that a star must have."""
-
-LEAST_LEFT = 0.01
-"""Lower limit of the expected counts, as a fraction of the sky."""
-
-OUTSIDE = 1e100
-"""Fall of the logarithm of the posterior where a star is not near its stamp."""
-
-WEAK = 1e-9
-"""Information on flux and sky besides that of the star, so that no matrix is singular."""
+MAX_Z = 6.0
+"""Standard deviations of the prior beyond which no coefficient is searched."""
 
 STARS_AT_ONCE = 128
 """Stars of 16 × 16 px that are worked on together, to bound the memory."""
 
-CANDIDATES_AT_ONCE = 100
-"""Candidates of a star that are evaluated at once."""
 
+ROUNDS = ((48, 4), (100, 6), (400, 12), (1000, 12))
+"""Rounds of the search: candidates drawn for a star, and those of them that are followed to modes.
 
-class Round(NamedTuple):
-    """How many candidates are drawn for a star, and from how many of them modes are sought."""
-
-    candidates: int
-    starts: int
-
-
-ROUNDS = (Round(48, 4), Round(100, 6), Round(400, 12), Round(1000, 12))
-"""The later ones for stars that no mode explains, or of which the one before found another."""
-
-LIKELY = 0.01
-"""Probability of a mode beside which there may be others."""
-
-CLIMB = Steps(most=25, depth=40.0, rounding=1e-5)
+Rounds after the first are for stars that no mode explains yet, or for which the round before found
+another mode.
+"""
 
 
 class SensingError(Error, ValueError):
-    """Stars, or a telescope, of which no wavefronts can be found."""
+    """Stars, or a telescope, from which no wavefronts can be measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class StarOptics:
-    """Stamps of stars with given terms, as functions of their numbers.
+    """Propagation from the parameters of stars to their stamps.
 
     Attributes
     ----------
     telescope : OwnTelescope
     terms : Terms
-        Of n stars.
+        Aberrations of n stars, K coefficients each.
     stamp_px : int
+        Side d of a stamp; P = d² pixels.
     """
 
     telescope: OwnTelescope
     terms: Terms
     stamp_px: int
+    search_px: ClassVar[int] = 4
+    """Pixels by which candidates are shifted along x and y to match a stamp."""
 
     @property
-    def count(self) -> int:
-        """Coefficients K of a star."""
+    def coefficient_count(self) -> int:
+        """Number K of coefficients of a star."""
         return len(self.terms.names)
 
     @property
     def reach_px(self) -> float:
-        """Distance along x and y from the middle of a stamp within which its star is."""
-        return 0.5 * self.stamp_px + SHIFT_PX
+        """Largest distance of a star along x and y from the middle of its stamp."""
+        return 0.5 * self.stamp_px + self.search_px
 
     @cached_property
     def operator(self) -> SampledStamps:
         """Propagation to stamps."""
         return self.propagation(self.stamp_px)
 
-    @cached_property
-    def broadening(self) -> SampledStamps:
-        """Propagation to the stamps' derivatives by the logarithm of the seeing's FWHM."""
-        return self.propagation(self.stamp_px, broadening=True)
-
     def propagation(
         self, stamp_px: int, oversampling: int = 1, *, broadening: bool = False
     ) -> SampledStamps:
-        """Propagation to stamps of another size, with several values per pixel and axis."""
-        telescope = self.telescope
-        pixel = telescope.pixel
-        blur = telescope.blur
+        """Return the propagation to stamps of a side, with several values per pixel and axis.
+
+        With `broadening`, the stamps are derivatives by the logarithm of the FWHM of the seeing.
+        """
+        telescope, blur = self.telescope, self.telescope.blur
+        # Points of the image for stamps without blur, its whole period for blurred ones.
+        pixel = telescope.pixel / oversampling
         sampling: Callable[..., Sampling] = PointSampling
         if blur is not None:
             profile = Broadening(blur) if broadening else blur
             sampling = partial(BlurredSampling, profile=profile)
         return SampledStamps(
             telescope.obscuration,
-            partial(movable_modes, self.terms.modes, pixel),
-            partial(sampling, stamp_px=stamp_px, pixel=pixel / oversampling, precision="complex64"),
+            # Two modes more move the star by a pixel of the telescope along x and y.
+            partial(movable_modes, self.terms.modes, telescope.pixel),
+            sampling,
             stamp_px,
-            pixel / oversampling,
-            SIZES if blur is None else (BLURRED_SIZE, *SIZES),
+            pixel,
+            "complex64",
+            PUPIL_SIZES[1:] if blur is None else PUPIL_SIZES,
             reach=blur.reach if blur is not None else 0.0,
             batch=64,
         )
 
     def coefficients(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Coefficients in waves, (m, K), of standardised ones z (m, K) of stars (m,)."""
+        """Return coefficients in waves, (m, K), of standardised ones z (m, K) of stars (m,)."""
         return np.asarray(self.terms.mean[star] + self.terms.sd[star] * z)
 
-    def modes(self, star: np.ndarray, z: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Coefficients of the pupil's modes (m, J + 2); `place` (m, 2) is x, y in pixels."""
-        waves = np.einsum("mk,mkj->mj", self.coefficients(star, z), self.terms.to_modes[star])
-        return np.concatenate([waves, place], axis=1)
+    def mode_coefficients(
+        self, star: np.ndarray, coefficients: np.ndarray, place_px: np.ndarray
+    ) -> np.ndarray:
+        """Return the coefficients (m, J + 2) of the pupil's modes, tilts included.
 
-    def derivatives(
-        self, star: np.ndarray, z: np.ndarray, place: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps of light 1, (m, P), and slopes by z and place, (m, K + 2, P)."""
-        directions = self.terms.sd[star][:, :, None] * self.terms.to_modes[star]
+        Parameters
+        ----------
+        star : ndarray of int, shape (m,)
+        coefficients : ndarray, shape (m, K)
+            In waves.
+        place_px : ndarray, shape (m, 2)
+            Place (x, y) of the star from the middle of the stamp.
+        """
+        # Terms are linear in the modes, by a matrix of each star's field.
+        waves = np.einsum("mk,mkj->mj", coefficients, self.terms.to_modes[star])
+        return np.concatenate([waves, place_px], axis=1)
+
+    def derivatives(self, modes: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
+        """Return stamps of light 1, (m, P), and their derivatives, (m, k + 2, P).
+
+        Parameters
+        ----------
+        modes : ndarray, shape (m, J + 2)
+            Result of `mode_coefficients`.
+        directions : ndarray, shape (m, k, J)
+            Derivatives of the modes by k parameters; those by the place (x, y) are added.
+        """
+        # Two parameters more, each of which is the coefficient of one of the last two modes.
         directions = np.pad(directions, ((0, 0), (0, 2), (0, 2)))
         directions[:, [-2, -1], [-2, -1]] = 1.0
-        stamps, slopes = self.operator.derivatives(self.modes(star, z, place), directions)
-        flat = (len(star), -1)
-        return (
-            stamps.reshape(flat).astype(np.float64),
-            slopes.reshape(*slopes.shape[:2], -1).astype(np.float64),
-        )
+        stamps, slopes = self.operator.derivatives(modes, directions)
+        # Counts are compared in double precision.
+        slopes = slopes.reshape(*slopes.shape[:2], -1).astype(np.float64)
+        return stamps.reshape(len(modes), -1).astype(np.float64), slopes
 
     def twins(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Standardised coefficients (m, K) with the even terms negated; ∞ where one is fixed."""
+        """Return standardised coefficients (m, K) whose even terms are negated in waves.
+
+        A coefficient that has no twin, because the prior fixes it, becomes ∞.
+        """
         mean, sd = self.terms.mean[star], self.terms.sd[star]
+        # −(mean + sd z) = mean + sd z' for z' = −z − 2 mean/sd.
         with np.errstate(divide="ignore", invalid="ignore"):
             negated = np.where(sd > 0, -z - 2.0 * mean / sd, np.where(mean == 0, z, np.inf))
-        return np.where(self.terms.even, negated, z)
+        return np.where(self.terms.is_even, negated, z)
 
 
 @dataclass(frozen=True)
 class Photons:
-    """Stamps in electrons whose noise is Poisson's.
+    """Stamps in electrons, with Poisson noise.
 
     Attributes
     ----------
     counts : ndarray, shape (n, P)
-        Sky included; NaN where a pixel is not used.
-    sky : ndarray, shape (n,)
-        Counts per pixel that have the noise of the sky, read noise included.
-    gain, level, noise : ndarray, shape (n,)
-        Electrons per unit of the stamps, and the sky and its noise in that unit.
+        Electrons, sky included; NaN where a pixel is not used.
+    sky_counts : ndarray, shape (n,)
+        Electrons per pixel that have the noise of the sky, read noise included.
+    gain : ndarray, shape (n,)
+        Electrons per unit of the stamps.
+    sky_level, sky_noise : ndarray, shape (n,)
+        Sky and its RMS in a pixel, in the unit of the stamps.
     """
 
     counts: np.ndarray
-    sky: np.ndarray
+    sky_counts: np.ndarray
     gain: np.ndarray
-    level: np.ndarray
-    noise: np.ndarray
+    sky_level: np.ndarray
+    sky_noise: np.ndarray
 
     @classmethod
-    def of(cls, stamps: Stamps) -> Photons:
-        """Return photons of stamps in counts; without a gain, the sky's noise alone counts."""
+    def from_stamps(cls, stamps: Stamps) -> Photons:
+        """Convert stamps to electrons; without a gain, the noise of the sky alone counts."""
+        # Sky and noise as given, else from the border of the stamp.
         data = stamps.data.astype(np.float64)
-        level = border_median(data, stamps.bad)
-        level = np.where(np.isfinite(stamps.background), stamps.background, level)
+        border = border_median(data, stamps.bad)
+        level = np.where(np.isfinite(stamps.background), stamps.background, border)
         scatter = border_scatter(data, stamps.bad)
         noise = np.where(np.isfinite(stamps.noise), stamps.noise, scatter)
         noise = np.where(noise > 0, noise, np.nan)
+        # A gain that is not given is so large that the star's own photon noise vanishes beside
+        # the sky's. N electrons have the variance N, so the sky counts are (gain · noise)².
         gain = np.where(np.isfinite(stamps.gain), stamps.gain, MOST_SKY**0.5 / noise)
         sky = np.clip((gain * noise) ** 2, LEAST_SKY, MOST_SKY)
+        # Counts of star and sky; pixels that are bad or saturated are not used.
         counts = gain[:, None, None] * (data - level[:, None, None]) + sky[:, None, None]
         counts = np.where(stamps.bad | stamps.saturated, np.nan, counts).reshape(len(data), -1)
         return cls(counts, sky, gain, level, noise)
 
     @property
+    def pixels(self) -> np.ndarray:
+        """Number of used pixels of each star, (n,): the mean deviance of the true image."""
+        return np.asarray(np.isfinite(self.counts).sum(axis=1))
+
+    @property
+    def deviance_limit(self) -> np.ndarray:
+        """Deviance above which an image does not explain a star, (n,).
+
+        Like χ², the deviance of the true image has the mean P and the variance 2P for P pixels;
+        the limit is four standard deviations above.
+        """
+        return np.asarray(self.pixels + 4.0 * np.sqrt(2.0 * self.pixels))
+
+    @property
     def usable(self) -> np.ndarray:
-        """Stars with enough pixels and a noise, (n,)."""
-        return np.asarray(
-            (np.isfinite(self.counts).mean(axis=1) >= LEAST_PIXELS) & np.isfinite(self.noise)
-        )
+        """True for stars with half of their pixels and a noise, (n,)."""
+        return np.asarray((self.pixels >= 0.5 * self.counts.shape[1]) & np.isfinite(self.sky_noise))
 
 
 @dataclass(frozen=True)
-class Modes:
-    """Modes of stars' posteriors, M in all, in the order of the stars, the best of each first.
+class StarModes:
+    """Modes of the posteriors of stars, M in all, by star and from the best on.
 
     Attributes
     ----------
     star : ndarray of int, shape (M,)
-    numbers : ndarray, shape (M, K + 4)
+    parameters : ndarray, shape (M, K + 4)
         Standardised coefficients, place (x, y) from the middle of the stamp in pixels, flux and
-        sky in the units of `Search.flux` and of the noise.
+        sky in the units of `WavefrontSearch.flux` and of the sky's noise.
     covariance : ndarray, shape (M, K + 4, K + 4)
     evidence : ndarray, shape (M,)
-        Logarithm of the mode's mass.
+        Logarithm of the mass of the mode.
     deviance : ndarray, shape (M,)
-        Twice the log-likelihood that is missing to a perfect fit.
+        Twice the difference in log-likelihood from a perfect fit.
     """
 
     star: np.ndarray
-    numbers: np.ndarray
+    parameters: np.ndarray
     covariance: np.ndarray
     evidence: np.ndarray
     deviance: np.ndarray
 
-    def take(self, modes: np.ndarray) -> Modes:
-        """Some of the modes, in the order given."""
-        return Modes(*(values[modes] for values in vars(self).values()))
+    def take(self, modes: np.ndarray) -> StarModes:
+        """Select modes by their numbers, in the order given."""
+        return StarModes(*(values[modes] for values in vars(self).values()))
+
+    def of_stars(self, stars: np.ndarray) -> StarModes:
+        """Select the modes of some stars."""
+        return self.take(np.flatnonzero(np.isin(self.star, stars)))
+
+    @property
+    def best_modes(self) -> StarModes:
+        """Best mode of each star."""
+        return self.take(np.flatnonzero(np.diff(self.star, prepend=-1)))
 
     @property
     def probability(self) -> np.ndarray:
-        """Part of its star's mass that every mode has, (M,)."""
-        mass = np.exp(self.evidence - best_of_group(self.evidence, self.star))
+        """Fraction of the mass of its star that each mode has, (M,)."""
+        # Masses relative to the best mode of the star do not underflow all together.
+        mass = np.exp(self.evidence - group_maximum(self.evidence, self.star))
         return np.asarray(mass / np.bincount(self.star, mass)[self.star])
 
-    @property
-    def first(self) -> np.ndarray:
-        """Number of each star's best mode."""
-        return np.flatnonzero(np.diff(self.star, prepend=-1))
 
-
-def expected_deviance(photons: Photons, star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the deviance of the true image, of some stars."""
-    pixels = np.isfinite(photons.counts[star]).sum(axis=1)
-    return pixels, np.sqrt(2.0 * pixels)
-
-
-class Search:
-    """The modes of the stars of some stamps.
+class WavefrontSearch:
+    """Search for the modes of the stars of some stamps.
 
     Parameters
     ----------
     optics : StarOptics
     photons : Photons
     seed : int
-        Of the candidates.
+        Seed of the candidates and of the draws.
+
+    Attributes
+    ----------
+    flux : ndarray, shape (n,)
+        Flux of the best candidate of each star in electrons, the unit of fluxes.
     """
 
     def __init__(self, optics: StarOptics, photons: Photons, seed: int) -> None:
         self.optics, self.photons, self.seed = optics, photons, seed
         self.flux = np.ones(len(photons.counts))
-        wide = optics.stamp_px + 2 * SHIFT_PX
-        self._wide = optics.propagation(wide)
+        # Stamps that are large enough to be shifted by whole pixels.
+        self._wide_operator = optics.propagation(optics.stamp_px + 2 * optics.search_px)
 
-    def modes(self) -> Modes:
-        """Modes of all stars, those without usable pixels left out.
+    def find_modes(self) -> StarModes:
+        """Find the modes of all stars that have enough usable pixels.
 
         Raises
         ------
@@ -297,199 +306,227 @@ class Search:
         usable = np.flatnonzero(self.photons.usable)
         if not usable.size:
             raise SensingError("no star has enough usable pixels")
-        return joined([self._modes(part) for part in self._blocks(usable)])
+        return join_modes([self._find_modes_of(block) for block in self._blocks(usable)])
 
-    def _modes(self, missing: np.ndarray) -> Modes:
-        """Modes of some stars."""
-        found: Modes | None = None
-        k, known = self.optics.count, np.ones(len(self.flux), int)
-        for number, each in enumerate(ROUNDS):
-            if not missing.size:
-                break
-            starts = [self.matched(star, number, each) for star in missing]
-            star = np.repeat(missing, [len(start) for start in starts])
-            fresh = self.climbed(star, np.concatenate(starts))
-            twins = fresh.numbers.copy()
-            twins[:, :k] = self.optics.twins(fresh.star, twins[:, :k])
-            reachable = (np.abs(twins[:, :k]) <= FARTHEST_Z).all(axis=1)
-            if reachable.any():
-                fresh = joined([fresh, self.climbed(fresh.star[reachable], twins[reachable])])
-            found = separate(fresh if found is None else joined([found, fresh]))
-            first = found.take(found.first)
-            # Where a round has found another mode, there may be more.
-            likely = np.bincount(found.star, found.probability > LIKELY, known.size)
-            more = (likely[first.star] > known[first.star]) | ~self.explained(first)
-            missing, known = np.intersect1d(missing, first.star[more]), likely
-        assert found is not None, "some stars"
-        return found
+    def draw_parameters(self, modes: StarModes) -> np.ndarray:
+        """Draw (m, `CHAINS.draws`, K + 4) parameters from the posteriors of stars with modes."""
+        blocks = self._blocks(modes.best_modes.star)
+        return np.concatenate([self._draw_parameters_of(modes.of_stars(block)) for block in blocks])
 
-    def explained(self, modes: Modes) -> np.ndarray:
-        """Whether modes fit as well as the true image nearly always does."""
-        mean, scatter = expected_deviance(self.photons, modes.star)
-        return modes.deviance <= mean + POOR_FIT * scatter
-
-    def matched(self, star: int, number: int, size: Round) -> np.ndarray:
-        """Starts of a star, (at most `starts`, K + 4): its best candidates, each at its place."""
-        optics, count = self.optics, size.candidates
-        rng = stream(self.seed, "wavefront", int(star), number)
-        z = np.clip(rng.standard_normal((count, optics.count)), -FARTHEST_Z, FARTHEST_Z)
-        if number == 0:
-            z[0] = 0.0
-        seen = self.photons.counts[star] - self.photons.sky[star]
-        used = np.isfinite(seen)
-        parts = [
-            self._gains(star, part, seen[used] - seen[used].mean(), used)
-            for part in np.split(z, range(CANDIDATES_AT_ONCE, count, CANDIDATES_AT_ONCE))
-        ]
-        flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
-        shifts = 2 * SHIFT_PX + 1
-        value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
-        place = value.argmax(axis=1)
-        best = np.argsort(-value.max(axis=1), kind="stable")[: size.starts]
-        if number == 0:
-            top = flux[best[0], place[best[0]]]
-            self.flux[star] = max(top, np.sqrt(self.photons.sky[star]))
-        row, column = np.divmod(place[best], shifts)
-        # A window that starts later shows the star earlier.
-        numbers = [z[best], SHIFT_PX - np.stack([column, row], axis=1)]
-        part = flux[best, place[best]] / self.flux[star]
-        numbers.append(np.stack([np.maximum(part, 0.01), np.zeros(best.size)], axis=1))
-        return np.concatenate(numbers, axis=1)
-
-    def _gains(
-        self, star: int, z: np.ndarray, seen: np.ndarray, used: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Flux of candidates z (c, K) at all shifts, and what it gains in log-likelihood, (c, S).
-
-        `seen` are the counts of the pixels (P,) that are `used`, their mean taken out.
-        """
-        side, nowhere = self.optics.stamp_px, np.zeros((len(z), 2))
-        modes = self.optics.modes(np.full(len(z), star), z, nowhere)
-        wide = self._wide.stamps(modes).astype(np.float64)
-        windows = np.lib.stride_tricks.sliding_window_view(wide, (side, side), axis=(1, 2))
-        light = windows.reshape(-1, side**2)[:, used]
-        light -= light.mean(axis=1, keepdims=True)
-        product = light @ seen
-        flux = product / np.maximum((light**2).sum(axis=1), np.finfo(float).tiny)
-        gain = np.where(flux > 0, flux * product, 0.0) / (2.0 * self.photons.sky[star])
-        return flux.reshape(len(z), -1), gain.reshape(len(z), -1)
-
-    def climbed(self, star: np.ndarray, start: np.ndarray) -> Modes:
-        """Modes that starts (M, K + 4) of stars (M,) lead to."""
-        optics, photons = self.optics, self.photons
-        k = optics.count
-        limit = np.array([FARTHEST_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
-
-        def evaluate(
-            some: np.ndarray, numbers: np.ndarray
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            advance(1)
-            members = star[some]
-            stamps, slopes = optics.derivatives(members, numbers[:, :k], numbers[:, k : k + 2])
-            mean, slopes = self.expected(members, stamps, slopes, numbers[:, k:])
-            deviance, score, information = poisson(photons.counts[members], mean, slopes)
-            z = numbers[:, :k]
-            score[:, :k] -= z
-            information[:, range(k), range(k)] += 1.0
-            score[:, k : k + 2] -= numbers[:, k : k + 2] / optics.stamp_px**2
-            information[:, range(k, k + 2), range(k, k + 2)] += 1.0 / optics.stamp_px**2
-            information[:, range(k + 2, k + BESIDE), range(k + 2, k + BESIDE)] += WEAK
-            return -0.5 * (deviance + self.penalty(numbers)), score, information
-
-        with task("modes", CLIMB.most + 1) as advance:
-            peaks = climb(evaluate, start, limit, CLIMB, star)
-        covariance = np.linalg.inv(peaks.information)
-        sign, width = np.linalg.slogdet(covariance)
-        evidence = np.where(sign > 0, peaks.height + 0.5 * width, -np.inf)
-        deviance = -2.0 * peaks.height - self.penalty(peaks.parameters)
-        return Modes(star, peaks.parameters, covariance, evidence, deviance)
-
-    def sampled(self, modes: Modes) -> np.ndarray:
-        """Draws (m, `CHAINS.kept`, K + 4) from the posteriors of the stars that have modes."""
-        blocks = self._blocks(modes.star[modes.first])
-        parts = [modes.take(np.flatnonzero(np.isin(modes.star, part))) for part in blocks]
-        return np.concatenate([self._sampled(part) for part in parts])
+    def is_explained(self, modes: StarModes) -> np.ndarray:
+        """Return True for modes that fit as well as the true image nearly always does."""
+        return np.asarray(modes.deviance <= self.photons.deviance_limit[modes.star])
 
     def _blocks(self, stars: np.ndarray) -> list[np.ndarray]:
+        # Memory grows with the number of pixels.
         size = max(1, int(STARS_AT_ONCE * (16 / self.optics.stamp_px) ** 2))
         return np.split(stars, range(size, stars.size, size))
 
-    def _sampled(self, modes: Modes) -> np.ndarray:
-        stars, k = modes.star[modes.first], self.optics.count
+    def _find_modes_of(self, stars: np.ndarray) -> StarModes:
+        """Find the modes of some stars, in as many rounds as each needs."""
+        count = self.optics.coefficient_count
+        modes: list[StarModes] = []
+        likely_modes = np.ones(len(self.flux), int)
+        for number, sizes in enumerate(ROUNDS):
+            if not stars.size:
+                break
+            # Climbs from the candidates that match best.
+            starts = [self._match_candidates(star, number, *sizes) for star in stars]
+            members = np.repeat(stars, [len(start) for start in starts])
+            fresh = self._climb(members, np.concatenate(starts))
+            # Climbs from the twins of their modes, where the prior permits them.
+            twins = fresh.parameters.copy()
+            twins[:, :count] = self.optics.twins(fresh.star, twins[:, :count])
+            is_reachable = (np.abs(twins[:, :count]) <= MAX_Z).all(axis=1)
+            if is_reachable.any():
+                twin_modes = self._climb(fresh.star[is_reachable], twins[is_reachable])
+                fresh = join_modes([fresh, twin_modes])
+            modes = [separate_modes(join_modes([*modes, fresh]))]
+            # The next round is for stars that are not explained, and for those that have got
+            # another mode with a probability above 1 %: there may be more.
+            best_modes = modes[0].best_modes
+            is_likely = modes[0].probability > 0.01
+            likely_before = likely_modes
+            likely_modes = np.bincount(modes[0].star, is_likely, likely_before.size)
+            has_more = likely_modes[best_modes.star] > likely_before[best_modes.star]
+            needs_more = has_more | ~self.is_explained(best_modes)
+            stars = np.intersect1d(stars, best_modes.star[needs_more])
+        return modes[0]
 
-        def twin(member: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            z = numbers[:, :k]
-            there = self.optics.twins(stars[member], z)
-            gain = 0.5 * ((z**2).sum(axis=1) - (there**2).sum(axis=1))
-            gain = np.where((np.abs(there) <= FARTHEST_Z).all(axis=1), gain, -np.inf)
-            return np.concatenate([there, numbers[:, k:]], axis=1), gain
+    def _match_candidates(self, star: int, number: int, candidates: int, starts: int) -> np.ndarray:
+        """Return the best candidates of a star in a round as starts, (at most `starts`, K + 4)."""
+        optics = self.optics
+        # Candidates from the prior; the first one of all is its mean.
+        rng = stream(self.seed, "wavefront", int(star), number)
+        z = rng.standard_normal((candidates, optics.coefficient_count))
+        z = np.clip(z, -MAX_Z, MAX_Z)
+        if number == 0:
+            z[0] = 0.0
+        # Match at most 100 of them at once, to bound the memory. The logarithm of the posterior
+        # is the gain by the star minus ½|z|²; each candidate has its best shift.
+        parts = [self._match(star, part) for part in np.split(z, range(100, len(z), 100))]
+        flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
+        value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
+        shift = value.argmax(axis=1)
+        ranked = np.argsort(-value.max(axis=1), kind="stable")[:starts]
+        if number == 0:
+            # The unit of flux, not below the noise of a pixel.
+            first_flux = flux[ranked[0], shift[ranked[0]]]
+            self.flux[star] = max(first_flux, np.sqrt(self.photons.sky_counts[star]))
+        # There are 2 · search_px + 1 shifts along each axis. A window that begins later in the
+        # wide stamp shows the star earlier.
+        row, column = np.divmod(shift[ranked], 2 * optics.search_px + 1)
+        place = optics.search_px - np.stack([column, row], axis=1)
+        relative_flux = np.maximum(flux[ranked, shift[ranked]] / self.flux[star], 0.01)
+        return np.column_stack([z[ranked], place, relative_flux, np.zeros(ranked.size)])
 
-        return sample_around(
-            lambda member, numbers: self._height(stars[member], numbers),
-            twin,
-            np.searchsorted(stars, modes.star),
-            Mixture(modes.numbers, np.linalg.cholesky(modes.covariance), modes.evidence),
-            [stream(self.seed, "wavefront draws", int(star)) for star in stars],
-        )
+    def _match(self, star: int, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fit the flux of candidates z (c, K) at S shifts; return it and its gain, (c, S).
 
-    def _height(self, star: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Logarithm of the posterior at numbers (m, K + 4) of stars (m,)."""
-        optics, k = self.optics, self.optics.count
-        z = np.clip(numbers[:, :k], -FARTHEST_Z, FARTHEST_Z)
-        place = np.clip(numbers[:, k : k + 2], -optics.reach_px, optics.reach_px)
-        modes = optics.modes(star, z, place)
-        stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
-        none = np.empty((len(star), 0, stamps.shape[1]))
-        mean, none = self.expected(star, stamps, none, numbers[:, k:])
-        deviance = poisson(self.photons.counts[star], mean, none)[0]
-        height = -0.5 * (deviance + self.penalty(numbers))
-        within = (np.abs(numbers[:, k : k + 2]) <= optics.reach_px).all(axis=1)
-        return np.where(within, height, -OUTSIDE)
+        The gain is that in log-likelihood over no star, with a free sky.
+        """
+        # Light of the star, its mean taken out: the sky is free.
+        light = self.photons.counts[star] - self.photons.sky_counts[star]
+        used = np.isfinite(light)
+        light = light[used] - light[used].mean()
+        # All windows of a stamp's size in the wide images of the candidates.
+        optics, side = self.optics, self.optics.stamp_px
+        stars = np.full(len(z), star)
+        coefficients = optics.coefficients(stars, z)
+        modes = optics.mode_coefficients(stars, coefficients, np.zeros((len(z), 2)))
+        wide_stamps = self._wide_operator.stamps(modes).astype(np.float64)
+        windows = np.lib.stride_tricks.sliding_window_view(wide_stamps, (side, side), axis=(1, 2))
+        image = windows.reshape(-1, side**2)[:, used]
+        image -= image.mean(axis=1, keepdims=True)
+        # Least squares: flux = p·d/p·p, and χ² falls by flux p·d/σ², with σ² the sky's counts.
+        product = image @ light
+        flux = product / np.maximum((image**2).sum(axis=1), np.finfo(float).tiny)
+        gain = np.where(flux > 0, flux * product, 0.0) / (2.0 * self.photons.sky_counts[star])
+        return flux.reshape(len(z), -1), gain.reshape(len(z), -1)
 
-    def penalty(self, numbers: np.ndarray) -> np.ndarray:
-        """−2 ln of the prior of numbers (m, K + 4): of coefficients, and a wide one of places."""
-        k = self.optics.count
-        own = (numbers[:, :k] ** 2).sum(axis=1)
-        place = numbers[:, k : k + 2] / self.optics.stamp_px
-        return np.asarray(own + (place**2).sum(axis=1))
+    def _climb(self, star: np.ndarray, start: np.ndarray) -> StarModes:
+        """Follow starts (M, K + 4) of stars (M,) to modes."""
+        optics, photons, k = self.optics, self.photons, self.optics.coefficient_count
+        limit = np.array([MAX_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
+        # Normal priors of the coefficients, σ = 1, and of the place, σ = the stamp's side. A trace
+        # of information on flux and sky keeps all matrices regular.
+        prior_variance = np.array([1.0] * k + [optics.stamp_px**2] * 2 + [np.inf] * 2)
+        prior_information = np.maximum(1.0 / prior_variance, 1e-9)
+        diagonal = range(k + 4)
 
-    def expected(
-        self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, own: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Expected counts (m, P), no pixel below `LEAST_LEFT`, and their slopes (m, k + 2, P).
+        def evaluate(members: np.ndarray, parameters: np.ndarray) -> Evaluation:
+            advance(1)
+            stars, z, place = star[members], parameters[:, :k], parameters[:, k : k + 2]
+            # Poisson likelihood of the counts.
+            modes = optics.mode_coefficients(stars, optics.coefficients(stars, z), place)
+            directions = optics.terms.sd[stars][:, :, None] * optics.terms.to_modes[stars]
+            stamps, slopes = optics.derivatives(modes, directions)
+            mean, slopes = self.expected_counts(stars, stamps, slopes, parameters[:, k:])
+            deviance, score, information = poisson_information(photons.counts[stars], mean, slopes)
+            score -= parameters / prior_variance
+            information[:, diagonal, diagonal] += prior_information
+            return -0.5 * (deviance + self._prior_penalty(parameters)), score, information
+
+        steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
+        with task("modes", steps.max_steps + 1) as advance:
+            peaks = climb(evaluate, start, limit, steps, star)
+        # Laplace's approximation: mass = height of the peak × √|covariance|.
+        covariance = np.linalg.inv(peaks.information)
+        sign, log_determinant = np.linalg.slogdet(covariance)
+        evidence = np.where(sign > 0, peaks.height + 0.5 * log_determinant, -np.inf)
+        deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
+        return StarModes(star, peaks.parameters, covariance, evidence, deviance)
+
+    def _draw_parameters_of(self, modes: StarModes) -> np.ndarray:
+        """Draw from the posteriors of all stars that the modes belong to."""
+        stars, optics, k = modes.best_modes.star, self.optics, self.optics.coefficient_count
+
+        def twin(member: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            # Twins have the same likelihood: ln p differs by the prior, −½|z|².
+            z = parameters[:, :k]
+            twin_z = optics.twins(stars[member], z)
+            gain = 0.5 * ((z**2).sum(axis=1) - (twin_z**2).sum(axis=1))
+            gain = np.where((np.abs(twin_z) <= MAX_Z).all(axis=1), gain, -np.inf)
+            return np.concatenate([twin_z, parameters[:, k:]], axis=1), gain
+
+        def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+            # Images are those at the limits where parameters are beyond.
+            star, place, reach = stars[member], parameters[:, k : k + 2], optics.reach_px
+            coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
+            modes = optics.mode_coefficients(star, coefficients, np.clip(place, -reach, reach))
+            stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
+            # The likelihood alone; no derivatives are needed.
+            no_slopes = np.empty((len(star), 0, stamps.shape[1]))
+            mean, no_slopes = self.expected_counts(star, stamps, no_slopes, parameters[:, k:])
+            deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
+            height = -0.5 * (deviance + self._prior_penalty(parameters))
+            # A star far from its stamp is impossible; a finite number keeps differences finite.
+            return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
+
+        # A random stream for each star: its draws do not depend on the other stars.
+        owner = np.searchsorted(stars, modes.star)
+        rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
+        mixture = modes.parameters, modes.covariance, modes.evidence
+        return sample_around(log_posterior, twin, owner, *mixture, rngs)
+
+    def _prior_penalty(self, parameters: np.ndarray) -> np.ndarray:
+        """Return −2 ln of the prior of parameters (m, K + 4), (m,).
+
+        Coefficients are normal with σ = 1; the place has a wide prior, σ = the stamp's side.
+        """
+        k = self.optics.coefficient_count
+        place = parameters[:, k : k + 2] / self.optics.stamp_px
+        return np.asarray((parameters[:, :k] ** 2).sum(axis=1) + (place**2).sum(axis=1))
+
+    def expected_counts(
+        self,
+        star: np.ndarray,
+        stamps: np.ndarray,
+        slopes: np.ndarray,
+        star_parameters: np.ndarray,
+    ) -> StampsAndSlopes:
+        """Return expected counts (m, P), and their derivatives (m, k + 2, P).
+
+        Two derivatives are added: by flux and by sky.
 
         Parameters
         ----------
         star : ndarray of int, shape (m,)
         stamps, slopes : ndarray, shapes (m, P) and (m, k, P)
-            Of light 1, and by whatever numbers.
-        own : ndarray, shape (m, 4)
-            Place, flux and sky of each star.
+            Stamps of light 1 and their derivatives by k parameters.
+        star_parameters : ndarray, shape (m, 4)
+            Place (x, y), flux and sky of each star, in the units of `StarModes`.
         """
-        flux, sky = self.flux[star, None], self.photons.sky[star, None]
-        of_sky = np.broadcast_to(np.sqrt(sky), stamps.shape)
-        mean = flux * own[:, 2:3] * stamps + sky + of_sky * own[:, 3:]
-        slopes = slopes * (flux * own[:, 2:3])[:, None]
-        slopes = np.concatenate([slopes, (flux * stamps)[:, None], of_sky[:, None]], axis=1)
-        return np.maximum(mean, LEAST_LEFT * sky), slopes
+        # μ = F f p + B + √B s, with the unit of flux F, the flux f and the sky s.
+        # The derivatives by flux and sky are F p and √B.
+        flux, sky = self.flux[star, None], self.photons.sky_counts[star, None]
+        sky_slope = np.broadcast_to(np.sqrt(sky), stamps.shape)
+        mean = flux * star_parameters[:, 2:3] * stamps + sky + sky_slope * star_parameters[:, 3:]
+        slopes = slopes * (flux * star_parameters[:, 2:3])[:, None]
+        slopes = np.concatenate([slopes, (flux * stamps)[:, None], sky_slope[:, None]], axis=1)
+        # No pixel is expected to have less than a hundredth of the sky: counts are divided by it.
+        return np.maximum(mean, 0.01 * sky), slopes
 
 
-def joined(parts: list[Modes]) -> Modes:
-    """Modes of several searches."""
-    return Modes(*(np.concatenate([getattr(p, name) for p in parts]) for name in vars(parts[0])))
+def join_modes(parts: list[StarModes]) -> StarModes:
+    """Concatenate the modes of several searches."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return StarModes(*(np.concatenate(values) for values in columns))
 
 
-def separate(modes: Modes) -> Modes:
-    """Modes that are likely, each once, by star and from the best on."""
-    near = modes.evidence > best_of_group(modes.evidence, modes.star) - UNLIKELY
-    kept: dict[int, list[int]] = {}
+def separate_modes(modes: StarModes) -> StarModes:
+    """Return the likely modes, each once, by star and from the best on.
+
+    Modes whose evidence is 12 below the best one of their star (6e-6 of its mass) are dropped.
+    """
+    is_likely = modes.evidence > group_maximum(modes.evidence, modes.star) - 12.0
+    # Modes of each star from the best on.
+    separate: dict[int, list[int]] = {}
     order = np.lexsort((-modes.evidence, modes.star))
-    for m in order[near[order]]:
-        others = kept.setdefault(int(modes.star[m]), [])
-        for k in others:
-            apart = modes.numbers[m] - modes.numbers[k]
-            if apart @ np.linalg.solve(modes.covariance[k], apart) < 1.0:
-                break
-        else:
-            others.append(int(m))
-    return modes.take(np.array([m for members in kept.values() for m in members], int))
+    for mode in order[is_likely[order]]:
+        # A mode is new if it is a standard deviation or more from all better ones of its star.
+        better_modes = separate.setdefault(int(modes.star[mode]), [])
+        offsets = [(modes.parameters[mode] - modes.parameters[k], k) for k in better_modes]
+        if not any(gap @ np.linalg.solve(modes.covariance[k], gap) < 1.0 for gap, k in offsets):
+            better_modes.append(int(mode))
+    return modes.take(np.array([mode for rows in separate.values() for mode in rows], int))

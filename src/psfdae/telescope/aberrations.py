@@ -1,4 +1,8 @@
-"""Static aberrations of a telescope: Seidel terms, Zernike terms over the field, a ray trace."""
+"""Settings of the static aberrations of a telescope.
+
+They are given as Seidel terms, as Zernike terms over the field, or by a ray trace. All are OPDs
+in waves of the telescope's wavelength; lengths of a prescription are in metres.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +23,26 @@ from pydantic import (
 from psfdae.optics.wavefronts import SEIDEL_TERMS
 from psfdae.settings import Finite, Group, Name, Positive
 
+HIGHEST_NOLL = 45
+"""Highest Noll index of a term, the last one of radial order 8."""
 
-def _not_zero(value: float) -> float:
+
+def _check_not_zero(value: float) -> float:
+    """Return a radius of curvature, or refuse 0."""
     if value == 0:
         raise ValueError("must not be 0")
     return value
 
 
-Radius = Annotated[Finite, AfterValidator(_not_zero)]
+Radius = Annotated[Finite, AfterValidator(_check_not_zero)]
+# Types of settings: two numbers along x and y, waves of scatter, and Sellmeier's three terms.
+Pair = tuple[Finite, Finite]
+Jitter = Annotated[float, Field(ge=0, le=100)]
+Resonances = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
 class Mirror(Group):
-    """A conic mirror."""
+    """Conic mirror."""
 
     radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
     conic: Finite = Field(description="Conic constant")
@@ -38,22 +50,23 @@ class Mirror(Group):
 
 
 class Secondary(Mirror):
-    """The mirror that is misaligned."""
+    """Secondary mirror, the one that may be misaligned."""
 
     clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
 
 
 class Lens(Group):
-    """A lens with two spherical surfaces; light meets the front first."""
+    """Lens with two spherical surfaces; light meets the front first."""
 
-    front_radius_m: Radius = Field(description="Radius of curvature, > 0: centre above vertex")
-    back_radius_m: Radius = Field(description="As front_radius_m")
+    front_radius_m: Radius = Field(description="Radius of the front, > 0: centre above vertex")
+    back_radius_m: Radius = Field(description="Radius of the back, > 0: centre above vertex")
     front_vertex_m: Finite = Field(description="z of the front vertex")
     back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
     clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
 
     @model_validator(mode="after")
-    def _thick(self) -> Lens:
+    def _check_thickness(self) -> Lens:
+        # The front is above the back.
         thickness = self.front_vertex_m - self.back_vertex_m
         if not thickness > 0:
             raise ValueError(
@@ -64,18 +77,14 @@ class Lens(Group):
 
 
 class Glass(Group):
-    """Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
+    """Glass by Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
 
-    sellmeier_b: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description="Strengths of the three resonances"
-    )
-    sellmeier_c_um2: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description="In square micrometres"
-    )
+    sellmeier_b: Resonances = Field(description="Strengths of the three resonances")
+    sellmeier_c_um2: Resonances = Field(description="Squared wavelengths of the resonances, µm²")
 
 
 class Prescription(Group):
-    """One or two mirrors, and lenses behind the second; z up, light along −z.
+    """Optical design: one or two mirrors, and lenses behind the second; z up, light along −z.
 
     Without a secondary the light is focused above the primary. A flat mirror that folds it,
     as in a Newtonian, is left out: it is nothing but the telescope's obscuration.
@@ -90,24 +99,23 @@ class Prescription(Group):
     lenses: dict[Name, Lens] = Field(
         default_factory=dict, description="Lenses of the corrector, by name"
     )
-    glass: Glass | None = Field(default=None, description="Of all lenses")
+    glass: Glass | None = Field(default=None, description="Glass of all lenses")
     best_focus_m: Finite = Field(description="z of the detector in focus")
 
     @property
     def ordered_lenses(self) -> list[tuple[str, Lens]]:
-        """Name and lens in the order in which light meets them."""
+        """Names and lenses in the order in which light meets them, from the highest down."""
         return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
 
     @model_validator(mode="after")
-    def _complete(self) -> Prescription:
+    def _check_path(self) -> Prescription:
+        """Refuse lenses without a secondary or a glass, and surfaces in a wrong order."""
+        # Lenses need a secondary in front of them, and a glass.
         if self.lenses and self.secondary is None:
             raise ValueError(f"lenses = {list(self.lenses)}: must lie behind a secondary")
         if bool(self.lenses) != (self.glass is not None):
             raise ValueError("glass: must be given for lenses, and for nothing else")
-        return self
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Prescription:
+        # Surfaces on the way up from the primary, and down from the secondary.
         primary = ("primary", self.primary.vertex_m)
         focus = ("best focus", self.best_focus_m)
         upwards, downwards = [primary, focus], []
@@ -115,9 +123,10 @@ class Prescription(Group):
             secondary = ("secondary", self.secondary.vertex_m)
             upwards, downwards = [primary, secondary], [secondary]
             for name, lens in self.ordered_lenses:
-                downwards += [(f"front of {name}", lens.front_vertex_m)]
-                downwards += [(f"back of {name}", lens.back_vertex_m)]
-            downwards += [focus]
+                downwards.append((f"front of {name}", lens.front_vertex_m))
+                downwards.append((f"back of {name}", lens.back_vertex_m))
+            downwards.append(focus)
+        # Each surface follows the one before in the direction of the light.
         for sign, path in ((1, upwards), (-1, downwards)):
             for (start, z_start), (end, z_end) in pairwise(path):
                 distance = sign * (z_end - z_start)
@@ -128,14 +137,10 @@ class Prescription(Group):
         return self
 
 
-HIGHEST_NOLL = 45
-HIGHEST_POWER = 6
-
-
 class Seidel(Group):
     """Static third-order aberrations in waves at H = 1."""
 
-    kind: Literal["seidel"] = Field(description="Tells which keys follow")
+    kind: Literal["seidel"] = Field(description="Kind of aberrations; decides the other keys")
     spherical: Finite = Field(description="W040, waves")
     coma: Finite = Field(description="W131, waves")
     astigmatism: Finite = Field(description="W222, waves")
@@ -148,34 +153,37 @@ class Seidel(Group):
         return np.array([getattr(self, term) for term in SEIDEL_TERMS])
 
 
-def _constant(term: Any) -> Any:
-    """A bare number is a term that is the same over the whole field."""
+def _as_polynomial(term: Any) -> Any:
+    """Return a bare number as the term that is the same over the whole field."""
     return {"constant": term} if isinstance(term, int | float) else term
 
 
-def _powers_of_the_field(term: dict[str, float]) -> dict[str, float]:
+def _check_powers(term: dict[str, float]) -> dict[str, float]:
+    """Return a term whose keys are products of x and y, in this order, up to the sixth degree."""
     for name in term:
         if name != "constant" and not re.fullmatch(r"(?=.)x*y*", name):
             raise ValueError(f"{name!r}: must be constant or a product such as x, yy or xxy")
-        if name != "constant" and len(name) > HIGHEST_POWER:
-            raise ValueError(f"{name!r}: must be of degree {HIGHEST_POWER} or less")
+        if name != "constant" and len(name) > 6:
+            raise ValueError(f"{name!r}: must be of degree 6 or less")
     return term
+
+
+def _check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Return terms whose names are Zernike polynomials from z2 on."""
+    for name in terms:
+        # z1 is piston, which no image shows.
+        number = re.fullmatch(r"z([1-9]\d?)", name)
+        if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
+            raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
+    return terms
 
 
 FieldPolynomial = Annotated[
     dict[str, Finite],
     Field(min_length=1),
-    BeforeValidator(_constant),
-    AfterValidator(_powers_of_the_field),
+    BeforeValidator(_as_polynomial),
+    AfterValidator(_check_powers),
 ]
-
-
-def _noll_terms(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    for name in terms:
-        number = re.fullmatch(r"z([1-9]\d?)", name)
-        if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
-            raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
-    return terms
 
 
 class Zernike(Group):
@@ -185,16 +193,14 @@ class Zernike(Group):
     disc. The field vector (x, y) has length 1 at `field_edge_deg`.
     """
 
-    kind: Literal["zernike"] = Field(description="Tells which keys follow")
+    kind: Literal["zernike"] = Field(description="Kind of aberrations; decides the other keys")
     terms: Annotated[
-        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(_noll_terms)
+        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(_check_noll)
     ] = Field(
         description="Waves RMS by Noll index and power of the field: "
         "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
     )
-    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=0.0, description="Standard deviation added to every term of every star"
-    )
+    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -205,52 +211,45 @@ class Zernike(Group):
     def polynomials(self) -> list[dict[tuple[int, int], float]]:
         """Coefficient in waves by powers (of x, of y) of the field, in the order of `noll`."""
         return [
-            {
-                (0, 0) if name == "constant" else (name.count("x"), name.count("y")): waves
-                for name, waves in self.terms[f"z{noll}"].items()
-            }
-            for noll in self.noll
+            {(name.count("x"), name.count("y")): waves for name, waves in term.items()}
+            for term in (self.terms[f"z{noll}"] for noll in self.noll)
         ]
 
 
-Pair = tuple[Finite, Finite]
-
-
 class Raytraced(Group):
-    """Aberrations of a telescope by ray tracing (batoid)."""
+    """Aberrations of a telescope that a ray trace computes (batoid)."""
 
-    kind: Literal["raytraced"] = Field(description="Tells which keys follow")
+    kind: Literal["raytraced"] = Field(description="Kind of aberrations; decides the other keys")
     prescription: Prescription
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
         default=0.0, description="Distance of the detector beyond best focus"
     )
-    decentre_m: Pair = Field(default=(0.0, 0.0), description="Of the secondary, along x and y")
+    decentre_m: Pair = Field(default=(0.0, 0.0), description="Decentre of the secondary, x and y")
     tilt_deg: Pair = Field(
-        default=(0.0, 0.0), description="Of the secondary about its vertex, about x and y"
+        default=(0.0, 0.0), description="Tilt of the secondary about its vertex, about x and y"
     )
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
         default=22, description="Highest Noll index of the wavefront"
     )
-    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
-        default=0.0, description="Standard deviation added to every Zernike term of every star"
-    )
+    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
 
     @property
     def misalignment(self) -> np.ndarray:
-        """Decentre x, y in metres and tilt about x, y in radians of the secondary, (4,)."""
+        """Decentre x, y in metres and tilt about x, y in radians of the secondary, shape (4,)."""
+        # Settings are in degrees, optics in radians.
         return np.array([*self.decentre_m, *np.deg2rad(self.tilt_deg)])
 
     @model_validator(mode="after")
-    def _secondary(self) -> Raytraced:
+    def _check_secondary(self) -> Raytraced:
         if self.prescription.secondary is None and self.misalignment.any():
             raise ValueError(
                 f"decentre_m = {list(self.decentre_m)}, tilt_deg = {list(self.tilt_deg)}: "
-                "of a secondary, which the prescription has not"
+                "must be 0, because the prescription has no secondary"
             )
         return self
 
     @model_serializer(mode="wrap")
-    def _aligned(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_zero_misalignment(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Products of aligned telescopes keep the bytes that they had before misalignments.
         return {
             key: value

@@ -1,7 +1,8 @@
-"""Aberrations of a telescope over its field: static ones, their prior, and what moves them all.
+"""Aberrations of a telescope over its field: their static values, their prior, and their cause.
 
-A star's aberrations are the coefficients of some terms. Tilts are none of them: they move the
-star, whose place is not known better than its image says.
+The aberrations of a star are the coefficients of some terms of its wavefront. Tilts are left out:
+they move the star, whose place is not known better than its image tells. All stars follow from a
+few numbers of the telescope, such as the decentre of its secondary mirror.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from psfdae.errors import needed_by
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,
     SEIDEL_TERMS,
-    Modes,
+    PupilModes,
     field_coefficients,
     monomial_coefficients,
     monomial_images,
@@ -27,49 +28,47 @@ from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 from psfdae.telescope.settings import OwnTelescope
 
-SEEN_SEIDEL = SEIDEL_TERMS[:-1]
-"""Distortion is a tilt."""
-
-ODD_SEIDEL = ("coma",)
+VISIBLE_SEIDEL_TERMS = SEIDEL_TERMS[:-1]
+"""Seidel terms that change the image of a star. Distortion is a tilt: it only moves the star."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms of the wavefront, and coefficients that stars may have.
+    """Terms of the wavefronts of n stars, and the prior of their coefficients.
 
     Attributes
     ----------
     names : tuple of str, length K
-    modes : Modes
+    modes : PupilModes
         J modes of the pupil.
     to_modes : ndarray, shape (n, K, J)
         Coefficients of the modes, in waves, for a unit of each term at each star.
     mean, sd : ndarray, shape (n, K)
-        Prior of each star's coefficients, in waves.
-    even : ndarray of bool, shape (K,)
-        Terms that are the same at opposite points of the pupil. A wavefront whose even part
-        has the other sign has the same image.
+        Mean and standard deviation of the coefficients of each star, in waves.
+    is_even : ndarray of bool, shape (K,)
+        True for terms that are the same at opposite points of the pupil. A wavefront whose even
+        part has the other sign has the same image.
     """
 
     names: tuple[str, ...]
-    modes: Modes
+    modes: PupilModes
     to_modes: np.ndarray
     mean: np.ndarray
     sd: np.ndarray
-    even: np.ndarray
+    is_even: np.ndarray
 
 
-def relative(telescope: OwnTelescope, angle_deg: np.ndarray) -> np.ndarray:
-    """Field vectors, 1 at the telescope's `field_edge_deg`, of field angles in degrees."""
+def relative_field(telescope: OwnTelescope, angle_deg: np.ndarray) -> np.ndarray:
+    """Return field angles in degrees as field vectors, 1 at the telescope's `field_edge_deg`."""
     return np.asarray(angle_deg, float) / telescope.field_edge_deg
 
 
 def static_zernikes(
     telescope: OwnTelescope, angle_deg: np.ndarray
 ) -> tuple[tuple[int, ...], np.ndarray]:
-    """Noll indices (J of them) and static coefficients at field angles (n, 2), shape (n, J).
+    """Return J Noll indices, and static coefficients (n, J) at field angles (n, 2).
 
-    The coefficients are an OPD in waves.
+    The coefficients are an OPD in waves. The telescope has no Seidel terms.
 
     Raises
     ------
@@ -80,83 +79,97 @@ def static_zernikes(
     """
     aberrations = telescope.aberrations
     if isinstance(aberrations, Zernike):
-        field = relative(telescope, angle_deg)
+        # Polynomials of the field.
+        field = relative_field(telescope, angle_deg)
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
     assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
+    # The ray trace of the telescope as its file states it.
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
-    return noll, traced(telescope, angle_deg)
+    defocus_m, misalignment = aberrations.defocus_m, aberrations.misalignment
+    return noll, trace_zernikes(telescope, angle_deg, defocus_m, misalignment)
 
 
-def traced(
-    telescope: OwnTelescope,
-    angle_deg: np.ndarray,
-    defocus_m: float | None = None,
-    misalignment: np.ndarray | None = None,
+def trace_zernikes(
+    telescope: OwnTelescope, angle_deg: np.ndarray, defocus_m: float, misalignment: np.ndarray
 ) -> np.ndarray:
-    """Zernike coefficients (n, J) of a ray trace, an OPD in waves.
+    """Trace rays of a telescope and return its Zernike coefficients (n, J), an OPD in waves.
 
-    `defocus_m` and `misalignment` (4,), a decentre x, y in metres and a tilt about x, y in
-    radians of the secondary, are the file's by default.
+    Parameters
+    ----------
+    telescope : OwnTelescope
+        Telescope with a prescription.
+    angle_deg : ndarray, shape (n, 2)
+    defocus_m : float
+        Distance of the detector beyond best focus.
+    misalignment : ndarray, shape (4,)
+        Decentre x, y in metres and tilt about x, y in radians of the secondary.
     """
-    from psfdae.telescope.raytracing import ZernikeTracer, build_optic, misaligned
+    from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 
-    own = telescope.aberrations
-    assert isinstance(own, Raytraced)
-    defocus_m = own.defocus_m if defocus_m is None else defocus_m
+    aberrations = telescope.aberrations
+    assert isinstance(aberrations, Raytraced)
     with needed_by(f"{telescope.name}: a ray trace"):
-        optic = build_optic(own.prescription, telescope, defocus_m)
-    optic = misaligned(optic, own.misalignment if misalignment is None else misalignment)
-    tracer = ZernikeTracer(
-        optic, telescope.wavelength_m, np.deg2rad(angle_deg), np.zeros(4), own.highest_zernike
-    )
+        optic = build_optic(aberrations.prescription, telescope, defocus_m)
+    field_rad, highest = np.deg2rad(angle_deg), aberrations.highest_zernike
+    tracer = ZernikeTracer(optic, telescope.wavelength_m, field_rad, highest)
     # The trace counts the lead of the wavefront, an OPD its delay.
-    return np.asarray(-tracer(np.zeros((1, 4)))[0])
+    return np.asarray(-tracer(misalignment[None])[0])
 
 
 def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
-    """Terms of stars at field angles (n, 2) in degrees, with the telescope's prior.
+    """Return the terms of stars at field angles (n, 2) in degrees, with the telescope's prior.
 
     Raises
     ------
+    ConfigError
+        If all terms are tilts.
     RayTracingError, MissingExtraError
         As `static_zernikes`.
     """
-    prior, aberrations = telescope.prior, telescope.aberrations
+    aberrations = telescope.aberrations
+    jitter = 0.0
     if isinstance(aberrations, Seidel):
-        names: tuple[str, ...] = SEEN_SEIDEL
-        field = relative(telescope, angle_deg)
-        each = np.eye(len(SEIDEL_TERMS))[: len(names)]
-        to_modes = monomial_coefficients(each, field[:, None])
-        modes, even = monomial_images, np.array([name not in ODD_SEIDEL for name in names])
+        # Coefficients of the pupil's monomials for a unit of each visible Seidel term.
+        names: tuple[str, ...] = VISIBLE_SEIDEL_TERMS
+        field = relative_field(telescope, angle_deg)
+        unit = np.eye(len(SEIDEL_TERMS))[: len(names)]
+        to_modes = monomial_coefficients(unit, field[:, None])
+        modes: PupilModes = monomial_images
+        is_even = np.array([name != "coma" for name in names])
         mean = np.tile(aberrations.coefficients[: len(names)], (len(field), 1))
     else:
+        jitter = aberrations.jitter_waves
+        # Each Zernike polynomial is a term and a mode.
         noll, mean = static_zernikes(telescope, angle_deg)
-        seen = [k for k, j in enumerate(noll) if j >= FIRST_NOLL]
-        if not seen:
+        visible = [k for k, j in enumerate(noll) if j >= FIRST_NOLL]
+        if not visible:
             raise ConfigError(f"{telescope.name}: aberrations.terms: z2 and z3 only move a star")
-        noll, mean = tuple(noll[k] for k in seen), mean[:, seen]
+        noll, mean = tuple(noll[k] for k in visible), mean[:, visible]
         names = tuple(f"z{j}" for j in noll)
         to_modes = np.broadcast_to(np.eye(len(noll)), (len(mean), len(noll), len(noll)))
         modes = partial(zernike_images, noll)
-        even = np.array([noll_to_nm(j)[1] % 2 == 0 for j in noll])
-    jitter = getattr(aberrations, "jitter_waves", 0.0) if prior.waves is None else prior.waves
-    sd = np.hypot(prior.fraction * np.abs(mean), jitter)
-    return Terms(names, modes, to_modes, mean, sd, even)
+        # Z_j goes with cos mφ or sin mφ, which is the same at opposite points if m is even.
+        is_even = np.array([noll_to_nm(j)[1] % 2 == 0 for j in noll])
+    # Prior: a fraction of the static coefficient, and a part that all have alike, in quadrature.
+    prior = telescope.prior
+    waves = jitter if prior.waves is None else prior.waves
+    sd = np.hypot(prior.fraction * np.abs(mean), waves)
+    return Terms(names, modes, to_modes, mean, sd, is_even)
 
 
 @dataclass(frozen=True)
-class FieldModel:
-    """A few numbers of the telescope from which the aberrations of all stars follow.
+class TelescopeModel:
+    """Numbers of a telescope from which the aberrations of all stars follow.
 
     Attributes
     ----------
     names, units : tuple of str, length Q
     mean, sd : ndarray, shape (Q,)
-        Prior of the numbers.
+        Mean and standard deviation of the prior of the numbers.
     coefficients : callable
-        From the numbers (Q,) to coefficients of all stars (n, K), in waves.
-    seeing : bool
-        Whether the last number is the FWHM of the seeing in arcsec, which moves no coefficient.
+        Function of the numbers (Q,) that returns coefficients of all stars (n, K), in waves.
+    has_seeing : bool
+        True if the last number is the FWHM of the seeing in arcsec, which moves no coefficient.
     """
 
     names: tuple[str, ...]
@@ -164,102 +177,115 @@ class FieldModel:
     mean: np.ndarray
     sd: np.ndarray
     coefficients: Callable[[np.ndarray], np.ndarray]
-    seeing: bool = False
-
-    def with_seeing(self, fwhm_arcsec: float, fraction: float) -> FieldModel:
-        """This model, and the FWHM of the seeing with a prior of that relative width."""
-        return FieldModel(
-            (*self.names, "seeing"),
-            (*self.units, "arcsec"),
-            np.append(self.mean, fwhm_arcsec),
-            np.append(self.sd, fraction * fwhm_arcsec),
-            lambda numbers: self.coefficients(numbers[:-1]),
-            seeing=True,
-        )
+    has_seeing: bool = False
 
     def jacobian(self, numbers: np.ndarray) -> np.ndarray:
-        """Derivatives of the coefficients, (Q, n, K), by differences of a hundredth of σ."""
+        """Return the derivatives of the coefficients at `numbers` (Q,), shape (Q, n, K).
+
+        They are central differences over ± a hundredth of the prior's σ.
+        """
         slopes = []
         for axis, step in enumerate(0.01 * self.sd):
-            move = np.where(np.arange(self.sd.size) == axis, step, 0.0)
-            ahead, behind = (self.coefficients(numbers + sign * move) for sign in (1, -1))
-            slopes.append((ahead - behind) / (2.0 * step))
+            # One number at a time.
+            shift = np.where(np.arange(self.sd.size) == axis, step, 0.0)
+            change = self.coefficients(numbers + shift) - self.coefficients(numbers - shift)
+            slopes.append(change / (2.0 * step))
         return np.array(slopes)
 
 
-def field_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
-    """Return the model of the field that is common to all stars at angles (n, 2).
+def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> TelescopeModel:
+    """Return the model of a telescope that is common to all stars at field angles (n, 2).
 
-    Seidel terms: the four coefficients that are no tilt. Zernike terms: the coefficients of their
-    polynomials of the field. A ray trace: the detector's defocus, and decentre and tilt of the
-    secondary, or without one the place of the optical axis. The FWHM of the seeing is among them
-    if the prior leaves it free.
+    Its numbers are, for Seidel terms, the coefficients that are no tilt; for Zernike terms, the
+    coefficients of their polynomials of the field; for a ray trace, the detector's defocus, and
+    decentre and tilt of the secondary, or without one the place of the optical axis. The FWHM of
+    the seeing is the last number if the prior leaves it free.
     """
-    optics, seeing = _of_the_optics(telescope, angle_deg), telescope.seeing
-    if seeing is None or not telescope.prior.seeing:
-        return optics
-    return optics.with_seeing(seeing.fwhm_arcsec, telescope.prior.seeing)
-
-
-def _of_the_optics(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
-    prior, aberrations = telescope.prior, telescope.aberrations
+    angle_deg = np.asarray(angle_deg, float)
+    prior, aberrations, seeing = telescope.prior, telescope.aberrations, telescope.seeing
     if isinstance(aberrations, Seidel):
-        mean = aberrations.coefficients[: len(SEEN_SEIDEL)]
-        sd = np.hypot(prior.fraction * np.abs(mean), prior.waves or 0.0)
-        kept = sd > 0
-        names = tuple(name for name, k in zip(SEEN_SEIDEL, kept, strict=True) if k)
-
-        def seidel(numbers: np.ndarray) -> np.ndarray:
-            whole = mean.copy()
-            whole[kept] = numbers
-            return np.tile(whole, (len(angle_deg), 1))
-
-        return FieldModel(names, ("wave",) * len(names), mean[kept], sd[kept], seidel)
-    if isinstance(aberrations, Zernike):
-        return _polynomials(telescope, aberrations, np.asarray(angle_deg, float))
-    return _ray_trace(telescope, aberrations, np.asarray(angle_deg, float))
-
-
-def _polynomials(
-    telescope: OwnTelescope, aberrations: Zernike, angle_deg: np.ndarray
-) -> FieldModel:
-    prior = telescope.prior
-    field, noll = relative(telescope, angle_deg), [j for j in aberrations.noll if j >= FIRST_NOLL]
-    rows = [(j, name) for j in noll for name in aberrations.terms[f"z{j}"]]
-    basis = np.zeros((len(rows), len(field), len(noll)))
-    for row, (j, name) in enumerate(rows):
-        powers = (name.count("x"), name.count("y")) if name != "constant" else (0, 0)
-        basis[row, :, noll.index(j)] = field[:, 0] ** powers[0] * field[:, 1] ** powers[1]
-    mean = np.array([aberrations.terms[f"z{j}"][name] for j, name in rows])
-    waves = aberrations.jitter_waves if prior.waves is None else prior.waves
-    sd = np.hypot(prior.fraction * np.abs(mean), waves)
-    kept = sd > 0
-    fixed = np.tensordot(mean[~kept], basis[~kept], 1)
-    names = tuple(f"z{j}.{name}" for (j, name), k in zip(rows, kept, strict=True) if k)
-    return FieldModel(
-        names,
-        ("wave",) * len(names),
-        mean[kept],
-        sd[kept],
-        lambda numbers: fixed + np.tensordot(numbers, basis[kept], 1),
+        # Seidel coefficients are the same for all stars: row k of the basis is a unit of term k.
+        count = len(VISIBLE_SEIDEL_TERMS)
+        basis = np.broadcast_to(np.eye(count)[:, None], (count, len(angle_deg), count))
+        mean, waves = aberrations.coefficients[:count], prior.waves or 0.0
+        model = _linear_model(VISIBLE_SEIDEL_TERMS, mean, basis, prior.fraction, waves)
+    elif isinstance(aberrations, Zernike):
+        # A row of the basis is a product of powers of the field, in the column of its Zernike.
+        field = relative_field(telescope, angle_deg)
+        noll = [j for j in aberrations.noll if j >= FIRST_NOLL]
+        rows = [(j, power) for j in noll for power in aberrations.terms[f"z{j}"]]
+        basis = np.zeros((len(rows), len(field), len(noll)))
+        for row, (j, power) in enumerate(rows):
+            x, y = (field[:, axis] ** power.count(letter) for axis, letter in enumerate("xy"))
+            basis[row, :, noll.index(j)] = x * y
+        mean = np.array([aberrations.terms[f"z{j}"][power] for j, power in rows])
+        waves = aberrations.jitter_waves if prior.waves is None else prior.waves
+        names = tuple(f"z{j}.{power}" for j, power in rows)
+        model = _linear_model(names, mean, basis, prior.fraction, waves)
+    else:
+        model = _ray_traced_model(telescope, aberrations, angle_deg)
+    # The FWHM of the seeing is added if the prior leaves it free.
+    if seeing is None or not prior.seeing:
+        return model
+    return TelescopeModel(
+        (*model.names, "seeing"),
+        (*model.units, "arcsec"),
+        np.append(model.mean, seeing.fwhm_arcsec),
+        np.append(model.sd, prior.seeing * seeing.fwhm_arcsec),
+        lambda numbers: model.coefficients(numbers[:-1]),
+        has_seeing=True,
     )
 
 
-def _ray_trace(telescope: OwnTelescope, own: Raytraced, angle_deg: np.ndarray) -> FieldModel:
-    prior = telescope.prior
-    if own.prescription.secondary is not None:
+def _linear_model(
+    names: tuple[str, ...], mean: np.ndarray, basis: np.ndarray, fraction: float, waves: float
+) -> TelescopeModel:
+    """Return the model of coefficients Σ_q number_q basis_q, numbers with σ = 0 being fixed.
+
+    Parameters
+    ----------
+    names : tuple of str, length Q
+    mean : ndarray, shape (Q,)
+        In waves.
+    basis : ndarray, shape (Q, n, K)
+        Coefficients of the stars for a unit of each number.
+    fraction, waves : float
+        Standard deviation of the numbers: relative to the mean, and in waves, in quadrature.
+    """
+    # Prior of the numbers; those without a width are constants.
+    sd = np.hypot(fraction * np.abs(mean), waves)
+    is_free = sd > 0
+    fixed = np.tensordot(mean[~is_free], basis[~is_free], 1)
+    names = tuple(names[index] for index in np.flatnonzero(is_free))
+    return TelescopeModel(
+        names,
+        ("wave",) * len(names),
+        mean[is_free],
+        sd[is_free],
+        lambda numbers: fixed + np.tensordot(numbers, basis[is_free], 1),
+    )
+
+
+def _ray_traced_model(
+    telescope: OwnTelescope, aberrations: Raytraced, angle_deg: np.ndarray
+) -> TelescopeModel:
+    """Return the model of a ray-traced telescope: defocus, and secondary or optical axis."""
+    prior, defocus_m = telescope.prior, aberrations.defocus_m
+    if aberrations.prescription.secondary is not None:
+        # Misalignments are in metres and radians, numbers in metres and degrees.
         to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
-        return FieldModel(
+        return TelescopeModel(
             ("defocus", "decentre_x", "decentre_y", "tilt_x", "tilt_y"),
             ("m", "m", "m", "deg", "deg"),
-            np.array([own.defocus_m, *own.decentre_m, *own.tilt_deg]),
+            np.array([defocus_m, *aberrations.decentre_m, *aberrations.tilt_deg]),
             np.array([prior.defocus_m, *[prior.decentre_m] * 2, *[prior.tilt_deg] * 2]),
-            lambda numbers: traced(telescope, angle_deg, numbers[0], to_radians * numbers[1:]),
+            lambda t: trace_zernikes(telescope, angle_deg, t[0], to_radians * t[1:]),
         )
-    return FieldModel(
+    # Without a secondary, the optical axis may be off the middle of the field.
+    return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),
-        np.array([own.defocus_m, 0.0, 0.0]),
+        np.array([defocus_m, 0.0, 0.0]),
         np.array([prior.defocus_m, prior.tilt_deg, prior.tilt_deg]),
-        lambda numbers: traced(telescope, angle_deg - numbers[1:], numbers[0]),
+        lambda t: trace_zernikes(telescope, angle_deg - t[1:], t[0], np.zeros(4)),
     )

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psfdae.errors import Error
-from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_basis
+from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_images
 
 if TYPE_CHECKING:
     from batoid import CompoundOptic
@@ -29,27 +29,16 @@ if TYPE_CHECKING:
     from psfdae.telescope.aberrations import Lens, Mirror, Prescription
     from psfdae.telescope.settings import Telescope
 
-DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
-"""Order of the four numbers of a state of misalignment."""
-
-RIM = 0.998
-"""Relative radius of the rays that look for vignetting at the pupil's rim."""
-
-RIM_RAYS = 36
-
-RANGE_ROUNDING = 1e-9
-"""A state may exceed the range by this much of it: the ends of a grid are rounded."""
-
 
 class RayTracingError(Error, ValueError):
-    """A state of misalignment or a field that the telescope cannot serve."""
+    """Error of a misalignment or a field whose rays cannot be traced."""
 
 
-def misaligned(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
-    """The telescope with its item M2, the secondary, displaced; `optic` stays as it is.
+def misalign(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
+    """Return the telescope with its item M2, the secondary, displaced; `optic` stays as it is.
 
-    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; 0 is the
-    only one of a telescope without secondary.
+    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; a telescope
+    without secondary has none but 0.
     """
     if not np.any(misalignment):
         return optic
@@ -59,27 +48,8 @@ def misaligned(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
     return optic.withLocallyShiftedOptic("M2", [x, y, 0.0]).withLocallyRotatedOptic("M2", turn)
 
 
-def check_states(states: np.ndarray, unit: np.ndarray) -> None:
-    """Refuse states (n, 4), in units of the range `unit`, outside of it.
-
-    Raises
-    ------
-    RayTracingError
-        Names the state, its degree of freedom and its value.
-    """
-    outside = ~(np.abs(states) <= 1.0 + RANGE_ROUNDING)
-    if outside.any():
-        state, axis = np.argwhere(outside)[0]
-        value = states[state, axis]
-        in_units = [f"{value * unit[axis] * 1e3:.6g} mm", f"{np.rad2deg(value * unit[axis]):.6g}°"]
-        raise RayTracingError(
-            f"state {state}: {DEGREES_OF_FREEDOM[axis]} = {value:.6g} of the range "
-            f"({in_units[axis // 2]}): must be between -1 and 1"
-        )
-
-
 class ZernikeTracer:
-    """Zernike coefficients of the wavefront at a set of fields, by ray tracing.
+    """Ray trace of a telescope that gives Zernike coefficients of its wavefront at some fields.
 
     The rays start on Gauss–Legendre rings in the entrance pupil: their weighted
     least-squares fit is that over the whole lit annulus, exact for wavefronts of
@@ -91,52 +61,50 @@ class ZernikeTracer:
     optic : batoid.CompoundOptic
         The aligned telescope; its pupil's size and obscuration and its reference
         sphere are those of the wavefront.
-    wavelength : float
-        In metres.
-    fields : ndarray, shape (F, 2)
-        Field angles (x, y) in radians.
-    unit : ndarray, shape (4,)
-        Range of the misalignment in metres, metres, radians, radians.
-    highest : int
+    wavelength_m : float
+    field_rad : ndarray, shape (F, 2)
+        Field angles (x, y).
+    highest_noll : int
         Highest Noll index.
     """
 
     def __init__(
         self,
         optic: CompoundOptic,
-        wavelength: float,
-        fields: np.ndarray,
-        unit: np.ndarray,
-        highest: int,
+        wavelength_m: float,
+        field_rad: np.ndarray,
+        highest_noll: int,
     ) -> None:
         import batoid
 
-        self.optic, self.wavelength = optic, wavelength
-        self.fields = np.asarray(fields, float)
-        self.unit = np.asarray(unit, float)
-        x, y, self._weights = annulus_points(highest, optic.pupilObscuration)
+        self.optic = optic
+        self.wavelength_m = wavelength_m
+        self.field_rad = np.asarray(field_rad, float)
+        # Weighted least squares, (√w Z)⁺ √w.
+        x, y, self._weights = annulus_points(highest_noll, optic.pupilObscuration)
         root = np.sqrt(self._weights)
-        self._fit = np.linalg.pinv((zernike_basis(highest, x, y) * root).T) * root
-        angle = 2.0 * np.pi * np.arange(RIM_RAYS) / RIM_RAYS
-        start = np.stack([np.append(x, RIM * np.cos(angle)), np.append(y, RIM * np.sin(angle))])
+        basis = zernike_images(range(1, highest_noll + 1), x, y)
+        self._fit = np.linalg.pinv((basis * root).T) * root
+        # 36 rays more, just inside the rim of the pupil, show whether it is vignetted.
+        angle = 2.0 * np.pi * np.arange(36) / 36
+        start = np.stack([np.append(x, 0.998 * np.cos(angle)), np.append(y, 0.998 * np.sin(angle))])
         start *= 0.5 * optic.pupilSize
         # Rays of all fields, one field after the other, from the entrance pupil.
-        self._rays = batoid.concatenateRayVectors(
-            [
-                batoid.RayVector.fromStop(
-                    *start, optic=optic, wavelength=wavelength, theta_x=float(x), theta_y=float(y)
-                )
-                for x, y in self.fields
-            ]
-        )
+        rays = [
+            batoid.RayVector.fromStop(
+                *start, optic=optic, wavelength=wavelength_m, theta_x=float(x), theta_y=float(y)
+            )
+            for x, y in self.field_rad
+        ]
+        self._rays = batoid.concatenateRayVectors(rays)
 
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        """Zernike coefficients of states of misalignment.
+    def __call__(self, misalignments: np.ndarray) -> np.ndarray:
+        """Return the Zernike coefficients of misalignments of the secondary.
 
         Parameters
         ----------
-        states : ndarray, shape (n, 4)
-            In units of the range, order of `DEGREES_OF_FREEDOM`.
+        misalignments : ndarray, shape (n, 4)
+            Decentre x, y in metres and tilt about x, y in radians, as in `misalign`.
 
         Returns
         -------
@@ -146,51 +114,53 @@ class ZernikeTracer:
         Raises
         ------
         RayTracingError
-            If a state lies outside the range or a field is vignetted.
+            If a field is vignetted; names the number of the misalignment.
         """
-        states = np.atleast_2d(np.asarray(states, float))
-        check_states(states, self.unit)
-        return np.stack([self._trace(number, state) for number, state in enumerate(states)])
+        return np.stack([self._trace(*state) for state in enumerate(misalignments)])
 
-    def _trace(self, number: int, state: np.ndarray) -> np.ndarray:
+    def _trace(self, number: int, misalignment: np.ndarray) -> np.ndarray:
+        """Return the coefficients (F, J) of one misalignment, whose number messages name."""
+        # The trace changes the rays in place.
         rays = self._rays.copy()
-        misaligned(self.optic, state * self.unit).trace(rays)
-        lost = (rays.vignetted | rays.failed).reshape(len(self.fields), -1)
-        if lost.any():
-            vignetted = lost.any(axis=1)
-            field = int(vignetted.argmax())
-            x, y = np.rad2deg(self.fields[field])
+        misalign(self.optic, misalignment).trace(rays)
+        is_stopped = (rays.vignetted | rays.failed).reshape(len(self.field_rad), -1)
+        if is_stopped.any():
+            is_vignetted = is_stopped.any(axis=1)
+            field = int(is_vignetted.argmax())
+            x, y = np.rad2deg(self.field_rad[field])
             raise RayTracingError(
-                f"state {number}, field ({x:.6g}, {y:.6g})°: {int(lost[field].sum())} of "
-                f"{lost.shape[1]} rays are vignetted; {int(vignetted.sum())} of "
-                f"{len(lost)} fields are"
+                f"state {number}, field ({x:.6g}, {y:.6g})°: {int(is_stopped[field].sum())} of "
+                f"{is_stopped.shape[1]} rays are vignetted; {int(is_vignetted.sum())} of "
+                f"{len(is_stopped)} fields are"
             )
+        # Landing point, direction and path of the rays of the pupil, those at its rim left out.
         pupil = slice(0, self._weights.size)
-        landing, velocity = (a.reshape(*lost.shape, 3)[:, pupil] for a in (rays.r, rays.v))
-        lead = self._lead(landing, velocity, rays.t.reshape(lost.shape)[:, pupil])
-        return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
-
-    def _lead(self, landing: np.ndarray, velocity: np.ndarray, path: np.ndarray) -> np.ndarray:
-        """Lead of every ray on the mean of its field at the reference sphere, in waves."""
+        landing, velocity = (a.reshape(*is_stopped.shape, 3)[:, pupil] for a in (rays.r, rays.v))
+        path = rays.t.reshape(is_stopped.shape)[:, pupil]
         direction = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
+        # Back along the ray to the sphere about the mean landing point: |o + s d| = R with s < 0,
+        # so s = −o·d − √((o·d)² − (|o|² − R²)), o the offset from the centre.
         centre = np.einsum("n,fnk->fk", self._weights, landing)
         offset = landing - centre[:, None]
         along = (offset * direction).sum(-1)
-        # Back along the ray to the sphere, |offset + s·direction| = radius with s < 0.
-        beyond = (offset**2).sum(-1) - self.optic.sphereRadius**2
-        path = path - along - np.sqrt(along**2 - beyond)
-        return np.asarray((path @ self._weights[:, None] - path) / self.wavelength)
+        excess = (offset**2).sum(-1) - self.optic.sphereRadius**2
+        path = path - along - np.sqrt(along**2 - excess)
+        # Lead of every ray on the mean of its field, in waves, and its fit.
+        lead = (path @ self._weights[:, None] - path) / self.wavelength_m
+        return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
 
 
-def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and weights that integrate products of Zernike polynomials over an annulus.
+def annulus_points(
+    highest_noll: int, obscuration: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points and weights that integrate products of Zernike polynomials over an annulus.
 
     Gauss–Legendre in r², and at least as many spokes as the highest product
     needs; a multiple of 8, so that mirror symmetries hold to rounding.
 
     Parameters
     ----------
-    highest : int
+    highest_noll : int
         Highest Noll index.
     obscuration : float
         Linear central obscuration.
@@ -200,23 +170,25 @@ def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.nda
     x, y, weights : ndarray, shape (n,)
         In pupil radii; the weights sum to 1.
     """
-    order = noll_to_nm(highest)[0]
+    # A product of two polynomials of order n has the order 2n in r, n in r², and 2n cycles.
+    order = noll_to_nm(highest_noll)[0]
     nodes, weights = np.polynomial.legendre.leggauss(order)
     spokes = 8 * -(-(2 * order + 1) // 8)
-    inner = obscuration**2
-    radius = np.sqrt(inner + (1.0 - inner) * 0.5 * (nodes + 1.0))
+    # Nodes −1 … 1 become r² from ε² to 1.
+    rim = obscuration**2
+    radius = np.sqrt(rim + (1.0 - rim) * 0.5 * (nodes + 1.0))
     angle = 2.0 * np.pi * np.arange(spokes) / spokes
     x, y = np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
     return x.ravel(), y.ravel(), np.repeat(0.5 * weights / spokes, spokes)
 
 
 def build_optic(
-    prescription: Prescription, telescope: Telescope, defocus: float = 0.0
+    prescription: Prescription, telescope: Telescope, defocus_m: float = 0.0
 ) -> CompoundOptic:
-    """The aligned telescope, a batoid.CompoundOptic with items M1, D, and M2 and lenses if any.
+    """Build the aligned telescope, a batoid.CompoundOptic.
 
-    `defocus` is the distance of the detector beyond best focus, in metres. batoid is
-    imported only here and where rays are launched: no other scene depends on it.
+    Its items are M1, M2 and lenses if any, and the detector D, `defocus_m` beyond best focus.
+    batoid is imported only here and where rays are launched: no other scene depends on it.
     """
     import batoid
 
@@ -226,62 +198,62 @@ def build_optic(
     def clear(radius: float) -> Any:
         return batoid.ObscNegation(batoid.ObscCircle(radius))
 
-    radius, p = 0.5 * telescope.diameter_m, prescription
-    annulus = batoid.ObscNegation(batoid.ObscAnnulus(telescope.obscuration * radius, radius))
-    vacuum = batoid.ConstMedium(1.0)
-    glass = p.glass and batoid.SellmeierMedium(*p.glass.sellmeier_b, *p.glass.sellmeier_c_um2)
+    def mirror(settings: Mirror, name: str, aperture: Any) -> Any:
+        # Quadric finds no point of a paraboloid on the axis.
+        if settings.conic == -1.0:
+            surface = batoid.Paraboloid(settings.radius_m)
+        else:
+            surface = batoid.Quadric(settings.radius_m, settings.conic)
+        place = at(settings.vertex_m)
+        return batoid.Mirror(surface, name=name, coordSys=place, obscuration=aperture)
 
-    def conic(mirror: Mirror) -> Any:
-        if mirror.conic == -1.0:  # of which Quadric finds no point on the axis
-            return batoid.Paraboloid(mirror.radius_m)
-        return batoid.Quadric(mirror.radius_m, mirror.conic)
-
-    def built(name: str, lens: Lens) -> Any:
-        front = (lens.front_radius_m, lens.front_vertex_m, vacuum, glass)
-        back = (lens.back_radius_m, lens.back_vertex_m, glass, vacuum)
-        sides = [
+    def lens(name: str, settings: Lens) -> Any:
+        front = ("front", settings.front_radius_m, settings.front_vertex_m, vacuum, glass)
+        back = ("back", settings.back_radius_m, settings.back_vertex_m, glass, vacuum)
+        surfaces = [
             batoid.RefractiveInterface(
                 batoid.Sphere(radius),
                 name=f"{name} {side}",
                 coordSys=at(vertex),
-                obscuration=clear(lens.clear_radius_m),
-                inMedium=before,
-                outMedium=after,
+                obscuration=clear(settings.clear_radius_m),
+                inMedium=in_medium,
+                outMedium=out_medium,
             )
-            for side, (radius, vertex, before, after) in (("front", front), ("back", back))
+            for side, radius, vertex, in_medium, out_medium in (front, back)
         ]
-        return batoid.Lens(sides, name=name, medium=glass)
+        return batoid.Lens(surfaces, name=name, medium=glass)
 
-    items = [
-        batoid.Mirror(
-            conic(p.primary),
-            name="M1",
-            coordSys=at(p.primary.vertex_m),
-            obscuration=annulus if telescope.obscuration else clear(radius),
-        ),
-    ]
-    beyond = 1.0  # a single mirror sends the light up
-    if p.secondary:
-        beyond = -1.0
-        items.append(
-            batoid.Mirror(
-                conic(p.secondary),
-                name="M2",
-                coordSys=at(p.secondary.vertex_m),
-                obscuration=clear(p.secondary.clear_radius_m),
-            )
-        )
-    items += [built(*item) for item in p.ordered_lenses]
-    detector = at(p.best_focus_m + beyond * defocus)
+    # Media on both sides of the surfaces of lenses.
+    vacuum = batoid.ConstMedium(1.0)
+    glass = prescription.glass and batoid.SellmeierMedium(
+        *prescription.glass.sellmeier_b, *prescription.glass.sellmeier_c_um2
+    )
+    # The primary, with the hole of the central obscuration.
+    radius = 0.5 * telescope.diameter_m
+    aperture = clear(radius)
+    if telescope.obscuration:
+        annulus = batoid.ObscAnnulus(telescope.obscuration * radius, radius)
+        aperture = batoid.ObscNegation(annulus)
+    items = [mirror(prescription.primary, "M1", aperture)]
+    # A single mirror sends the light up, a second one down: the detector moves along it.
+    light_direction = 1.0
+    if prescription.secondary:
+        light_direction = -1.0
+        aperture = clear(prescription.secondary.clear_radius_m)
+        items.append(mirror(prescription.secondary, "M2", aperture))
+    items += [lens(*item) for item in prescription.ordered_lenses]
+    # Detector and entrance pupil, planes across the axis.
+    detector = at(prescription.best_focus_m + light_direction * defocus_m)
     items.append(batoid.Detector(batoid.Plane(), name="D", coordSys=detector, obscuration=None))
+    entrance_pupil = batoid.Interface(
+        batoid.Plane(), name="entrance pupil", coordSys=at(prescription.entrance_pupil_m)
+    )
     return batoid.CompoundOptic(
         items,
-        name=p.name,
-        backDist=p.launch_distance_m,
-        sphereRadius=p.reference_sphere_m,
+        name=prescription.name,
+        backDist=prescription.launch_distance_m,
+        sphereRadius=prescription.reference_sphere_m,
         pupilSize=telescope.diameter_m,
         pupilObscuration=telescope.obscuration,
-        stopSurface=batoid.Interface(
-            batoid.Plane(), name="entrance pupil", coordSys=at(p.entrance_pupil_m)
-        ),
+        stopSurface=entrance_pupil,
     )

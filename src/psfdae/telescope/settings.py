@@ -1,4 +1,8 @@
-"""The telescope: aperture, band, detector, and the aberrations of a telescope of one's own."""
+"""Settings of a telescope: aperture, band and detector, and what a user's own telescope adds.
+
+A telescope of one's own has a field, static aberrations with a prior, and seeing. Its YAML file
+is read by `read_telescope`.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +23,11 @@ from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
 from psfdae.reading import read_yaml
 from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, validate
-from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
-
-ABERRATIONS: dict[str, type[Group]] = {
-    "seidel": Seidel,
-    "zernike": Zernike,
-    "raytraced": Raytraced,
-}
-"""Kinds of aberrations that a telescope can bring."""
+from psfdae.telescope.aberrations import Jitter, Raytraced, Seidel, Zernike
 
 
 class Telescope(Group):
-    """Aperture, band and detector."""
+    """Telescope by its aperture, band and detector."""
 
     name: Name = Field(description="For titles, files and messages")
     diameter_m: Positive = Field(description="Outer diameter of the aperture")
@@ -56,7 +53,7 @@ class Seeing(Group):
     )
 
     @model_validator(mode="after")
-    def _beta(self) -> Seeing:
+    def _check_beta(self) -> Seeing:
         if (self.kind == "moffat") != (self.beta is not None):
             raise ValueError(
                 f"beta = {self.beta}: must be between 1.5 and 20 for kind = moffat, "
@@ -66,88 +63,88 @@ class Seeing(Group):
 
 
 class Prior(Group):
-    """How far a telescope may be from what its file says, as `psfdae wavefront` assumes."""
+    """Prior of a telescope: how far it may be from its file, as `psfdae wavefront` assumes."""
 
     fraction: Annotated[float, Field(ge=0, le=10)] = Field(
         default=0.1, description="Relative standard deviation of every term"
     )
-    waves: Annotated[float, Field(ge=0, le=100)] | None = Field(
+    waves: Jitter | None = Field(
         default=None, description="Standard deviation in waves besides; null: jitter_waves"
     )
-    defocus_m: Positive = Field(
-        default=1e-4, description="Of a ray trace: standard deviation of the detector's place"
-    )
-    decentre_m: Positive = Field(
-        default=1e-3, description="Likewise of the secondary's decentre along x and y"
-    )
-    tilt_deg: Positive = Field(default=0.1, description="Likewise of its tilt about x and y")
+    defocus_m: Positive = Field(default=1e-4, description="σ of the detector's defocus (ray trace)")
+    decentre_m: Positive = Field(default=1e-3, description="σ of the secondary's decentre, x and y")
+    tilt_deg: Positive = Field(default=0.1, description="σ of the secondary's tilt about x and y")
     seeing: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.0,
-        description="Relative standard deviation of the seeing's FWHM, found with all stars "
-        "together; 0: as given",
+        default=0.0, description="Relative σ of the seeing's FWHM in a joint fit; 0: as given"
     )
 
 
-def _aberrations(tree: Any) -> Any:
+def _checked_aberrations(tree: Any) -> Any:
+    """Check aberrations by the class of their `kind`.
+
+    The class is chosen beforehand, so that messages name no member of a union.
+    """
+    classes: dict[str, type[Group]]
+    classes = {"seidel": Seidel, "zernike": Zernike, "raytraced": Raytraced}
     if not isinstance(tree, Mapping):
         return tree
     kind = tree.get("kind")
-    if not isinstance(kind, str) or kind not in ABERRATIONS:
-        raise ValueError(f"kind = {kind!r}: must be {', '.join(ABERRATIONS)}")
-    return ABERRATIONS[kind].model_validate(tree)
+    if not isinstance(kind, str) or kind not in classes:
+        raise ValueError(f"kind = {kind!r}: must be {', '.join(classes)}")
+    return classes[kind].model_validate(tree)
 
 
 class OwnTelescope(Telescope):
-    """A telescope with its field and aberrations (config/dataset/_telescope.yaml)."""
+    """Telescope of one's own, with its field and aberrations (config/dataset/_telescope.yaml)."""
 
     field_edge_deg: Annotated[float, Field(gt=0, le=45)] = Field(
         description="Field angle of the outermost field on an axis, where the relative field is 1"
     )
-    # The class is chosen by `kind` beforehand: messages then name no member of a union.
-    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(_aberrations)] = Field(
-        description="Static aberrations over the field"
+    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(_checked_aberrations)] = (
+        Field(description="Static aberrations over the field")
     )
     seeing: Seeing | None = Field(default=None, description="Null: a telescope above the air")
-    prior: Prior = Field(default=Prior(), description="Of the state of the telescope")
+    prior: Prior = Field(default=Prior(), description="Prior of the telescope's state")
 
     @property
     def blur(self) -> Profile | None:
         """Profile of the seeing, in λ/D."""
         if self.seeing is None:
             return None
+        # The seeing on the sky in the units of pixels.
         fwhm = pixel_width(self.seeing.fwhm_arcsec, self.diameter_m, self.wavelength_m)
         return Profile(fwhm, self.seeing.beta)
 
     @model_serializer(mode="wrap")
-    def _as_before(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Products of telescopes without these keep the bytes that they had before them.
-        later = {"seeing": None, "prior": Prior()}
+    def _without_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Products of telescopes without seeing and prior keep the bytes that they had before there
+        # were such settings.
+        defaults = {"seeing": None, "prior": Prior()}
         return {
-            k: v for k, v in dump(self).items() if k not in later or getattr(self, k) != later[k]
+            key: value
+            for key, value in dump(self).items()
+            if key not in defaults or getattr(self, key) != defaults[key]
         }
 
 
 def has_own_aberrations(tree: object) -> bool:
-    """Whether a telescope, checked or not yet, brings aberrations of its own."""
-    own = {"aberrations", "field_edge_deg", "seeing", "prior"}
-    return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(own & set(tree)))
+    """Return True if a telescope, checked or not yet, brings aberrations of its own."""
+    keys = {"aberrations", "field_edge_deg", "seeing", "prior"}
+    return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(keys & set(tree)))
 
 
-def _telescope(tree: Any) -> Any:
+def _checked_telescope(tree: Any) -> Any:
+    """Check a telescope by its class: with aberrations, or without."""
     if not isinstance(tree, Mapping):
         return tree
     return (OwnTelescope if has_own_aberrations(tree) else Telescope).model_validate(tree)
 
 
-AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(_telescope)]
-
-
-DEFAULT = re.compile(r"(?:/(?P<group>\w+)(?:@(?P<place>[\w.]+))?: )?(?P<name>\w+)")
-"""An entry of the list `defaults`: a file of the same folder, or of another one."""
+AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(_checked_telescope)]
 
 
 def read_telescope(path: str | Path) -> OwnTelescope:
-    """A telescope of one's own from its YAML file.
+    """Read a telescope of one's own from its YAML file.
 
     Its list `defaults` may name other files, as those in `config/telescope` do: NAME is one of the
     same folder, `/GROUP@KEY: NAME` one of the folder GROUP beside it, whose content becomes KEY.
@@ -164,42 +161,51 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     'refractor: a pixel is 1.76 λ/D wide'
     """
     try:
-        return validate(OwnTelescope, _composed(Path(path).absolute()))
+        return validate(OwnTelescope, _composed_tree(Path(path).absolute()))
     except ConfigError as error:
-        whole = f"{Path(path).absolute()}: "
-        lines = [line.removeprefix(whole) for line in str(error).splitlines()]
+        # Every line of the message names the file as the user did.
+        prefix = f"{Path(path).absolute()}: "
+        lines = [line.removeprefix(prefix) for line in str(error).splitlines()]
         raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
 
 
-def _composed(path: Path, within: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The tree of a file with those that it names; `within` are those that name it."""
-    if path in within:
+def _composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the content of a file with that of the files in its list `defaults`.
+
+    `including` are the files on the way to this one, each of which names the next.
+    """
+    if path in including:
         raise ConfigError(f"{path}: defaults: it names itself")
+    # The file without the list of those that it includes.
     tree = read_yaml(path)
     entries = tree.pop("defaults", [])
-    whole: dict[str, Any] = {}
     if not isinstance(entries, list):
         raise ConfigError(f"{path}: defaults = {entries!r}: must be a list")
+    # As in Hydra, later entries overrule earlier ones; `_self_`, the file's own content, is the
+    # last one unless it stands elsewhere.
+    composed: dict[str, Any] = {}
     for entry in [*entries, *([] if "_self_" in entries else ["_self_"])]:
         text = "".join(f"{k}: {v}" for k, v in entry.items()) if isinstance(entry, dict) else entry
-        found = DEFAULT.fullmatch(str(text))
-        if found is None:
+        pattern = r"(?:/(?P<group>\w+)(?:@(?P<key>[\w.]+))?: )?(?P<name>\w+)"
+        match = re.fullmatch(pattern, str(text))
+        if match is None:
             raise ConfigError(f"{path}: defaults: {entry!r}: must be NAME or /GROUP@KEY: NAME")
-        if text == "_self_":
-            whole = _merged(whole, tree)
-            continue
-        folder = path.parent.parent / found["group"] if found["group"] else path.parent
-        part = _composed(folder / f"{found['name']}.yaml", (*within, path))
-        for key in reversed(found["place"].split(".") if found["place"] else []):
-            part = {key: part}
-        whole = _merged(whole, part)
-    return whole
+        # Content of the entry: the file itself, or another file, under its key if it has one.
+        part = tree
+        if text != "_self_":
+            folder = path.parent.parent / match["group"] if match["group"] else path.parent
+            part = _composed_tree(folder / f"{match['name']}.yaml", (*including, path))
+            for key in reversed(match["key"].split(".") if match["key"] else []):
+                part = {key: part}
+        composed = _merged(composed, part)
+    return composed
 
 
-def _merged(first: dict[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Two trees, of which the second one decides."""
-    merged = dict(first)
-    for key, value in second.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
+def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge two trees, key by key; where both have a value, that of the second one counts."""
+    subtrees = {
+        key: _merged(first[key], value)
+        for key, value in second.items()
+        if isinstance(value, Mapping) and isinstance(first.get(key), Mapping)
+    }
+    return {**first, **second, **subtrees}

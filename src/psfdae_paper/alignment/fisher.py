@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from psfdae.noise import NoiseModel
-from psfdae.sensing.climbing import poisson, together
+from psfdae.sensing.climbing import combine_images, poisson_information
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel
 
@@ -114,10 +114,10 @@ def deviance_and_information(
         for array in (images, stamps)
     )
     slopes = flux * slopes.reshape(count * fields, k, -1).astype(np.float64)
-    deviance, score, information = poisson(observed, expected, slopes)
+    deviance, score, information = poisson_information(observed, expected, slopes)
     # Photons of different fields are independent: their information about the state adds up.
     information = information.reshape(count, fields, k, k)
-    score, information = together(score.reshape(count, fields, k), information, 4)
+    score, information = combine_images(score.reshape(count, fields, k), information, 4)
     return deviance.reshape(count, fields).sum(axis=1), score, information
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae.sensing.climbing import Peaks, Steps, climb
-from psfdae.telescope.raytracing import DEGREES_OF_FREEDOM
 from psfdae_paper.alignment.fisher import Stamps, deviance_and_information
+from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.alignment import Fit
 
 ROUNDING = 1e-6
@@ -62,12 +62,12 @@ def fit_states(
 
     # A step of s standard errors raises the log-likelihood by s²/2.
     steps = Steps(
-        most=settings.iterations,
-        least_gain=0.5 * settings.tolerance**2,
-        decisive=len(DEGREES_OF_FREEDOM),
-        first_damping=settings.damping,
-        most_damping=np.inf,
-        rounding=ROUNDING,
+        max_steps=settings.iterations,
+        min_gain=0.5 * settings.tolerance**2,
+        counted_parameters=len(DEGREES_OF_FREEDOM),
+        initial_damping=settings.damping,
+        max_damping=np.inf,
+        relative_rounding=ROUNDING,
     )
     return climb(evaluate, start, settings.limit, steps)
 
@@ -98,6 +98,6 @@ def refit_twins(
         twin_fit = fit_states(likelihood, images[in_range], twins[in_range], settings)
         # Heights are negative: the twin must be higher by more than rounding.
         is_higher = twin_fit.height > fit.height[in_range] * (1.0 - ROUNDING)
-        improved.take(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
+        improved.overwrite(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
         improved.evaluations[in_range] += twin_fit.evaluations
     return improved, in_range

@@ -17,7 +17,7 @@ from psfdae.errors import Error
 from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,
-    Modes,
+    PupilModes,
     movable_modes,
     noll_to_nm,
     radial_polynomial,
@@ -102,19 +102,19 @@ class AlignmentStamps:
         """Noll indices of the J coefficients."""
         self.movable = movable
         # Pupil modes whose sum is the OPD of a centred stamp.
-        self._modes: Modes = partial(
+        self._modes: PupilModes = partial(
             centred_modes, alignment.highest_zernike, telescope.obscuration
         )
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
         # Stamps are nearly as wide as the period of the image, which is transformed whole.
-        side, pixel = alignment.stamp_px, telescope.pixel
         self.propagation = SampledStamps(
             telescope.obscuration,
             self._modes,
-            partial(PeriodSampling, stamp_px=side, pixel=pixel, precision=optics.precision),
-            side,
-            pixel,
+            PeriodSampling,
+            alignment.stamp_px,
+            telescope.pixel,
+            optics.precision,
             optics.pupil_samples,
             batch=optics.batch,
             threads=optics.threads,
@@ -185,7 +185,7 @@ class AlignmentStamps:
             array.reshape(prod(shape), *array.shape[len(shape) :])
             for array in (zernikes, directions)
         )
-        raw = self.propagation.derivatives(zernikes, directions, places=self.movable)
+        raw = self.propagation.derivatives(zernikes, directions, by_position=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)
         self._check_energy(energy)
         return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])

@@ -1,7 +1,7 @@
 """Scene 3: a telescope with a misaligned secondary mirror, its states and its wavefronts.
 
 A state is four numbers in units of the range, in the order of
-`psfdae.optics.raytracing.DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
+`DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
 Wavefronts leave out piston and tilts: all fields move together with the secondary, and
 a stamp is centred on its own centroid.
 
@@ -24,10 +24,13 @@ import numpy as np
 
 from psfdae.errors import Error
 from psfdae.telescope.aberrations import Prescription
-from psfdae.telescope.raytracing import ZernikeTracer, build_optic
+from psfdae.telescope.raytracing import RayTracingError, ZernikeTracer, build_optic
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
+
+DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
+"""Order of the four numbers of a state of misalignment."""
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))
 """Pairs of degrees of freedom whose products are terms of the quadratic model, in their order."""
@@ -65,17 +68,51 @@ def design_states() -> np.ndarray:
     return np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4), grid_states(2)])
 
 
-def zernike_tracer(
-    telescope: Telescope, prescription: Prescription, alignment: Alignment
-) -> ZernikeTracer:
-    """Make the ray tracer from states to Zernike coefficients (n, F, J) at the field points."""
-    return ZernikeTracer(
-        build_optic(prescription, telescope, alignment.defocus_m),
-        telescope.wavelength_m,
-        field_points(alignment.field_radius_deg, alignment.field_points),
-        alignment.unit,
-        alignment.highest_zernike,
-    )
+class StateTracer(ZernikeTracer):
+    """Ray trace of states of misalignment at the field points.
+
+    Parameters
+    ----------
+    telescope, prescription, alignment : config groups
+
+    Attributes
+    ----------
+    misalignment_range : ndarray, shape (4,)
+        Range of the misalignment in metres, metres, radians, radians: the unit of states.
+    """
+
+    def __init__(
+        self, telescope: Telescope, prescription: Prescription, alignment: Alignment
+    ) -> None:
+        super().__init__(
+            build_optic(prescription, telescope, alignment.defocus_m),
+            telescope.wavelength_m,
+            field_points(alignment.field_radius_deg, alignment.field_points),
+            alignment.highest_zernike,
+        )
+        self.misalignment_range = np.asarray(alignment.unit, float)
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """Return the Zernike coefficients (n, F, J) in waves of states (n, 4).
+
+        Raises
+        ------
+        RayTracingError
+            If a state lies outside the range or a field is vignetted; names the state.
+        """
+        states = np.atleast_2d(np.asarray(states, float))
+        # Ends of a grid are rounded: 1e-9 of the range is no mistake.
+        is_outside = ~(np.abs(states) <= 1.0 + 1e-9)
+        if is_outside.any():
+            state, axis = np.argwhere(is_outside)[0]
+            value = states[state, axis]
+            size = value * self.misalignment_range[axis]
+            size_text = f"{size * 1e3:.6g} mm" if axis < 2 else f"{np.rad2deg(size):.6g}°"
+            raise RayTracingError(
+                f"state {state}: {DEGREES_OF_FREEDOM[axis]} = {value:.6g} of the range "
+                f"({size_text}): must be between -1 and 1"
+            )
+        return super().__call__(states * self.misalignment_range)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ The unknowns of a star are its field f, the offset o in pixels from the chief ra
 its stamp, and the Seidel coefficients c. For one (f, o) the image is smooth in c, so a
 mode of the posterior is sought by Gauss–Newton steps from the bank's best matches, and
 coefficients are drawn around all modes, from a mixture of Student's t. The mixture
-is adapted to its own draws (`psfdae.sensing.sampling`), and the
+is adapted to its own draws (`psfdae_paper.bounds.mixture`), and the
 draws of all rounds are weighed by prior × likelihood over the density of all rounds
 together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
 brightest pixel the simulator would not frame at o have no weight.
@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import cached_property, partial, reduce
+from functools import cached_property, reduce
 from itertools import product
 from typing import NamedTuple, get_args
 
@@ -25,10 +25,10 @@ from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_wi
 from psfdae.optics.propagation import Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import MONOMIALS, SEIDEL_TERMS, monomial_coefficients, monomial_images
-from psfdae.sensing.climbing import Peaks, Steps, best_of_group, poisson
+from psfdae.sensing.climbing import Peaks, Steps, group_maximum, poisson_information
 from psfdae.sensing.climbing import climb as climb_posterior
-from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
+from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
@@ -199,14 +199,14 @@ class StampModel:
         """Propagators by precision, on the smallest pupil grid that the sampling guard allows."""
         # Stamps differ from those of N = 222 by an MSE of 4e-11 on average and 7e-10 at most.
         pupil_samples = {126, 158, 190, 222, 254, 318, 398, 478, 574, 690, 830, 1000}
-        side, pixel = self.framing.stamp_px, self.telescope.pixel
         return {
             precision: SampledStamps(
                 self.telescope.obscuration,
                 monomial_images,
-                partial(PointSampling, stamp_px=side, pixel=pixel, precision=precision),
-                side,
-                pixel,
+                PointSampling,
+                self.framing.stamp_px,
+                self.telescope.pixel,
+                precision,
                 sorted(pupil_samples | {*self.optics.pupil_samples}),
                 batch=TERMS * self.optics.batch,
             )
@@ -301,7 +301,7 @@ class Modes:
     def log_density(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the log-density of Student's t around every mode at draws (n, 5), (M, n)."""
         mixture = self.mixture
-        density = mixture.log_density(mixture.distance(z))
+        density = mixture.log_density(mixture.squared_distance(z))
         return np.asarray(density + self._log_support(field, offset))
 
     def _log_support(self, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -349,7 +349,7 @@ class Modes:
         # Rounded up, so that every mode has a draw, whose weight may show that its mass is larger.
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
-        return Place(self.field[mode], self.offset[mode], self.mixture.draws(mode, rng)), number
+        return Place(self.field[mode], self.offset[mode], self.mixture.draw(mode, rng)), number
 
 
 def largest_of_groups(group: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
@@ -569,12 +569,14 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
         # Poisson likelihood times the prior N(0, 1): their logarithms and derivatives add up.
         # ln posterior = −½ (deviance + |z|²), slope = score − z, information + 1.
         counts, expected = posteriors.counts[modes.star[rows]], likelihood.expected(stamps)
-        deviance, score, information = poisson(counts, expected, likelihood.flux * slopes)
+        deviance, score, information = poisson_information(
+            counts, expected, likelihood.flux * slopes
+        )
         height = -0.5 * (deviance + (z**2).sum(axis=1))
         return height, score - z, information + np.eye(z.shape[1])
 
     start = np.hstack([modes.z, np.zeros((len(modes.z), len(added_directions)))])
-    steps = Steps(depth=MAX_EVIDENCE_DROP)
+    steps = Steps(max_drop=MAX_EVIDENCE_DROP)
     return climb_posterior(evaluate, start, MAX_ABS_Z, steps, modes.group)
 
 
@@ -723,7 +725,7 @@ def separate(modes: Modes) -> Modes:
     Of modes of a star in the same field and offset that are less than one of their standard
     deviations apart, the best is kept. It is known by the least knowledge that led to any of them.
     """
-    best_evidence = best_of_group(modes.evidence, modes.group)
+    best_evidence = group_maximum(modes.evidence, modes.group)
     noticeable = np.flatnonzero(modes.evidence > best_evidence - MAX_EVIDENCE_DROP)
     distinct: dict[tuple[int, ...], list[int]] = {}
     knowledge = modes.knowledge.copy()

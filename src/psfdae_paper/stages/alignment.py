@@ -19,18 +19,17 @@ from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.options import File
 from psfdae.rng import stream
 from psfdae.settings import Group
-from psfdae.telescope.raytracing import ZernikeTracer
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     QuadraticModel,
+    StateTracer,
     design_states,
     field_points,
     fit_quadratic,
     grid_states,
     uniform_states,
     verify,
-    zernike_tracer,
 )
 from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS, STATE_GROUPS, WAVEFRONT_KEYS
 from psfdae_paper.configuration.command import command
@@ -126,9 +125,9 @@ def states(
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
-def _tracer(config: Config) -> ZernikeTracer:
+def _tracer(config: Config) -> StateTracer:
     """Return the ray trace of the configured telescope."""
-    return zernike_tracer(config.telescope, config.prescription, config.alignment)
+    return StateTracer(config.telescope, config.prescription, config.alignment)
 
 
 def _geometry(config: Config) -> dict[str, Column]:

@@ -18,7 +18,7 @@ from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.fisher import coma_free_decentre, expected_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.alignment.telescope import design_states, fit_quadratic, zernike_tracer
+from psfdae_paper.alignment.telescope import StateTracer, design_states, fit_quadratic
 from psfdae_paper.configuration.aligners import (
     ALIGNERS,
     BOUNDS,
@@ -353,7 +353,7 @@ def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, 
         Stamps of `MULTIPLES` of the state, with the CCD at a defocus of `defocus_m` metres.
     """
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
-    tracer = zernike_tracer(config.telescope, config.prescription, settings)
+    tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
     model = fit_quadratic(design_states(), tracer(design_states()))
     tilt = np.array([(0.20, 0.25)])  # x, y in units of the range

@@ -281,4 +281,6 @@ def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
 
 def aberration_columns(source: ModalWavefronts) -> dict[str, Column]:
     """Return the stars' random aberrations as columns of a product, in waves."""
-    return {name: Column(values, "wave", about) for name, (values, about) in source.drawn.items()}
+    return {
+        name: Column(values, "wave", about) for name, (values, about) in source.star_columns.items()
+    }
