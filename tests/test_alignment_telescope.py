@@ -99,12 +99,11 @@ def test_batoid_s_own_zernike_fit(tracer):
 def test_weights_of_the_annulus_integrate_zernike_products():
     """Means of Z_j² over the annulus agree with a fine midpoint sum."""
     x, y, weights = annulus_points(22, 0.42)
-    basis = zernike_images(range(1, 23), x, y)
+    noll = range(1, 23)
+    basis = zernike_images(noll, x, y)
     radius = np.sqrt(0.42**2 + (1 - 0.42**2) * (np.arange(400) + 0.5) / 400)
     angle = 2 * np.pi * np.arange(64) / 64
-    fine = zernike_images(
-        range(1, 23), np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))
-    )
+    fine = zernike_images(noll, np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)))
     assert weights.sum() == pytest.approx(1, abs=1e-12)
     assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
 

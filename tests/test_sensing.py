@@ -215,11 +215,9 @@ def test_even_part_has_no_sign(kind):
     optics = StarOptics(telescope, terms_of(telescope, field_of(telescope, 5, rng)), 16)
     star, z = np.arange(5), rng.standard_normal((5, optics.coefficient_count))
     place = np.zeros((5, 2))
+    pair = (optics.coefficients(star, sign) for sign in (z, optics.twins(star, z)))
     images, twins = (
-        optics.operator.stamps(
-            optics.mode_coefficients(star, optics.coefficients(star, sign), place)
-        )
-        for sign in (z, optics.twins(star, z))
+        optics.operator.stamps(optics.mode_coefficients(star, waves, place)) for waves in pair
     )
     assert twins == pytest.approx(images, abs=float(2e-6 * images.max()))
     assert optics.twins(star, optics.twins(star, z)) == pytest.approx(z)

@@ -273,19 +273,20 @@ def _ray_traced_model(
     prior, defocus_m = telescope.prior, aberrations.defocus_m
     if aberrations.prescription.secondary is not None:
         # Misalignments are in metres and radians, numbers in metres and degrees.
-        to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
+        units = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
         return TelescopeModel(
             ("defocus", "decentre_x", "decentre_y", "tilt_x", "tilt_y"),
             ("m", "m", "m", "deg", "deg"),
             np.array([defocus_m, *aberrations.decentre_m, *aberrations.tilt_deg]),
             np.array([prior.defocus_m, *[prior.decentre_m] * 2, *[prior.tilt_deg] * 2]),
-            lambda t: trace_zernikes(telescope, angle_deg, t[0], to_radians * t[1:]),
+            lambda numbers: trace_zernikes(telescope, angle_deg, numbers[0], units * numbers[1:]),
         )
     # Without a secondary, the optical axis may be off the middle of the field.
+    aligned = np.zeros(4)
     return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),
         np.array([defocus_m, 0.0, 0.0]),
         np.array([prior.defocus_m, prior.tilt_deg, prior.tilt_deg]),
-        lambda t: trace_zernikes(telescope, angle_deg - t[1:], t[0], np.zeros(4)),
+        lambda numbers: trace_zernikes(telescope, angle_deg - numbers[1:], numbers[0], aligned),
     )
