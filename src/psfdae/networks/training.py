@@ -243,16 +243,7 @@ class Training(ABC):
         losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
-            step = epoch * self.steps + len(losses)
-            loss = self.loss(batch, step)
-            losses.append(self._finite("loss", loss, step))
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            # Clipping returns the norm before it.
-            norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
-            self._finite("gradient's norm", norm, step)
-            self.optimiser.step()
-            self.scheduler.step()
+            losses.append(self._step(batch, epoch * self.steps + len(losses)))
         error = self.validate(epoch + 1)
         if error < self.best_mse:
             # A copy, because the next steps change the weights in place.
@@ -265,6 +256,19 @@ class Training(ABC):
         self.cpu_seconds += time.process_time() - started_cpu
         self.history.append(self.row(epoch + 1, rate, float(np.mean(losses)), error))
         return self.history[-1]
+
+    def _step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
+        """Make a step of the optimiser with a batch, and return the loss before it."""
+        loss = self.loss(batch, step)
+        value = self._finite("loss", loss, step)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        # Clipping returns the norm before it.
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
+        self._finite("gradient's norm", norm, step)
+        self.optimiser.step()
+        self.scheduler.step()
+        return value
 
     def _finite(self, quantity: str, tensor: torch.Tensor, step: int) -> float:
         """Return the value of a tensor of one element; raise TrainingError if it is not finite."""
