@@ -180,11 +180,13 @@ def fit_field(
         errors of the field are not measured.
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
-    tried = _supported(orders, stars)
+    supported_orders = _supported(orders, stars)
     # Fits: all knots and smoothnesses, all orders, with magnitude and colour in either order, the
     # last one and four more.
-    with task("field", 1 + COARSER + SMOOTHER + len(tried) + 3 + 5) as alternating.advance:
-        return _best_fit(alternating, tried, len(orders) == 1 or len(stars) < 3, rng)
+    with task(
+        "field", 1 + COARSER + SMOOTHER + len(supported_orders) + 3 + 5
+    ) as alternating.advance:
+        return _best_fit(alternating, supported_orders, len(orders) == 1 or len(stars) < 3, rng)
 
 
 def _best_fit(
@@ -193,7 +195,7 @@ def _best_fit(
     is_settled: bool,
     rng: np.random.Generator | None,
 ) -> FieldFit:
-    """The fit whose order, terms and smoothness predict stars best that are left out.
+    """Return the fit whose order, terms and smoothness predict left-out stars best.
 
     Parameters
     ----------
@@ -210,42 +212,44 @@ def _best_fit(
     # Splines first, with a polynomial that follows most of the field: with those that follow noise,
     # no higher order would seem to pay.
     alternating.choose_splines(max((o for o in orders if o <= CURVED), default=orders[0]))
-    best, least = 0, np.inf
+    best_order, least_error = 0, np.inf
     for order in orders:
         error = alternating.crossed_error(alternating.fit(order))
         # A curved field is the rule. Higher orders must pay clearly: noise makes some seem better.
-        if error < (1.0 if order <= CURVED else 0.99) * least:
-            best, least = order, error
+        if error < (1.0 if order <= CURVED else 0.99) * least_error:
+            best_order, least_error = order, error
         elif order >= CURVED:
             break
-    low, high, most = alternating.low, alternating.high, alternating.most
+    low, high, greatest = alternating.low, alternating.high, alternating.greatest
     # Magnitude and colour, the one that saves more first: the other may only go along with it.
-    untried = [coordinate for coordinate in range(len(most)) if most[coordinate] > high[coordinate]]
+    untried = [
+        coordinate for coordinate in range(len(greatest)) if greatest[coordinate] > high[coordinate]
+    ]
     while untried:
         errors = {}
         for coordinate in untried:
-            high[coordinate] = most[coordinate]
-            errors[coordinate] = alternating.crossed_error(alternating.fit(best))
+            high[coordinate] = greatest[coordinate]
+            errors[coordinate] = alternating.crossed_error(alternating.fit(best_order))
             high[coordinate] = low[coordinate]
-        chosen = min(untried, key=errors.__getitem__)
-        if errors[chosen] >= (1.0 - STAR_GAIN) * least:
+        gainful = min(untried, key=errors.__getitem__)
+        if errors[gainful] >= (1.0 - STAR_GAIN) * least_error:
             break
-        high[chosen], least = most[chosen], errors[chosen]
-        untried.remove(chosen)
+        high[gainful], least_error = greatest[gainful], errors[gainful]
+        untried.remove(gainful)
     alternating.tolerance = TOLERANCE
-    return alternating.with_errors(alternating.fit(best), rng)
+    return alternating.with_errors(alternating.fit(best_order), rng)
 
 
 def _supported(orders: Sequence[int], stars: BrightStars) -> list[int]:
     """Return the orders, ascending, that so many stars may support."""
     if not np.isfinite(stars.position).all():
         return [0]
-    tried = sorted(orders)
+    ascending = sorted(orders)
     if len(stars) >= FEW_STARS or len(orders) == 1:
-        return tried
+        return ascending
     # Stars that are left out say too little then: at least three stars for two terms of the
     # polynomial of order o, which has (o + 1)(o + 2)/2.
-    return [o for o in tried if 3 * (o + 1) * (o + 2) <= 4 * len(stars)] or tried[:1]
+    return [o for o in ascending if 3 * (o + 1) * (o + 2) <= 4 * len(stars)] or ascending[:1]
 
 
 def refit_field(
@@ -266,7 +270,7 @@ def refit_field(
     for alternating.change in EXPOSURE_CHANGES:
         fit = alternating.fit(prior.order)
         fits.append((alternating.crossed_error(fit), fit))
-    return min(fits, key=lambda found: found[0])[1]
+    return min(fits, key=lambda error_and_fit: error_and_fit[0])[1]
 
 
 class _Alternating:
@@ -285,7 +289,7 @@ class _Alternating:
         prior: FieldModel | None = None,
     ) -> None:
         self.prior = prior
-        self.images, self.seen = stars.framed(side)
+        self.images, self.measured = stars.framed(side)
         self.around_px = max(stars.wide[0].size - stamp_px**2, 1)  # of which the sky is the median
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
@@ -295,14 +299,16 @@ class _Alternating:
         sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
         self.window_px = 1.4 * sigma if sigma > 3.0 else WINDOW_PX
         self.axis = np.arange(side) - side // 2.0
-        self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
+        self.in_stamp = np.abs(self.axis + 0.5) < stamp_px / 2
         self.set_knots(knots_of(side, spacing))
         self.advance: Advance = lambda fits: None
-        known = [column[np.isfinite(column)] for column in self.place.T]
-        ends = [(column.min(), column.max()) if column.size else (0.0, 0.0) for column in known]
-        self.low, self.most = np.transpose(ends)
+        finite_columns = [column[np.isfinite(column)] for column in self.place.T]
+        ends = [
+            (column.min(), column.max()) if column.size else (0.0, 0.0) for column in finite_columns
+        ]
+        self.low, self.greatest = np.transpose(ends)
         # Magnitude and colour do not count until they are tried.
-        self.high = np.concatenate([self.most[:2], self.low[2:]])
+        self.high = np.concatenate([self.greatest[:2], self.low[2:]])
         if prior is not None:
             self.low, self.high = prior.low, prior.high
 
@@ -313,24 +319,24 @@ class _Alternating:
         self.bend = bend.T @ bend
 
     def choose_splines(self, order: int) -> None:
-        """Take knots farther apart, and then smoother splines, as long as each step pays."""
-        least = self.crossed_error(self.fit(order))
+        """Set knots farther apart, and then smoother splines, as long as each step pays."""
+        least_error = self.crossed_error(self.fit(order))
         for _ in range(COARSER):
             finer = self.knots
             self.set_knots(knots_of(len(self.axis), COARSER_BY * self.spacing))
-            if (error := self.crossed_error(self.fit(order))) >= least:
+            if (error := self.crossed_error(self.fit(order))) >= least_error:
                 self.set_knots(finer)
                 break
-            least = error
+            least_error = error
         for _ in range(SMOOTHER):
             self.smoothness *= SMOOTHER_BY
-            if (error := self.crossed_error(self.fit(order))) >= least:
+            if (error := self.crossed_error(self.fit(order))) >= least_error:
                 self.smoothness /= SMOOTHER_BY
                 break
-            least = error
+            least_error = error
 
     def fit(self, order: int) -> FieldFit:
-        """All stars."""
+        """Fit field, fluxes and centres to all stars by turns, with a polynomial of this order."""
         count = 2 + max(np.flatnonzero(self.high[2:] > self.low[2:]) + 1, default=0)
         low, high = self.low[:count].copy(), self.high[:count].copy()
         terms = _terms(self.place, low, high, order)
@@ -342,36 +348,38 @@ class _Alternating:
         # own pixels would be larger where noise makes them fainter, and light in the wings too
         # little (Humphrey, Liu & Buote 2009, ApJ 693, 822).
         light = np.median(self.images / flux[:, None, None], axis=0)
-        alike, noise = np.ones(self.images.shape), self._weight(flux, light)
-        found: np.ndarray | None = None
+        robust_weight, noise = np.ones(self.images.shape), self._weight(flux, light)
+        splines_of_field: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
-            weight = noise * alike
-            found = self._splines(terms, data, weight * good[:, None, None], centre, found)
-            splines = np.tensordot(terms, found, 1)
+            weight = noise * robust_weight
+            splines_of_field = self._splines(
+                terms, data, weight * good[:, None, None], centre, splines_of_field
+            )
+            splines = np.tensordot(terms, splines_of_field, 1)
             factor, centre, _ = _adjusted(
                 splines, data, weight, centre, self.axis, self.spacing, CENTRE_STEPS
             )
-            middle = np.tensordot(terms.mean(axis=0)[None], found, 1)
+            middle = np.tensordot(terms.mean(axis=0)[None], splines_of_field, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(_drawn(middle, sides, np.zeros((1, 2)), self.spacing).sum())
-            found, flux = found / total, flux * factor * total
-            splines = np.tensordot(terms, found, 1)
-            drawn = _drawn(splines, self.axis, centre, self.spacing)
+            splines_of_field, flux = splines_of_field / total, flux * factor * total
+            splines = np.tensordot(terms, splines_of_field, 1)
+            star_images = _drawn(splines, self.axis, centre, self.spacing)
             # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
             # could change with that place against each other.
-            inside = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
-            flux, drawn = flux * inside, drawn / inside[:, None, None]
-            residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
-            noise = self._weight(flux, drawn)
+            inside = star_images[:, self.in_stamp][:, :, self.in_stamp].sum(axis=(1, 2))
+            flux, star_images = flux * inside, star_images / inside[:, None, None]
+            residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)
+            noise = self._weight(flux, star_images)
             square = residual**2 * noise
-            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.seen.sum(axis=(1, 2)), 1)
-            alike = 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
+            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.measured.sum(axis=(1, 2)), 1)
+            robust_weight = 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
-        assert found is not None
+        assert splines_of_field is not None
         self.advance(1)
-        model = FieldModel(found, low, high, self.spacing)
+        model = FieldModel(splines_of_field, low, high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
     def with_errors(self, fit: FieldFit, rng: np.random.Generator | None) -> FieldFit:
@@ -401,7 +409,7 @@ class _Alternating:
         images, tolerance, models = self.images, self.tolerance, []
         self.tolerance = TRIED_TOLERANCE
         for _ in range(4):
-            self.images = np.where(self.seen, stars + sigma * rng.normal(size=stars.shape), 0.0)
+            self.images = np.where(self.measured, stars + sigma * rng.normal(size=stars.shape), 0.0)
             models.append(self.fit(fit.model.order).model)
         self.images, self.tolerance = images, tolerance
         unknown = excess_scatter(*light)
@@ -421,54 +429,68 @@ class _Alternating:
         return float(np.exp(np.concatenate(errors).mean()))
 
     def _left_out(self, fit: FieldFit) -> Iterator[LeftOut]:
-        """Stars of one fold after the other, as the others predict them; some folds of many stars.
+        """Yield the stars of one fold after the other, as the others predict them.
+
+        Of many stars, some folds are enough.
 
         Splines are fitted without them, to the fluxes and centres of the fit.
         """
         terms = fit.model.terms(self.place)
         data = self.images / fit.flux[:, None, None]
-        drawn = fit.model.images(terms, fit.centre, len(self.axis))
-        weight, noise = self._weight(fit.flux, drawn), self._variance(fit.flux, drawn)
+        star_images = fit.model.images(terms, fit.centre, len(self.axis))
+        weight, noise = self._weight(fit.flux, star_images), self._variance(fit.flux, star_images)
         weight /= 1.0 + fit.residual**2 * weight / UNLIKE_SIGMA**2
         fold, judged_stars = np.arange(len(terms)) % FOLDS, 0
-        inner = self.inner
-        box = np.ix_(range(len(terms)), inner, inner)
+        in_stamp = self.in_stamp
+        box = np.ix_(range(len(terms)), in_stamp, in_stamp)
         for left_out in range(FOLDS):
             used = weight * ((fold != left_out) & fit.good)[:, None, None]
-            found = self._splines(terms, data, used, fit.centre, fit.model.coefficients)
+            coefficients = self._splines(terms, data, used, fit.centre, fit.model.coefficients)
             judged = np.flatnonzero((fold == left_out) & fit.good)
             if not len(judged):
                 continue
-            images, even = data[box][judged], self.seen[box][judged].astype(float)
-            splines = np.tensordot(terms[judged], found, 1)
-            parts = splines, images, even, fit.centre[judged], self.axis[inner], self.spacing
-            flux, centre, left = _adjusted(*parts, LEFT_OUT_STEPS, sky=True)
+            images, is_measured = data[box][judged], self.measured[box][judged].astype(float)
+            splines = np.tensordot(terms[judged], coefficients, 1)
+            parts = (
+                splines,
+                images,
+                is_measured,
+                fit.centre[judged],
+                self.axis[in_stamp],
+                self.spacing,
+            )
+            flux, centre, residual = _adjusted(*parts, LEFT_OUT_STEPS, sky=True)
             # The sky b of weighted least squares with the design D of flux, row, column and sky is
             # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
             # median around the star which was subtracted from them.
-            design = _design(splines, centre, self.axis[inner], self.spacing, sky=True)
+            design = _design(splines, centre, self.axis[in_stamp], self.spacing, sky=True)
             turned = design * weight[box][judged].reshape(len(judged), 1, -1)
             influence = np.linalg.solve(turned @ design.transpose(0, 2, 1), turned)[:, 3]
             level = (influence * images.reshape(len(judged), -1)).sum(axis=1)
             variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
             variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
-            light = inner.sum() ** 2 / flux * [level, np.sqrt(variance)]
-            yield LeftOut(found, light, left, even * np.maximum(drawn[box][judged], 0.0))
+            light = in_stamp.sum() ** 2 / flux * [level, np.sqrt(variance)]
+            yield LeftOut(
+                coefficients,
+                light,
+                residual,
+                is_measured * np.maximum(star_images[box][judged], 0.0),
+            )
             judged_stars += len(judged)
             if judged_stars >= ENOUGH_STARS:
                 break
 
     def _weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen.
+        """Return 1/variance of pixels of flux 1, with errors of the model; 0 where not measured.
 
         `light` is that expected of stars of flux 1, of each (n, s, s) or of all (s, s).
         """
         of_model = MODEL_ERROR * np.maximum(light, 0.0)
         variance = self._variance(flux, light) + of_model**2 + LEAST_ERROR**2
-        return np.where(self.seen, 1.0 / variance, 0.0)
+        return np.where(self.measured, 1.0 / variance, 0.0)
 
     def _variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Variance of the pixels of flux 1 by the sky and the star's photons."""
+        """Return the variance of pixels of stars of flux 1 by the sky and the star's photons."""
         factor = 1.0 / flux[:, None, None]
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
         return np.asarray((noise * factor) ** 2 + np.maximum(light, 0.0) * factor / photons)
@@ -482,27 +504,29 @@ class _Alternating:
         rows: np.ndarray,
         columns: np.ndarray,
     ) -> np.ndarray:
-        """Splines of another exposure, stretched and blurred as its stars (n, s, s) show it.
+        """Return splines of another exposure, stretched and blurred as its stars (n, s, s) show it.
 
         Their fluxes may be wrong: what is proportional to a star says nothing of its shape.
         """
 
-        def seen(splines: np.ndarray) -> np.ndarray:
+        def in_sigma(splines: np.ndarray) -> np.ndarray:
             image = rows @ np.tensordot(terms, splines, 1) @ columns
             return np.asarray((image * np.sqrt(weight)).reshape(len(terms), -1))
 
-        left = (np.sqrt(weight) * data).reshape(len(terms), -1)
-        found = prior.coefficients
+        scaled_data = (np.sqrt(weight) * data).reshape(len(terms), -1)
+        coefficients = prior.coefficients
         for _ in range(DEFORMATION_STEPS):
-            changes, star = _deformations(found, prior.spacing), seen(found)
+            changes, star = _deformations(coefficients, prior.spacing), in_sigma(coefficients)
             star /= np.linalg.norm(star, axis=1, keepdims=True)
-            shapes = np.stack([*map(seen, changes), left])
+            shapes = np.stack([*map(in_sigma, changes), scaled_data])
             shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
             shapes = shapes.reshape(len(shapes), -1)
             products = shapes @ shapes.T
             normal = products[:-1, :-1] + np.eye(len(changes)) / LARGEST_DEFORMATION**2
-            found = found + np.tensordot(np.linalg.solve(normal, products[:-1, -1]), changes, 1)
-        return np.asarray(found)
+            coefficients = coefficients + np.tensordot(
+                np.linalg.solve(normal, products[:-1, -1]), changes, 1
+            )
+        return np.asarray(coefficients)
 
     def _splines(
         self,
@@ -526,16 +550,17 @@ class _Alternating:
         penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
-        ridge, known = np.full(shape, RIDGE), np.zeros(shape)
+        ridge, prior_coefficients = np.full(shape, RIDGE), np.zeros(shape)
         if self.prior is not None:
-            known = self._deformed(self.prior, terms, data, weight, rows, columns_t)
-            ridge[:] = 1.0 / (self.change * np.abs(known[0]) + LEAST_CHANGE) ** 2
+            prior_coefficients = self._deformed(self.prior, terms, data, weight, rows, columns_t)
+            ridge[:] = 1.0 / (self.change * np.abs(prior_coefficients[0]) + LEAST_CHANGE) ** 2
             ridge[1:] /= HIGHER_CHANGE**2
-            data = data - rows @ np.tensordot(terms, known, 1) @ columns_t
+            data = data - rows @ np.tensordot(terms, prior_coefficients, 1) @ columns_t
         elif start is not None:
             ridge[1:] = 1.0 / (CHANGE * np.abs(start[0]) + LEAST_CHANGE) ** 2
 
-        # The gradients stop at a part of 1e-4: single precision is enough for their products.
+        # Normal equations (Σ tᵀ w t + penalty) c = Σ tᵀ w d, solved by conjugate gradients. The
+        # gradients stop at a part of 1e-4: single precision is enough for their products.
         single = (terms, data, weight, rows, columns)
         terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
         rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
@@ -548,11 +573,11 @@ class _Alternating:
             smooth = penalty * (self.bend @ c + c @ self.bend) + ridge * c
             return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
 
-        wanted = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
+        projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
         # Terms of a knot are solved for together: they are far from orthogonal.
-        seen = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
+        curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
         pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
-        blocks = (seen.T @ pairs).reshape(-1, shape[0], shape[0])
+        blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
         blocks += (
             np.eye(shape[0]) * (6 * penalty.ravel() + ridge.reshape(shape[0], -1).T)[:, None, :]
         )
@@ -561,15 +586,15 @@ class _Alternating:
         def nearly(flat: np.ndarray) -> np.ndarray:
             return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
 
-        found, _ = cg(
+        change, _ = cg(
             LinearOperator(size, matvec=normal, dtype=float),
-            (terms.T @ wanted).ravel(),
-            None if start is None else (start - known).ravel(),
+            (terms.T @ projection).ravel(),
+            None if start is None else (start - prior_coefficients).ravel(),
             rtol=self.tolerance,
             maxiter=ITERATIONS,
             M=LinearOperator(size, matvec=nearly, dtype=float),
         )
-        return np.asarray(found).reshape(shape) + known
+        return np.asarray(change).reshape(shape) + prior_coefficients
 
 
 def knots_of(frame_px: int, spacing: float) -> int:
@@ -583,7 +608,7 @@ def spacing_of(frame_px: int, knots: int) -> float:
 
 
 def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
-    """Changes of splines (K, N, N) by stretching and by blurring them, along three axes each.
+    """Return changes of splines (K, N, N) by stretching and blurring them, along three axes each.
 
     Shape (6, K, N, N): a change of one is that of r → r (1 − a), or of a² added to the variance.
     """
@@ -591,8 +616,10 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
 
     def slope(values: np.ndarray, axis: int) -> np.ndarray:
         """Return the slope of a polynomial through five knots."""
-        near, far = (np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2))
-        return np.asarray((8.0 * near - far) / (12.0 * spacing))
+        one_apart, two_apart = (
+            np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2)
+        )
+        return np.asarray((8.0 * one_apart - two_apart) / (12.0 * spacing))
 
     along_y, along_x = (slope(coefficients, axis) for axis in (1, 2))
     yy, xy, xx = slope(along_y, 1), slope(along_y, 2), slope(along_x, 2)
@@ -602,7 +629,7 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
-    """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
+    """Return monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
 
     Powers of other coordinates whose range has two ends are the last terms. What is not known is
     taken for the middle of its range.
@@ -610,16 +637,16 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     width = np.where(high > low, high - low, 1.0)
     scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
     scaled = np.nan_to_num(scaled)
-    x, y, *more = scaled.T
+    x, y, *star_columns = scaled.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
     terms = [x**a * y**b for a, b in powers]
-    counted = (column for column, ends in zip(more, (high > low)[2:], strict=True) if ends)
+    counted = (column for column, ends in zip(star_columns, (high > low)[2:], strict=True) if ends)
     terms += [column**power for column in counted for power in range(1, STAR_TERMS + 1)]
     return np.stack(terms, axis=1)
 
 
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:
-    """Images (n, m, m) on an axis (m,) of coefficients (n, N, N), moved to centres (n, 2)."""
+    """Return images (n, m, m) on an axis (m,) of coefficients (n, N, N) with centres (n, 2)."""
     rows, columns = (
         cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
@@ -636,39 +663,46 @@ def _adjusted(
     steps: int,
     sky: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flux, centre (n, 2) and, if asked for, sky of stars, and residuals over the flux."""
+    """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps.
 
+    Returns
+    -------
+    flux : ndarray, shape (n,)
+    centre : ndarray, shape (n, 2)
+    residual : ndarray, shape (n, s, s)
+        In units of the flux.
+    """
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
         design = _design(splines, centre, axis, spacing, sky)
-        left = design * weight.reshape(count, 1, -1)
-        found = np.linalg.solve(left @ design.transpose(0, 2, 1), left @ flat)[..., 0]
-        flux = found[:, 0]
-        move = np.clip(found[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
+        weighted = design * weight.reshape(count, 1, -1)
+        parameters = np.linalg.solve(weighted @ design.transpose(0, 2, 1), weighted @ flat)[..., 0]
+        flux = parameters[:, 0]
+        move = np.clip(parameters[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
         centre = np.clip(centre + move, -FARTHEST_PX, FARTHEST_PX)
-    level = found[:, 3, None, None] if sky else 0.0
-    drawn = _drawn(splines, axis, centre, spacing)
-    return flux, centre, (data - level) / flux[:, None, None] - drawn
+    level = parameters[:, 3, None, None] if sky else 0.0
+    star_images = _drawn(splines, axis, centre, spacing)
+    return flux, centre, (data - level) / flux[:, None, None] - star_images
 
 
 def _design(
     splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
 ) -> np.ndarray:
-    """Change of images (n, 3 or 4, P) with flux, row, column of the centre and, if asked, sky."""
+    """Return the change of images (n, 3 or 4, P) with flux, row, column and, if asked, sky."""
     # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
     # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
     place, knots = axis - centre[..., None], splines.shape[-1]
     rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
     down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
     along = splines @ columns.transpose(0, 2, 1)
-    moved = rows @ splines @ across.transpose(0, 2, 1)
-    parts = [rows @ along, -down @ along, -moved]
-    parts += [np.ones_like(moved)] * sky
+    image_across = rows @ splines @ across.transpose(0, 2, 1)
+    parts = [rows @ along, -down @ along, -image_across]
+    parts += [np.ones_like(image_across)] * sky
     return np.stack(parts, axis=1).reshape(len(centre), len(parts), -1)
 
 
 def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
-    """Scatter τ of values (n,) about 0 beyond their errors σ (n,), the likeliest one.
+    """Return the likeliest scatter τ of values (n,) about 0 beyond their errors σ (n,).
 
     Σ (e²/(σ² + τ²) − 1) / (σ² + τ²) = 0 with e² ≤ 9 (σ² + τ²), for outliers; 0 of fewer than five.
     """
@@ -680,5 +714,5 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
 
     if len(values) < 5 or slope(0.0) <= 0:
         return 0.0
-    most = 3.0 * float(np.abs(values).max())
-    return float(brentq(slope, 0.0, most))
+    upper_end = 3.0 * float(np.abs(values).max())
+    return float(brentq(slope, 0.0, upper_end))

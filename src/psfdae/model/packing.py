@@ -69,11 +69,11 @@ from psfdae.version import __version__
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
 COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
-WIDE = 0.95  # part of them within ± `error68` times `ratio95`
+COVERAGE95 = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
 CASES = 3  # of what is known of stars: their flux and sky, their sky, or neither
 HIDDEN = 0.25  # of a pixel's RMS error, which its `error68` has at least
-NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
+NORMAL_RATIO95 = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
 FEW_STARS = 250  # noisy images per node, at least; fewer test stars are seen several times
@@ -102,7 +102,7 @@ class HeldOutStars:
     def of(
         cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
     ) -> HeldOutStars:
-        """Some stars of a product "stars", by their indices."""
+        """Return some stars of a product "stars", by their indices."""
         truth = stars[reference]
         doubts = own_noise(stars, truth, noise.background)
         arrays = (stars["realisation"], truth, field_positions(stars), *doubts)
@@ -110,7 +110,7 @@ class HeldOutStars:
         return cls(images, references, noise, position, *of_test)
 
     def errors(self, psf: np.ndarray, star: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Moduli of the errors of PSFs of some stars, less the stars' own noise, at least 0.
+        """Return moduli of the errors of PSFs of some stars, less the stars' own noise, at least 0.
 
         Quantiles above the own noise are those of errors to noise-free stars; means are larger.
         """
@@ -128,10 +128,12 @@ class Errors:
     distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
     outlier_score: np.ndarray | None = None  # (S, N), if the method has one
 
-    def of(self, chosen: np.ndarray) -> Errors:
-        """Errors of a part of the stars, by a mask over stars."""
-        kept = chosen[self.star]
-        return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
+    def of(self, is_selected: np.ndarray) -> Errors:
+        """Return the errors of some of the stars, by a mask over stars."""
+        selected = is_selected[self.star]
+        return Errors(
+            self.nodes, self.error[:, selected], self.star[selected], self.distance[:, selected]
+        )
 
     @cached_property
     def half_width(self) -> np.ndarray:
@@ -146,10 +148,10 @@ class Errors:
     def ratio95(self) -> np.ndarray:
         """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
         scaled = np.abs(self.error) / np.maximum(self.half_width, LEAST_SIGMA)[:, None]
-        return np.array([np.quantile(node, WIDE) for node in scaled], np.float64)
+        return np.array([np.quantile(node, COVERAGE95) for node in scaled], np.float64)
 
     def rms(self) -> np.ndarray:
-        """Root mean square per pixel, shape (S, d, d)."""
+        """Return the root mean square per pixel, shape (S, d, d)."""
         return np.asarray(np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error])))
 
     def strange_limit(self) -> np.ndarray | None:
@@ -161,19 +163,19 @@ class Errors:
         """
         if self.outlier_score is None:
             return None
-        least = np.square(self._of_few(np.sqrt(np.maximum(self.outlier_score, 0.0))))
-        usual = np.median(self.outlier_score, axis=1)
-        spread = np.median(np.abs(self.outlier_score - usual[:, None]), axis=1)
-        excess = (self.outlier_score - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
-        return np.asarray(np.maximum(usual + spread * np.quantile(excess, LIMIT), least))
+        few_star_limit = np.square(self._of_few(np.sqrt(np.maximum(self.outlier_score, 0.0))))
+        median = np.median(self.outlier_score, axis=1)
+        spread = np.median(np.abs(self.outlier_score - median[:, None]), axis=1)
+        excess = (self.outlier_score - median[:, None]) / np.maximum(spread, 1e-12)[:, None]
+        return np.asarray(np.maximum(median + spread * np.quantile(excess, LIMIT), few_star_limit))
 
     def distance_limit(self) -> float:
-        """Distance that 0.1 % of the stars of all nodes exceed; as high as few stars ask for."""
-        found = float(np.quantile(self.distance, LIMIT))
-        return max(found, float(self._of_few(self.distance).max()))
+        """Return the distance that 0.1 % of the stars exceed; as high as few stars ask for."""
+        quantile = float(np.quantile(self.distance, LIMIT))
+        return max(quantile, float(self._of_few(self.distance).max()))
 
     def _of_few(self, distance: np.ndarray) -> np.ndarray:
-        """Limit (S,) of normal distances (S, N) that knows how few stars it rests on.
+        """Return the limit (S,) of normal distances (S, N) that knows how few stars it rests on.
 
         0 for a hundred or more, whose own quantile says it.
         """
@@ -238,9 +240,11 @@ def without_errors(
     licence: str,
     largest_mb: float | None = None,
 ) -> Bundle:
-    """A fit with all that it takes to apply it, but for its errors; raises as `model_of`."""
+    """Return a fit with all that it takes to apply it, but its errors; raises as `model_of`."""
     band, stamp_px = facts.held_out.noise.kappa * facts.levels, facts.info["stamp_px"]
-    arrays, said = packed(fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf))
+    arrays, packed_fields = packed(
+        fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf)
+    )
     info = BundleInfo(
         psfdae_version=__version__,
         name=name,
@@ -248,12 +252,14 @@ def without_errors(
         created=creation_date(),
         metrics=[],
         **facts.info,
-        **(said or {"method": fitted.name, "reference": reference}),
+        **(packed_fields or {"method": fitted.name, "reference": reference}),
     )
     nodes = noise_nodes(band)
     nothing = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
-    made = Bundle(info, arrays, facts.flux_model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
-    return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
+    bundle = Bundle(
+        info, arrays, facts.flux_model, nodes, nothing, nothing, np.ones(nodes.size), 0.0
+    )
+    return with_misfit(bundle, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
 
 
 def model_of(
@@ -266,7 +272,7 @@ def model_of(
     licence: str,
     largest_mb: float | None = None,
 ) -> PsfModel:
-    """The model of a fit, with its errors on test stars and all that it takes to apply it.
+    """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
 
     Parameters
     ----------
@@ -286,16 +292,16 @@ def model_of(
         If it cannot be that small.
     """
     facts = StarFacts.of(stars, reference, config, trained)
-    made = without_errors(fitted, facts, reference, name, licence, largest_mb)
+    bundle = without_errors(fitted, facts, reference, name, licence, largest_mb)
     held_out = facts.held_out
-    unpacked = estimator(made)  # what it errs as packed
+    unpacked = estimator(bundle)  # what it errs as packed
     if isinstance(fitted, DrawsStars):
-        made = with_model_errors(PsfModel(made, unpacked), fitted, config.seed)
-    made, errors = calibrated(made, unpacked, held_out, config.seed)
-    if of_image(stars) and made.strange_limit is not None:
+        bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
+    bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
+    if of_image(stars) and bundle.strange_limit is not None:
         train = np.unique(stars["field_index"][split_stars(stars, trained["split"], config).train])
         bright = BrightStars.of_product(stars).of(train)
-        made = with_training_stars(PsfModel(made, unpacked), bright)
+        bundle = with_training_stars(PsfModel(bundle, unpacked), bright)
     test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
@@ -303,16 +309,16 @@ def model_of(
         lambda level: noisy_test_images(config, stars, test, level),
         lambda noisy, level: unpacked.estimate(noisy, level, held_out.position),
         errors,
-        made.info.noise_equivalent_px,
+        bundle.info.noise_equivalent_px,
         config.evaluation.data_range,
     )
-    said = {**made.info.config, "evaluation": config.evaluation.model_dump()}
-    info = made.info.model_copy(update={"metrics": metrics, "config": said})
-    return PsfModel(replace(made, info=info), unpacked)
+    settings = {**bundle.info.config, "evaluation": config.evaluation.model_dump()}
+    info = bundle.info.model_copy(update={"metrics": metrics, "config": settings})
+    return PsfModel(replace(bundle, info=info), unpacked)
 
 
 def _trained_on(product: Product, train: np.ndarray) -> int:
-    """Stars of the training; those of an image are in several of its images each."""
+    """Return the number of training stars; each star of an image is in several of its images."""
     return len(np.unique(product["field_index"][train])) if of_image(product) else len(train)
 
 
@@ -347,24 +353,24 @@ def packed(
     BundleError
         If it takes more than the largest number of bytes in any case.
     """
-    tried = np.geomspace(noise, max(1.0, noise), STEPS)
+    noises = np.geomspace(noise, max(1.0, noise), STEPS)
 
     @cache
-    def made(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        return fitted.pack(stamp_px, float(tried[step]))
+    def arrays_of(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return fitted.pack(stamp_px, float(noises[step]))
 
-    def small(step: int) -> bool:
-        return sum(array.nbytes for array in made(step)[0].values()) <= largest
+    def is_small(step: int) -> bool:
+        return sum(array.nbytes for array in arrays_of(step)[0].values()) <= largest
 
     # Mostly the first one will do, and each takes a while.
-    least = 0 if small(0) else bisect_left(range(STEPS), True, key=small)
-    if least == STEPS:
+    least_step = 0 if is_small(0) else bisect_left(range(STEPS), True, key=is_small)
+    if least_step == STEPS:
         raise BundleError(f"{fitted.look.label}: takes more than {largest / 1e6:.2g} MB")
-    return made(least)
+    return arrays_of(least_step)
 
 
 def noise_nodes(band: np.ndarray) -> np.ndarray:
-    """Noise at which errors are measured, ascending.
+    """Return the noise levels at which errors are measured, ascending.
 
     They reach as far as stars go without a flag: fluxes are estimates, and half of the faintest
     stars look fainter than they are.
@@ -373,22 +379,22 @@ def noise_nodes(band: np.ndarray) -> np.ndarray:
 
 
 def leading(model: FluxModel, components: int) -> FluxModel:
-    """The model with the variance beyond its leading eigenvectors spread evenly."""
+    """Return the model with the variance beyond its leading eigenvectors spread evenly."""
     variance = model.variance.copy()
-    rest = variance[: variance.size - components]
-    if rest.size:
-        rest[:] = rest.sum() / rest.size
+    trailing = variance[: variance.size - components]
+    if trailing.size:
+        trailing[:] = trailing.sum() / trailing.size
     return replace(model, variance=variance)
 
 
 def reach(band: np.ndarray, area: float) -> dict[str, float]:
-    """Range of noise and S/N of a training, from its noise levels σ and its stars' area A in px."""
-    least, most = float(band.min()), float(band.max())
+    """Return the range of noise and S/N of a training from its noise levels and its stars' area."""
+    least_noise, greatest_noise = float(band.min()), float(band.max())
     return {
-        "noise_min": least,
-        "noise_max": most,
-        "snr_min": signal_to_noise(most, area),
-        "snr_max": signal_to_noise(least, area),
+        "noise_min": least_noise,
+        "noise_max": greatest_noise,
+        "snr_min": signal_to_noise(greatest_noise, area),
+        "snr_max": signal_to_noise(least_noise, area),
         "noise_equivalent_px": area,
     }
 
@@ -400,23 +406,23 @@ def measure_errors(
     nodes: np.ndarray,
     rng: np.random.Generator,
 ) -> Errors:
-    """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
+    """Measure errors and distances of noisy test stars at nodes (S,), pixel RMS over the flux."""
     # Each star at each node of the noise; all are restored together.
-    drawn = [_noisy(stars, node, rng) for node in nodes]
-    noisy, star = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
-    noise = np.repeat(nodes, len(drawn[0][1]))
+    draws = [_noisy(stars, node, rng) for node in nodes]
+    noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
+    noise = np.repeat(nodes, len(draws[0][1]))
     level = noise / stars.noise.kappa
     estimate = fitted.estimate(noisy, level, stars.position[star])
-    score, free = estimate.outlier_score, with_free_flux(fitted)
-    if score is None and isinstance(free, ScoresOutliers):
-        score = free.outlier_score(noisy, level)
+    score, free_flux = estimate.outlier_score, with_free_flux(fitted)
+    if score is None and isinstance(free_flux, ScoresOutliers):
+        score = free_flux.outlier_score(noisy, level)
     error = errors_of(estimate, stars, star).astype(np.float32)
     distance = mahalanobis(noisy, noise, model, COMPONENTS)
     shape = len(nodes), -1
     return Errors(
         nodes,
         error.reshape(*shape, *stars.images.shape[1:]),
-        drawn[0][1],
+        draws[0][1],
         distance.reshape(shape),
         None if score is None else score.reshape(shape),
     )
@@ -425,7 +431,7 @@ def measure_errors(
 def errors_of(
     estimate: Estimate, stars: HeldOutStars, star: np.ndarray | slice = slice(None)
 ) -> np.ndarray:
-    """Moduli of errors (n, d, d), in units of σ if the method says it, else of the flux."""
+    """Return moduli of errors (n, d, d), in units of σ if the method says it, else of the flux."""
     error = stars.errors(estimate.psf, star)
     return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
 
@@ -433,10 +439,10 @@ def errors_of(
 def calibrated(
     bundle: Bundle, fitted: Method, stars: HeldOutStars, seed: int
 ) -> tuple[Bundle, Errors]:
-    """The bundle of a method with all that these stars say of its errors, and these errors."""
+    """Return the bundle with all that test stars say of its errors, and these errors."""
     rng = stream(seed, "noise", "calibration", "errors")
     errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
-    found = replace(
+    uncalibrated = replace(
         bundle,
         error68=errors.half_width,
         rms=errors.rms(),
@@ -448,11 +454,11 @@ def calibrated(
         flux_error_scale=None,
     )
     rng = stream(seed, "noise", "calibration", "scales")
-    return with_scales(PsfModel(found, fitted), stars, rng), errors
+    return with_scales(PsfModel(uncalibrated, fitted), stars, rng), errors
 
 
 def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle of a model with what flux, sky and brightness do to its errors.
+    """Return the bundle of a model with what flux, sky and brightness do to its errors.
 
     No training must have seen the stars: where noise is far below the errors that a method makes
     on other stars, those on its own do not tell.
@@ -469,36 +475,36 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
         case, image = np.divmod(np.arange(0, CASES * len(star), every), len(star))
         estimated = np.repeat(kinds, len(case))
         case, image = np.tile(case, len(kinds)), np.tile(image, len(kinds))
-        found = model.predict(
+        prediction = model.predict(
             noisy[image],
             flux=np.where(case == 0, 1.0, np.nan),
             background=np.where(case <= 1, 0.0, np.nan),
             noise=np.where(estimated, np.nan, node),
             position=stars.position[star[image]],
         )
-        finite = np.isfinite(found.psf).all(axis=(1, 2))
-        error = stars.errors(found.psf, star[image])
-        error /= np.maximum(found.uncertainty, LEAST_SIGMA)
-        bright = brightest(found.psf)
+        finite = np.isfinite(prediction.psf).all(axis=(1, 2))
+        error = stars.errors(prediction.psf, star[image])
+        error /= np.maximum(prediction.uncertainty, LEAST_SIGMA)
+        bright = brightest(prediction.psf)
         for index in np.ndindex(shape):
             usable = finite & (estimated == index[0]) & (case == index[1])
             if not usable.any():
                 continue
-            noise[*index, place] = np.median((found.noise / found.flux)[usable])
+            noise[*index, place] = np.median((prediction.noise / prediction.flux)[usable])
             # 95 % of errors are within no less than 68 % are, though a star alone has no errors.
-            wide = error[usable] / np.maximum(found.ratio95, 1.0)[usable, None, None]
+            over_ratio = error[usable] / np.maximum(prediction.ratio95, 1.0)[usable, None, None]
             for pixels, kind in ((~bright[usable], 0), (bright[usable], 1)):
                 width[0, *index, kind, place] = np.quantile(error[usable][pixels], COVERAGE)
-                width[1, *index, kind, place] = np.quantile(wide[pixels], WIDE)
+                width[1, *index, kind, place] = np.quantile(over_ratio[pixels], COVERAGE95)
             if index == (1, CASES - 1) and not measures:
-                doubt = np.hypot(found.flux_error, stars.flux_error[star[image]])[usable]
-                off = np.abs(found.flux - 1.0)[usable] / doubt
-                of_flux[place] = np.quantile(off, WIDE) / NORMAL_WIDE
+                doubt = np.hypot(prediction.flux_error, stars.flux_error[star[image]])[usable]
+                off = np.abs(prediction.flux - 1.0)[usable] / doubt
+                of_flux[place] = np.quantile(off, COVERAGE95) / NORMAL_RATIO95
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
     for index in np.ndindex(width.shape[:-1]):
-        _, *known, _ = index
-        width[index] = np.interp(nodes, noise[tuple(known)], width[index])
+        _, *case_index, _ = index
+        width[index] = np.interp(nodes, noise[tuple(case_index)], width[index])
     if measures:
         width[:, 0] = width[:, 1]
     scale68, scale95 = np.moveaxis(width, -1, 1)
@@ -511,7 +517,7 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
 
 
 def with_training_stars(model: PsfModel, stars: BrightStars) -> Bundle:
-    """The bundle of a model with a limit of outliers that its own training stars are not beyond.
+    """Return the bundle of a model with a limit of outliers that training stars are not beyond.
 
     The noise of a training star is in the axes of the training, along which a star of the same
     noise is an outlier by as much as there are few of them. Training stars have less noise than the
@@ -520,22 +526,24 @@ def with_training_stars(model: PsfModel, stars: BrightStars) -> Bundle:
     bundle = model.bundle
     if bundle.strange_limit is None or not len(stars):
         return bundle
-    images, seen = stars.framed(bundle.info.stamp_px)
-    images = np.where(seen, images, 0.0) / stars.flux[:, None, None]
+    images, is_measured = stars.framed(bundle.info.stamp_px)
+    images = np.where(is_measured, images, 0.0) / stars.flux[:, None, None]
     noise = stars.noise / stars.flux
-    found = model.predict(images, noise=noise, background=0.0, position=stars.place)
-    score = found.outlier_score[np.isfinite(found.outlier_score)]
+    prediction = model.predict(images, noise=noise, background=0.0, position=stars.place)
+    score = prediction.outlier_score[np.isfinite(prediction.outlier_score)]
     limit = bundle.strange_limit.copy()
     if score.size:
         # All but 1 % of them, which may be unlike the others, and a margin for other pixels.
         limit[0] = max(limit[0], 1.1 * float(np.quantile(score, 0.99)))
-    distance = found.distance[np.isfinite(found.distance)]
-    far = 1.1 * float(np.quantile(distance, 0.99)) if distance.size else 0.0
-    return replace(bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, far))
+    distance = prediction.distance[np.isfinite(prediction.distance)]
+    distance_limit = 1.1 * float(np.quantile(distance, 0.99)) if distance.size else 0.0
+    return replace(
+        bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, distance_limit)
+    )
 
 
 def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
-    """The bundle of a model with the errors of measured stars that the model makes.
+    """Return the bundle of a model with the errors of measured stars that the model makes.
 
     Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
     stated errors lack is the model's.
@@ -545,38 +553,42 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
     noise = 1.0 / (2000.0 * np.sqrt(bundle.info.noise_equivalent_px))
     images, position, centre = fitted.draw_stars(FEW_STARS, rng)
     noisy = images + noise * rng.normal(size=images.shape)
-    found = model.predict(noisy, position=position)
-    usable = (found.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
+    prediction = model.predict(noisy, position=position)
+    usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
     centre = centre + images.shape[-1] // 2
 
     def lacking(off: np.ndarray, stated: np.ndarray) -> float:
         """√(e² − stated²) for the e within which 68 % of normal errors are, or 95 % within 1.96."""
         ratio = np.abs(off) / stated
-        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, WIDE) / NORMAL_WIDE)
+        scale = 0.5 * (
+            np.quantile(ratio, COVERAGE) + np.quantile(ratio, COVERAGE95) / NORMAL_RATIO95
+        )
         return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
-    flux = lacking((found.flux - 1.0)[usable], found.flux_error[usable])
+    flux = lacking((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
-    sky = lacking(found.background[usable], found.background_error[usable])
+    sky = lacking(prediction.background[usable], prediction.background_error[usable])
     sky = max(sky, flux / images[0].size)
-    off = np.concatenate([found.y_fit - centre[:, 0], found.x_fit - centre[:, 1]])
-    stated = np.concatenate([found.y_error, found.x_error])
-    both = np.concatenate([usable, usable])
-    errors = ModelErrors(flux, sky, lacking(off[both], stated[both]), fitted.fitted_flux_error())
+    off = np.concatenate([prediction.y_fit - centre[:, 0], prediction.x_fit - centre[:, 1]])
+    stated = np.concatenate([prediction.y_error, prediction.x_error])
+    usable_centres = np.concatenate([usable, usable])
+    errors = ModelErrors(
+        flux, sky, lacking(off[usable_centres], stated[usable_centres]), fitted.fitted_flux_error()
+    )
     info = bundle.info
-    said = info.config | {"model_errors": errors._asdict()}
-    return replace(bundle, info=info.model_copy(update={"config": said}))
+    settings = info.config | {"model_errors": errors._asdict()}
+    return replace(bundle, info=info.model_copy(update={"config": settings}))
 
 
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
-    """The bundle of a field model with the light of stars beyond their stamps."""
+    """Return the bundle of a field model with the light of stars beyond their stamps."""
     info = bundle.info
-    said = info.config | {"wings": wings.plain()}
-    return replace(bundle, info=info.model_copy(update={"config": said}))
+    settings = info.config | {"wings": wings.plain()}
+    return replace(bundle, info=info.model_copy(update={"config": settings}))
 
 
 def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with the noise over the flux with which its method finds that of bright stars.
+    """Return the bundle with the noise over the flux with which bright stars are measured best.
 
     What the method does not know of a star's shape would pass for flux, if there is little noise
     beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
@@ -584,22 +596,22 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     if not issubclass(method(bundle.info.method), FindsFlux):
         return bundle
     nodes, errors = bundle.noise_nodes, []
-    some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
-    few = replace(stars, **some)
-    noisy = [_noisy(few, node, rng) for node in nodes[: len(nodes) // 2]]
-    tried = (0.0, *nodes)
-    for value in tried:
+    names = ("images", "references", "position")
+    test_stars = replace(stars, **{name: getattr(stars, name)[:FEW_STARS] for name in names})
+    noisy = [_noisy(test_stars, node, rng) for node in nodes[: len(nodes) // 2]]
+    noises = (0.0, *nodes)
+    for value in noises:
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
-        found = [(model.predict(images), stars.references[star]) for images, star in noisy]
+        restored = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [
             np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
-            for t, truth in found
+            for t, truth in restored
         ]
         errors.append(float(np.mean(logs)))
         if errors[-1] > min(errors):
             break
-    best = float(tried[int(np.argmin(errors))])
-    return replace(bundle, info=bundle.info.model_copy(update={"misfit": best}))
+    best_noise = float(noises[int(np.argmin(errors))])
+    return replace(bundle, info=bundle.info.model_copy(update={"misfit": best_noise}))
 
 
 def _noisy(
@@ -619,7 +631,7 @@ def measure_levels(
     area: float,
     data_range: float,
 ) -> list[dict[str, float]]:
-    """Mean errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
+    """Measure errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
 
     `draw` gives noisy images of all test stars at a λ; `area` is the noise-equivalent one
     in pixels, `data_range` that of `psfdae.metrics.all_metrics`.
@@ -646,25 +658,29 @@ def measure_levels(
 
 
 def coverage(error: np.ndarray, noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> float:
-    """Part of the errors (n, d, d) within ± the map at the noise of each star (n,)."""
+    """Return the part of the errors (n, d, d) within ± the map at the noise of each star (n,)."""
     return float((np.abs(error) <= at_noise(noise, nodes, maps)).mean())
 
 
 def crossed_maps(errors: Errors, count: int) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Either half of so many stars, bool (count,), with maps of errors (S, d, d) of the other half.
+    """Return either half of so many stars, bool (count,), with maps (S, d, d) of the other half.
 
     They are named by what they are to cover: `coverage68` the half-width, `coverage95` the wider
     one and `coverage_rms` the root mean square.
     """
-    even = np.arange(count) % 2 == 0
-    found = []
-    for half in (even, ~even) if count > 1 else ():
-        other = errors.of(~half)
-        half_width = other.half_width
-        wide = (half_width * other.ratio95()[:, None, None]).astype(half_width.dtype)
-        maps = {"coverage68": half_width, "coverage95": wide, "coverage_rms": other.rms()}
-        found.append((half, maps))
-    return found
+    is_even = np.arange(count) % 2 == 0
+    halves = []
+    for half in (is_even, ~is_even) if count > 1 else ():
+        other_half = errors.of(~half)
+        half_width = other_half.half_width
+        half_width95 = (half_width * other_half.ratio95()[:, None, None]).astype(half_width.dtype)
+        maps = {
+            "coverage68": half_width,
+            "coverage95": half_width95,
+            "coverage_rms": other_half.rms(),
+        }
+        halves.append((half, maps))
+    return halves
 
 
 def crossed_coverage(
@@ -673,20 +689,20 @@ def crossed_coverage(
     error: np.ndarray,
     noise: float,
 ) -> dict[str, float]:
-    """Coverage at another noise of either half of the stars by the `crossed_maps` of the other.
+    """Return the coverage of either half of the stars by the `crossed_maps` of the other half.
 
     `error` (n, d, d) holds every star once, at `noise`; the maps are those at the `nodes` (S,).
     """
-    found: dict[str, list[float]] = {}
+    parts: dict[str, list[float]] = {}
     for half, of in halves:
         level = np.full(int(half.sum()), noise)
         for name, maps in of.items():
-            found.setdefault(name, []).append(coverage(error[half], level, nodes, maps))
-    return {name: float(np.mean(values)) for name, values in found.items()}
+            parts.setdefault(name, []).append(coverage(error[half], level, nodes, maps))
+    return {name: float(np.mean(values)) for name, values in parts.items()}
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:
-    """SHA-256 of training stars and of what was to be learnt from them."""
+    """Return the SHA-256 of training stars and of what was to be learnt from them."""
     digest = hashlib.sha256()
     for array in (images, references):
         digest.update(f"{array.dtype.str} {array.shape}".encode())

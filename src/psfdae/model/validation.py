@@ -417,7 +417,7 @@ class Report:
         selection = stars.candidates.columns(stars.held_out)
         # Eight held-out stars, evenly over the field, show their residuals.
         held_out = np.flatnonzero(selection["part"] == "held out")
-        shown = held_out[_evenly_spread(stars.candidates.position[held_out], 8)]
+        shown = np.sort(held_out[_evenly_spread(stars.candidates.position[held_out], 8)])
         columns, psf, residuals = _predict_all(model, stars, shown)
         # Stamps without sky are the PSF plus its residual; σ is the noise of the sky.
         residual_figure = None
