@@ -47,9 +47,9 @@ def job_server():
 
 def import_stages() -> None:
     """Import what the stages need, and what their first call imports."""
-    from psfdae.cli import found
+    from psfdae.cli import command_modules
 
-    for module, _ in found().values():
+    for module, _ in command_modules().values():
         import_module(module)
     for late in ("matplotlib.pyplot", "sklearn.cluster", "sklearn.mixture", "skimage.metrics"):
         import_module(late)

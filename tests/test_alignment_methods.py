@@ -26,8 +26,8 @@ from psfdae_paper.alignment.networks import (
     MixedNoise,
     NetworkTraining,
     TrainingStates,
-    _scaled,
     predict_states,
+    scale_stamps,
     training_of,
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
@@ -86,7 +86,7 @@ def test_mirrored_states_have_the_mirrored_stamps(model, operator, states, stamp
         expected = operator(model(symmetry.states(states[:3])))[0]
         # The fit of the quadratic model to rays is symmetric to 1e-6 waves.
         assert symmetry.stamps(stamps[:3]) == pytest.approx(expected, abs=1e-5)
-        assert symmetry.state @ symmetry.state.T == pytest.approx(np.eye(4))
+        assert symmetry.state_matrix @ symmetry.state_matrix.T == pytest.approx(np.eye(4))
 
 
 # --- networks
@@ -206,12 +206,12 @@ def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, st
     draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
     for data in (TrainingStates(states, draws), TrainingStates(states, stamps, law)):
         training = training_of(network, data, settings, 1, "x")
-        scaled = _scaled(np.asarray(stamps, np.float32))
+        scaled = scale_stamps(np.asarray(stamps, np.float32))
         parts = training.parts[0].sum(axis=1)
         assert parts == pytest.approx(training.model.components(scaled).numpy(), abs=1e-3)
     many = np.repeat(np.mean(stamps, axis=0, keepdims=True), 1500, axis=0)
     errors = noise.draw(many, level, np.random.default_rng(2)) - many
-    spread = training.model.components(_scaled(errors)).numpy().std(axis=0)
+    spread = training.model.components(scale_stamps(errors)).numpy().std(axis=0)
     expected = np.sqrt(np.square(training.roots[0]).sum(axis=0))
     # A standard deviation of 1500 draws scatters by 1.8 %.
     assert spread == pytest.approx(expected, rel=0.1)

@@ -14,14 +14,14 @@ from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.mixture import FREEDOM
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
 from psfdae_paper.bounds.sampling import (
-    FIELD,
-    TRUTH,
+    Knowledge,
     Modes,
     StampModel,
+    StarPosteriors,
     climb,
-    recentred,
-    sampled_sums,
-    twins,
+    find_twins,
+    recentre,
+    sample_posterior,
 )
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 
@@ -87,38 +87,38 @@ def modes(model, stars, noise):
     none = np.zeros(4, int)
     start = Modes.at(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
-    counts = likelihood.counts(stars[2])
-    first = climb(start, counts, likelihood, model)
-    return climb(first + twins(first, likelihood, model), counts, likelihood, model)
+    posteriors = StarPosteriors(likelihood.counts(stars[2]), likelihood, model)
+    first = climb(start, posteriors)
+    return climb(first + find_twins(first, likelihood, model), posteriors)
 
 
 def sampled(model, modes, stars, noise, draws=2000):
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
     rngs = [stream(1, "test", star) for star in range(4)]
-    rounds = [draws // 4, draws // 4, draws // 2]
-    return sampled_sums(modes, stars[2], np.zeros(4, int), likelihood, model, rounds, rngs)
+    posteriors = StarPosteriors(likelihood.counts(stars[2]), likelihood, model)
+    return sample_posterior(modes, posteriors, np.zeros(4, int), draws, rngs)
 
 
 def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
-    sums = sampled(model, modes, stars, noise)
+    unknown_field, known_field = sampled(model, modes, stars, noise)
     mean, share, mean_in_field = exact
-    free, in_field = merge(sums.free), merge(sums.in_field)
+    free, in_field = merge(unknown_field.parts), merge(known_field.parts)
     error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
     assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
     assert ((in_field.mean_image - mean_in_field) ** 2).mean() < 0.01 * error
-    assert free.share / free.total[:, None, None] == pytest.approx(share, abs=0.03)
+    assert free.template_weight / free.weight_sum[:, None, None] == pytest.approx(share, abs=0.03)
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
-    assert (in_field.share[:, 1:] == 0).all()
-    assert sums.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
+    assert (in_field.template_weight[:, 1:] == 0).all()
+    assert unknown_field.with_truth.mean_image == pytest.approx(free.mean_image, abs=1e-12)
     assert ((free.effective_size > 500) & (free.effective_size < 2100)).all()
 
 
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
-    one, two = (sampled(model, modes, stars, noise, 80).free_helped for _ in range(2))
-    assert one.image.tobytes() == two.image.tobytes()
+    one, two = (sampled(model, modes, stars, noise, 80)[0].with_truth for _ in range(2))
+    assert one.image_sum.tobytes() == two.image_sum.tobytes()
     monkeypatch.setattr(sampling, "STARS_AT_ONCE", 1)
-    single = sampled(model, modes, stars, noise, 80).free_helped
+    single = sampled(model, modes, stars, noise, 80)[0].with_truth
     assert single.mean_image == pytest.approx(one.mean_image, abs=1e-6)
 
 
@@ -142,7 +142,7 @@ def test_twins_give_the_same_image(model, noise):
     assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
     none = np.zeros(1, int)
     start = Modes.at(none, none, middle, none, near)
-    others = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
+    others = find_twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
     there = (others.field == 1) & (others.offset == middle).all(axis=1)
     assert others.z[there][0] == pytest.approx(far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
@@ -158,11 +158,11 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
     images = wide.stamps(z, 2 * number, middle)
     likelihood = Likelihood.of(noise, 1e-4, images)
     start = Modes.at(number, 2 * number, middle, 0 * number, z)
-    modes = climb(start, likelihood.counts(images), likelihood, wide)
+    modes = climb(start, StarPosteriors(likelihood.counts(images), likelihood, wide))
     for first in range(2):
         evidence = np.where(number == first, 100.0, 99.0)
         both = replace(modes, star=0 * number, evidence=evidence)
-        other = twins(both, likelihood, wide)
+        other = find_twins(both, likelihood, wide)
         at = [
             np.flatnonzero((other.field == f) & (other.offset == o).all(axis=1))[0]
             for f, o in zip(2 * number, middle, strict=True)
@@ -189,36 +189,37 @@ def test_density_of_draws_is_students_t():
 
 
 def aside(stars, model, noise, level, shift):
-    """A star in the noise of `level`, its mode `shift` pixels beside the right one, the problem."""
+    """A star in the noise of `level`, its mode `shift` pixels beside the right one."""
     z, truth, _, offset = (part[:1] for part in stars)
     noisy = noise.draw(truth, level, np.random.default_rng(7))
     likelihood = Likelihood.of(noise, level, truth)
-    problem = (likelihood.counts(noisy), likelihood, model)
+    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
     none = np.zeros(1, int)
-    start = Modes.at(none, none, offset + shift, np.full(1, FIELD), z)
-    truth = Modes.at(none, none, offset, np.full(1, TRUTH), z)
-    return climb(start, *problem), truth, noisy, problem
+    start = Modes.at(none, none, offset + shift, np.full(1, Knowledge.FIELD), z)
+    truth = Modes.at(none, none, offset, np.full(1, Knowledge.TRUTH), z)
+    return climb(start, posteriors), truth, posteriors
 
 
 def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     z, truth, noisy, offset = stars
     likelihood = Likelihood.of(noise, LEVEL, truth)
-    counts, number, back = likelihood.counts(noisy), np.arange(len(z)), []
+    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
+    number, back = np.arange(len(z)), []
     for shift in set(jitters(1)) - {(0, 0)}:
-        start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), FIELD), z)
-        modes = recentred(start, counts, likelihood, model)
+        start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), Knowledge.FIELD), z)
+        modes = recentre(start, posteriors)
         back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
 
 
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
-    wrong, truth, noisy, problem = aside(stars, model, noise, 1e-3, (0, 1))
-    both = wrong + climb(truth, *problem)
+    wrong, truth, posteriors = aside(stars, model, noise, 1e-3, (0, 1))
+    both = wrong + climb(truth, posteriors)
     one, two = (
-        sampled_sums(modes, noisy, np.zeros(1, int), *problem[1:], [50, 50], [stream(1, "test", 0)])
+        sample_posterior(modes, posteriors, np.zeros(1, int), 100, [stream(1, "test", 0)])[1]
         for modes in (wrong, both)
     )
-    for part, other in zip(one.in_field, two.in_field, strict=True):
-        assert part.image.tobytes() == other.image.tobytes()
-    assert two.in_field_helped.image.tobytes() != one.in_field_helped.image.tobytes()
+    for part, other in zip(one.parts, two.parts, strict=True):
+        assert part.image_sum.tobytes() == other.image_sum.tobytes()
+    assert two.with_truth.image_sum.tobytes() != one.with_truth.image_sum.tobytes()

@@ -19,7 +19,7 @@ from psfdae.image.selection import (
 )
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
-from psfdae.moments import moved, windowed_centres
+from psfdae.moments import shift_stamps, windowed_centres
 from psfdae.noise import NoiseModel, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
@@ -151,7 +151,7 @@ def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
 def test_a_moved_star_is_the_star_rendered_there():
     rng = np.random.default_rng(7)
     centre, shift = rng.uniform(-0.5, 0.5, (2, 30, 2))
-    error = moved(gaussians(centre), shift) - gaussians(centre + shift)
+    error = shift_stamps(gaussians(centre), shift) - gaussians(centre + shift)
     assert np.square(error).mean() < 1e-8 * gaussians(centre).max() ** 2 / 0.01
     assert np.square(error).mean() < 1e-8
 

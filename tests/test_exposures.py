@@ -93,7 +93,7 @@ def hundred(sky):
         simulated(folder, "hundred", 3, 100, 1.04).image, folder / "hundred.csv",
         stamp_px=STAMP, train_stars=60, test_stars=10,
     )  # fmt: skip
-    bright, own = stars.candidates.bright, model.engine.estimator
+    bright, own = stars.candidates.bright, model.method
     splines = (own.settings.orders, own.settings.spacing_px, own.settings.smoothness)
     alone = fit_field(bright, SKY, STAMP + 4, STAMP, *splines).model
     images = alone.images(alone.terms(PLACES), (PLACES - np.rint(PLACES))[:, ::-1], STAMP)
@@ -137,7 +137,7 @@ def test_models_of_other_pixels_or_without_a_field_are_not_adapted(sky):
 def test_without_other_stars_the_field_stays(sky):
     """A star of the exposure changes nothing that it does not show."""
     _, model, sparse = sky
-    field = model.engine.estimator
+    field = model.method
     observed = Stars.from_image(
         sparse.image.with_name("rich.fits"), sparse.image.with_name("rich.csv"),
         stamp_px=STAMP, train_stars=60, test_stars=10,

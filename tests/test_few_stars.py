@@ -10,7 +10,6 @@ from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag
 from psfdae.model.crowded import photometry
 from psfdae.model.packing import Errors
-from psfdae.model.psf_model import MARGIN_PX
 from psfdae.model.settings import from_words
 from small_field import GAIN, READ, SKY, image_of, moffat, ring
 
@@ -19,7 +18,7 @@ CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
 
 def opened(model, image, place):
     """The stars of an image, for a model."""
-    return Source(image, place, **CAMERA).open(model.stamp_px, MARGIN_PX)
+    return Source(image, place, **CAMERA).open(model.stamp_px, model.margin_px)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
-from psfdae.commands.from_stars import _alone
+from psfdae.commands.from_stars import _locked
 from psfdae.files import read_product, write_product
 from psfdae.image.observation import Source
 from psfdae.image.selection import collect
@@ -32,7 +32,7 @@ from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
 from psfdae.model.star_sets import split_stars
 from psfdae.model.validation import Report
-from psfdae.moments import moved
+from psfdae.moments import shift_stamps
 from psfdae.noise import NoiseModel, OwnNoise
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
@@ -216,8 +216,10 @@ def test_own_noise_is_what_moving_and_dividing_leave_of_it():
     sky, background = 0.004, 1.0
     rms = np.sqrt(sky**2 + sky / background**0.5 * wide)
     phase = rng.uniform(-0.5, 0.5, (count, 2))
-    noise = moved(rms * rng.normal(size=(count, 24, 24)), phase)
-    clean, noisy = (cut(moved(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise))
+    noise = shift_stamps(rms * rng.normal(size=(count, 24, 24)), phase)
+    clean, noisy = (
+        cut(shift_stamps(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise)
+    )
     error = noisy / noisy.sum((1, 2), keepdims=True) - clean / clean.sum((1, 2), keepdims=True)
     found = error.reshape(count, -1).T @ error.reshape(count, -1)
     everyone, alone = np.arange(count), np.full(count, sky)
@@ -252,7 +254,7 @@ def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypat
     made = out / training.bundle.name
     made.unlink()
     monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "field.h5"))
-    monkeypatch.setattr(stage, "packed", lambda *args: training.model)
+    monkeypatch.setattr(stage, "pack_model", lambda *args: training.model)
     monkeypatch.setattr(Report, "page", lambda self: "page")
     words = [*training.words, "--out", out, "--report", page, *WORDS]
     words += ["methods=[noisy,field]", "--method", "field"]
@@ -288,8 +290,8 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.from_stars import _alone\n"
-        "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+        "from psfdae.commands.from_stars import _locked\n"
+        "with _locked(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
@@ -298,7 +300,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         message = refused("from-stars", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
-    with _alone(out):
+    with _locked(out):
         assert [path.name for path in out.iterdir()] == [".from_stars.lock"]
     assert not out.exists()
 

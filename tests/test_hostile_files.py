@@ -92,9 +92,9 @@ def model_with(name, change):
     def changed(_):
         bundle = read_bundle()
         bundle = with_network(bundle) if name.startswith(("dae/", "flux/")) else bundle
-        arrays = bundles._tensors(bundle)
+        arrays = bundles.bundle_arrays(bundle)
         arrays[name] = np.asarray(change(arrays[name]))
-        return bundles.packed(bundle.info.described(), arrays)
+        return bundles.bundle_bytes(bundle.info.described(), arrays)
 
     return changed
 
@@ -182,7 +182,7 @@ def test_columns_of_fits_tables_are_what_astropy_reads(tmp_path):
 
 def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipped):
     """Large stamps' way, on small ones: the same predictions but for rounding."""
-    monkeypatch.setattr(bundles, "COMPLETED_PX", 0)
+    monkeypatch.setattr(bundles, "MAX_FULL_BASIS_PX", 0)
     lean = load_model()
     flux_model, rng = lean.bundle.flux_model, np.random.default_rng(3)
     assert flux_model.basis.shape[1] == lean.info.components < 256

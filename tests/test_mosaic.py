@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from command_line import psfdae, refused
 from psfdae.commands import mosaic
-from psfdae.commands.predict import Stated
+from psfdae.commands.predict import ImageOptions
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
 from psfdae.image.observation import Source
@@ -72,7 +72,9 @@ def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path
 
 def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
     image, catalogue = ccds
-    stated = mosaic.images_of(image, Stated(catalogue=catalogue, all_extensions=True, gain=2.0))
+    stated = mosaic.options_by_image(
+        image, ImageOptions(catalogue=catalogue, all_extensions=True, gain=2.0)
+    )
     assert {name: of.extension for name, of in stated.items()} == NUMBERS
     for k in (1, 2):
         of = stated[f"CCD{k}"]
@@ -97,13 +99,13 @@ def test_images_that_fail_or_are_killed_are_named_at_the_end_and_stop_no_other(c
     words = {"A": "x", "B": "nothing", "C": "killed", "D": "x"}
     jobs = {name: {"word": word} for name, word in words.items()}
     with pytest.raises(mosaic.MosaicError, match=r"m: 2 of 4 images failed: B, C$"):
-        mosaic.each(twice, jobs, "m")
+        mosaic.run_for_images(twice, jobs, "m")
     out, err = capfd.readouterr()
     _, first, second, third, last = out.splitlines()
     assert (first, second, last, err) == ("A: xx", "B: f: no star", "D: xx", "")
     assert third.startswith("C: ") and "killed" in third
     with pytest.raises(KeyError):  # a bug stays one
-        mosaic.each(twice, {"A": {"word": "bug"}}, "m")
+        mosaic.run_for_images(twice, {"A": {"word": "bug"}}, "m")
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,9 @@ from psfdae.commands import predict as stage
 from psfdae.image.observation import Source
 from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
 from psfdae.model import prediction as writer
-from psfdae.model import psf_model as engine
+from psfdae.model import psf_model
 from psfdae.model.psf_model import SCALE_TOLERANCE
+from psfdae.model.restoration import SNR_TOLERANCE
 from workflow_runs import ROOT
 
 SIDE = 320
@@ -90,7 +91,7 @@ def test_image_and_catalogue(folder, field_psfs, shipped):
     truth = Table.read(folder / "stars.csv")
     assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
     source = Source(folder / "image.fits", folder / "stars.csv")
-    ((_, found),) = shipped.stream(source.open(shipped.stamp_px, engine.MARGIN_PX))
+    ((_, found),) = shipped.stream(source.open(shipped.stamp_px, shipped.margin_px))
     rows = found.to_table()
     assert rows.colnames == table.colnames and {"ra", "dec"} < {*rows.colnames}
     for name in rows.colnames:
@@ -142,10 +143,10 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
 
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     files = []
-    for rows, threads in ((4 * engine.BLOCK, 1), (engine.BLOCK, 3)):
-        monkeypatch.setattr(engine, "ROWS", rows)
+    for rows, threads in ((1024, 1), (256, 3)):
+        monkeypatch.setattr(psf_model, "MAX_STARS_READ", rows)
         out = folder / f"rows{rows}_{threads}.fits"
-        stage.predict(folder / "cube.fits", stage.Stated(), threads=threads, out=out)
+        stage.predict(folder / "cube.fits", stage.ImageOptions(), threads=threads, out=out)
         files.append(out.read_bytes())
     assert files[0] == files[1]
 
@@ -190,6 +191,6 @@ def test_page_lists_all_flags_and_columns():
         assert f"`{name}`" in text + photometry, name
     for extension, _ in writer.CUBES.values():
         assert f"| `{extension}` |" in text
-    assert f"by up to {stage.MARGIN_PX} px" in text
+    assert f"by up to {stage.PsfModel.margin_px} px" in text
     assert f"more than {100 * SCALE_TOLERANCE:g} %" in text
-    assert f"1/{engine.SNR_TOLERANCE:g} of the least" in text
+    assert f"1/{SNR_TOLERANCE:g} of the least" in text

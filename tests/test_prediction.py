@@ -10,8 +10,8 @@ import pytest
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
 from psfdae.image.stamps import cut
-from psfdae.model import psf_model as model
-from psfdae.model.psf_model import BLOCK, PsfModel
+from psfdae.model import restoration
+from psfdae.model.psf_model import PsfModel
 
 NAMES = {"id", "x", "y", "ra", "dec", "list_columns", "unit"}
 COLUMNS = tuple(name for name in Prediction.__dataclass_fields__ if name not in NAMES)
@@ -127,7 +127,7 @@ def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypa
     double = field_psfs[:60] + 0.3 * np.roll(field_psfs[:60], (3, 4), (1, 2))
     flux = np.geomspace(1e4, 1e6, 60)[:, None, None]
     stamps = np.random.default_rng(4).poisson(flux * double + 100.0).astype(np.float32)
-    monkeypatch.setattr(model, "MOST_CHI2", 2.0)
+    monkeypatch.setattr(restoration, "MAX_CHI2", 2.0)
     found = shipped.predict(stamps, gain=1.0, noise=10.0)
     poor = has(found, StarFlag.POOR_FIT)
     assert (poor == (found.chi2 > 2.0)).all() and 5 < poor.sum() < 55
@@ -155,7 +155,7 @@ def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
 def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, request):
     model = request.getfixturevalue(name)
     clean = model.predict(medium.stamps)
-    assert len(medium.stamps) > BLOCK
+    assert len(medium.stamps) > 256
     assert same(model.predict(medium.stamps, threads=2), clean)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
     for rows in (slice(300, 301), order):

@@ -20,7 +20,7 @@ def hashes():
     source._module.cache_clear()
     fits = {name: PLACES.get(name, f"psfdae.methods.{name}") for name in METHODS}
     commands = ("stars", "alignment states", *ALIGNERS, "paper-tables")
-    return {name: source_hash("fit", chosen=[module]) for name, module in fits.items()} | {
+    return {name: source_hash("fit", module) for name, module in fits.items()} | {
         name: source_hash(name) for name in commands
     }
 

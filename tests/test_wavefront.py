@@ -121,7 +121,7 @@ def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, nam
     assert missed.size == 0
     truth = fitted[name].model.standardised(drawn["seidel"][-TEST:])
     own = modes.take(np.flatnonzero(modes.field == drawn["field_index"][-TEST:][modes.star]))
-    first = own.take(sampling._first(own.star, own.evidence, 1))
+    first = own.take(sampling.largest_of_groups(own.star, own.evidence, 1))
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0

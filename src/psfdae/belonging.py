@@ -1,4 +1,4 @@
-"""Whether products belong together, by what their files say of their upstream settings.
+"""Checks that products belong together, by the settings that their files carry.
 
 A product carries the configuration that made it. A network or a fitted baseline has the
 configuration of its training stars in a file beside it. Settings that only one side states are
@@ -21,8 +21,8 @@ FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
 STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
 """Configuration keys that decide the static PSFs of a scene."""
 
-DRAWN = ("framing.subpixel", "telescope.aberrations.jitter_waves", "stars.aberration_fraction")
-STARS = (*STATIC, *DRAWN)
+RANDOM_PARTS = ("telescope.aberrations.jitter_waves", "stars.aberration_fraction")
+STARS = (*STATIC, "framing.subpixel", *RANDOM_PARTS)
 """Configuration keys that decide the kind of stars; sets of one kind differ by seed and name."""
 
 SAME_STARS = ("seed", "stars.name", "stars.count")
@@ -31,33 +31,33 @@ SAME_STARS = ("seed", "stars.name", "stars.count")
 SAME_IMAGE = ("image", "calibration_stars", "parts")
 """Keys that distinguish star sets of images, which are not simulated."""
 
-NO_PART = {"name", "jitter_waves"}
-"""Keys that a group does not bring along: titles, and what static PSFs lack."""
+UNCOMPARED_KEYS = {"name", "jitter_waves"}
+"""Keys that are not compared with their group: titles, and what static PSFs do not depend on."""
 
 TRAINED_ON = "trained_on.yaml"
-"""Configuration of the stars or states that a network was trained on, in its folder."""
+"""Name of the file with the configuration of the stars or states that a model was trained on."""
 
 
 def require(
     path: Path,
-    said: Mapping[str, Any],
+    config: Mapping[str, Any],
     keys: Sequence[str],
-    wanted: Mapping[str, Any] | BaseModel,
-    whose: object = "the configuration",
+    expected: Mapping[str, Any] | BaseModel,
+    expected_from: object = "the configuration",
 ) -> None:
     """Refuse an input of other settings than those of a stage, or of another input.
 
     Parameters
     ----------
     path : Path
-        Of the input.
-    said : mapping
+        The input.
+    config : mapping
         The configuration that it carries.
     keys : sequence of str
         Dotted keys, and groups of them, that must agree where both sides state them.
-    wanted : mapping or pydantic model
+    expected : mapping or pydantic model
         Configuration of the stage, or of another input.
-    whose : object
+    expected_from : object
         The other side in the message: the path of another input.
 
     Raises
@@ -65,83 +65,122 @@ def require(
     ProductError
         For the first key that differs, with both values.
     """
-    tree = wanted if isinstance(wanted, Mapping) else wanted.model_dump()
+    tree = expected if isinstance(expected, Mapping) else expected.model_dump()
     for key in keys:
-        here, there = _at(said, key), _at(tree, key)
-        names, parts = [key], set()
-        if isinstance(here, Mapping) and isinstance(there, Mapping):
-            one, other = ({k for k in s if isinstance(s[k], Mapping)} for s in (here, there))
-            # Who states one part of a group by itself, such as aberrations, states all of them.
-            parts = one | other if one & other else set()
-            names = [f"{key}.{name}" for name in sorted(({*here} & {*there} | parts) - NO_PART)]
+        group, expected_group = _at(config, key), _at(tree, key)
+        names, subgroups = [key], set()
+        if isinstance(group, Mapping) and isinstance(expected_group, Mapping):
+            # If both sides state one part of a group by itself, such as aberrations, they state
+            # all of its parts: then a part that one side lacks differs.
+            of_group = {name for name, value in group.items() if isinstance(value, Mapping)}
+            expected_of_group = {k for k, v in expected_group.items() if isinstance(v, Mapping)}
+            if of_group & expected_of_group:
+                subgroups = of_group | expected_of_group
+            compared = ({*group} & {*expected_group} | subgroups) - UNCOMPARED_KEYS
+            names = [f"{key}.{name}" for name in sorted(compared)]
         for name in names:
-            one, other = _at(said, name), _at(tree, name)
-            if (one is None or other is None) and name.rpartition(".")[2] not in parts:
+            value, expected_value = _at(config, name), _at(tree, name)
+            is_missing = value is None or expected_value is None
+            if is_missing and name.rpartition(".")[2] not in subgroups:
                 continue
-            found = _difference(name, one, other)
-            if found is not None:
-                raise ProductError(f"{path}: {found[0]} = {found[1]}, but {whose} has {found[2]}")
+            difference = _difference(name, value, expected_value)
+            if difference is not None:
+                dotted_key, a, b = difference
+                raise ProductError(f"{path}: {dotted_key} = {a}, but {expected_from} has {b}")
 
 
 def _at(tree: Any, key: str) -> Any:
-    """The value of a dotted key; None if it is not there."""
+    """Return the value of a dotted key of a tree; None if it is not there."""
     for name in key.split("."):
         tree = tree.get(name) if isinstance(tree, Mapping) else None
     return tree
 
 
-def _difference(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
-    """The first key in which two values differ, and what each has there."""
-    one, other = (
-        {} if side is None and isinstance(beside, Mapping) else side
-        for side, beside in ((one, other), (other, one))
-    )
-    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
-        return None if one == other else (name, one, other)
-    inner = ((key, *(s.get(key, "nothing") for s in (one, other))) for key in {**one, **other})
-    parts = (_difference(f"{name}.{key}", *both) for key, *both in inner if key not in NO_PART)
-    return next(filter(None, parts), None)
+def _difference(name: str, first: Any, second: Any) -> tuple[str, Any, Any] | None:
+    """Return the first key in which two values differ, with its two values; None if they agree.
+
+    Groups are compared key by key; a side without the group has none of its keys.
+    """
+    if first is None and isinstance(second, Mapping):
+        first = {}
+    elif second is None and isinstance(first, Mapping):
+        second = {}
+    if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
+        return None if first == second else (name, first, second)
+    for key in {**first, **second}:
+        if key not in UNCOMPARED_KEYS:
+            values = first.get(key, "nothing"), second.get(key, "nothing")
+            if (difference := _difference(f"{name}.{key}", *values)) is not None:
+                return difference
+    return None
 
 
 def write_origin(model: Path, stars: Product) -> None:
-    """Note beside a model, a folder or a file, of which product it was trained."""
+    """Write a note on the product that a model, a folder or a file, was trained on."""
     import yaml
 
     write_text(origin_path(model), yaml.safe_dump(stars.config, sort_keys=True))
 
 
 def origin_path(model: Path) -> Path:
-    """The file that says what a model was trained on; see `write_origin`."""
+    """Return the path of the file that says what a model was trained on; see `write_origin`."""
     return model / TRAINED_ON if model.is_dir() else model.with_name(f"{model.stem}.{TRAINED_ON}")
 
 
 def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[str, Any]:
     """Refuse a model that was trained on other stars or states than those of a product.
 
-    Returns what it was trained on, empty if no file says it; raises as `require`, and if that
-    file is damaged.
+    Returns
+    -------
+    dict
+        Configuration of the stars or states that it was trained on; empty if no file says it.
+
+    Raises
+    ------
+    ProductError
+        For the first of `keys` that differs, or if the file of the origin is damaged.
     """
     path = origin_path(model)
-    found = read_yaml(path) if path.is_file() else {}
-    require(path, found, keys, product.config, product.path)
-    return found
+    origin = read_yaml(path) if path.is_file() else {}
+    require(path, origin, keys, product.config, product.path)
+    return origin
 
 
 def require_training(
     model: Path,
-    said: Mapping[str, Any],
+    fit_config: Mapping[str, Any],
     stars: Product,
     config: Mapping[str, Any] | BaseModel,
     **options: str,
 ) -> None:
-    """Refuse a fit, whose configuration is `said`, that is no test on a product of stars.
+    """Refuse a fit that must not be tested on a product of stars.
 
-    It must be of stars of the same kind and have the same `options`, split and reference. Where
-    they are the very same stars, those of the random split's test must not have trained it.
+    It must be of stars of the same kind and have the same options. If they are the same stars,
+    those that test the random split must not have trained it: seed and number of training stars
+    must agree.
+
+    Parameters
+    ----------
+    model : Path
+        Folder or file of the fit.
+    fit_config : mapping
+        Its configuration.
+    stars : Product
+        The stars of the test.
+    config : mapping or pydantic model
+        Configuration of the test.
+    **options : str
+        Split and reference of the test.
+
+    Raises
+    ------
+    ProductError
+        For the first key that differs, with both values.
     """
     origin = require_origin(model, STARS, stars)
     path = model if model.is_file() else model / "config.yaml"
-    require(path, said, tuple(options), options, "the command")
-    known = [(_at(origin, key), _at(stars.config, key)) for key in SAME_STARS]
-    if options["split"] == "random" and all(one == two and one is not None for one, two in known):
-        require(path, said, ("seed", "parts.train_stars"), config)
+    require(path, fit_config, tuple(options), options, "the command")
+    identities = [(_at(origin, key), _at(stars.config, key)) for key in SAME_STARS]
+    same_stars = all(first == second and first is not None for first, second in identities)
+    if options["split"] == "random" and same_stars:
+        require(path, fit_config, ("seed", "parts.train_stars"), config)

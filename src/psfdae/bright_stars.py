@@ -1,4 +1,4 @@
-"""`BrightStars`: the stars of an image that are bright enough to learn from, as they are in it."""
+"""`BrightStars`: stars of an image that are bright enough to learn the PSF from."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from psfdae.files import Product
-from psfdae.moments import moved
+from psfdae.moments import shift_stamps
 
 DEFECT = 6.0
-"""σ of the sky: pixels this far below it are defects; they are raised to that."""
+"""Depth of a defect below the sky in σ of the sky; deeper pixels are raised to that."""
 
-LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
-"""Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
-pixel of a star that is made fainter has B − DEFECT √B at most."""
+LEAST_SKY = 2.0 * DEFECT**2
+"""Least sky B in photons per pixel: the deepest pixel, B − DEFECT √B, must not be negative."""
+
+MOST_SKY = 1e12
+"""Greatest sky in photons per pixel, beside which the photons of no star matter."""
 
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
@@ -45,13 +47,13 @@ class BrightStars:
     flux, noise : ndarray, shape (n,)
         Flux inside the stamp, and RMS of the sky in a pixel, in counts.
     snr : ndarray, shape (n,)
+        S/N by a filter matched to the star.
     row : ndarray of int, shape (n,)
-        Of the star list.
+        Row of the star list.
     colour : ndarray, shape (n,)
-        By the star list, NaN where it says none.
+        Colour in the star list, NaN where there is none.
     bad : ndarray of bool, shape (n, s, s)
-        Pixels of `wide` that were not measured: they show what nearby stars have there. By default
-        none are.
+        Pixels of `wide` that were not measured, and have values of nearby stars; by default none.
     """
 
     wide: np.ndarray
@@ -76,8 +78,9 @@ class BrightStars:
         names = ("peak", "position", "snr", "row", "listed", "flux", "colour", "bad")
         arrays = {name: stars[name] for name in names}
         flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
-        wide, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
-        return cls(**arrays, centre=centre, wide=wide, noise=noise)
+        # The product has stamps and noise of stars of flux 1.
+        stamps, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
+        return cls(**arrays, centre=centre, wide=stamps, noise=noise)
 
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
@@ -104,7 +107,7 @@ class BrightStars:
 
     def aligned(self) -> np.ndarray:
         """Return the stars with flux 1, moved to the common centre (s//2, s//2), (n, s, s)."""
-        return np.asarray(moved(self.wide, -self.centre) / self.flux[:, None, None])
+        return np.asarray(shift_stamps(self.wide, -self.centre) / self.flux[:, None, None])
 
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
         """Return the photons per pixel whose Poisson noise is that of the sky and of reading out.
@@ -121,12 +124,13 @@ class BrightStars:
 
         The second array is True for pixels that were measured. Pixels outside of `wide` are 0.
         """
-        # A margin of NaN, out of which each star's frame is cut.
-        wide = np.pad(self.wide, ((0, 0), (side, side), (side, side)), constant_values=np.nan)
+        # Rows and columns of each frame in stamps with a margin as wide as a frame, NaN in the
+        # images and False among the bad pixels.
+        margin = ((0, 0), (side, side), (side, side))
         start = side + self.wide.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
-        images = wide[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
+        frame = np.arange(len(self))[:, None, None], rows[:, :, None], columns[:, None, :]
+        images = np.pad(self.wide, margin, constant_values=np.nan)[frame]
         is_inside = np.isfinite(images)
-        bad = np.pad(self.bad, ((0, 0), (side, side), (side, side)))
-        bad = bad[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
+        bad = np.pad(self.bad, margin)[frame]
         return np.where(is_inside, images, 0.0).astype(np.float64), is_inside & ~bad

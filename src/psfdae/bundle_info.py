@@ -8,38 +8,39 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-FORMAT_VERSION = 3  # raised when an older psfdae could no longer read what a newer one writes
+FORMAT_VERSION = 3
+"""Version of the format, raised when an older psfdae could not read what a newer one writes."""
 
-# A network says its shape, other methods what they are.
-NETWORK, OTHERS = ("dae", "image_scale"), ("method", "reference")
+NETWORK_KEYS = ("dae", "image_scale")
+"""Keys that only the description of a network has."""
 
-FRAMING = "brightest pixel at (d/2, d/2)"  # 0-based (row, column) in stamps of side d, unjittered
-
+METHOD_KEYS = ("method", "reference")
+"""Keys that only the description of another method has."""
 
 Positive = Annotated[float, Field(gt=0)]
 
-
 Count = Annotated[int, Field(ge=1)]
 
-
 Kernel = Annotated[int, Field(ge=1, le=31)]
-
 
 Width = Annotated[int, Field(ge=1, le=1024)]
 
 
 class _Described(BaseModel):
+    """Part of the description: immutable, and without unknown keys or infinite numbers."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Architecture(_Described):
-    """Shape of the network."""
+    """Shape of the network: kernel sizes of its layers, and channels between them."""
 
     kernels: Annotated[tuple[Kernel, ...], Field(min_length=2, max_length=100)]
     widths: Annotated[tuple[Width, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _shape(self) -> Architecture:
+        """Refuse even kernels, and widths that do not fit between kernels."""
         if any(kernel % 2 == 0 for kernel in self.kernels):
             raise ValueError(f"kernels {self.kernels}: must be odd")
         if len(self.widths) != len(self.kernels) - 1:
@@ -47,17 +48,17 @@ class Architecture(_Described):
         return self
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every weight by its name in the network."""
-        named: dict[str, tuple[int, ...]] = {}
-        channels = pairwise((1, *self.widths, 1))
-        for layer, ((inner, outer), kernel) in enumerate(zip(channels, self.kernels, strict=True)):
-            named[f"layers.{layer}.weight"] = (outer, inner, kernel, kernel)
-            named[f"layers.{layer}.bias"] = (outer,)
-        return named
+        """Return the shape of every array of weights by its name in the network."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        layers = zip(pairwise((1, *self.widths, 1)), self.kernels, strict=True)
+        for index, ((inputs, outputs), kernel) in enumerate(layers):
+            shapes[f"layers.{index}.weight"] = (outputs, inputs, kernel, kernel)
+            shapes[f"layers.{index}.bias"] = (outputs,)
+        return shapes
 
 
 class BundleInfo(_Described):
-    """Description of a bundle.
+    """Description of a bundle: what its model was trained on, and how well it restores stars.
 
     Noise is the RMS of the sky noise in a pixel divided by the flux of the star
     inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
@@ -77,7 +78,8 @@ class BundleInfo(_Described):
     image_scale: Positive | None = Field(
         None, description="factor from normalised stamps to the network's"
     )
-    framing: str = FRAMING
+    # 0-based (row, column) in stamps of side d, without jitter.
+    framing: str = "brightest pixel at (d/2, d/2)"
     jitter_px: Annotated[int, Field(ge=0)]
     subpixel: bool = Field(description="stars lay anywhere in their pixels")
     noise_min: Positive
@@ -104,21 +106,26 @@ class BundleInfo(_Described):
 
     @model_validator(mode="after")
     def _of_its_format(self) -> BundleInfo:
-        wanted = NETWORK if self.dae or self.method == "dae" else OTHERS
-        given = [key for key in (*NETWORK, *OTHERS) if key in self.model_fields_set]
-        if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
-            raise ValueError(f"a model of {self.method} has {' and '.join(wanted)}")
+        """Refuse keys of a network for another method and the reverse, and a missing κ."""
+        needed = NETWORK_KEYS if self.dae or self.method == "dae" else METHOD_KEYS
+        stated = {*NETWORK_KEYS, *METHOD_KEYS} & self.model_fields_set
+        if stated != {*needed} or any(getattr(self, key) is None for key in needed):
+            raise ValueError(f"a model of {self.method} has {' and '.join(needed)}")
         if not (self.dae or (self.kappa > 0 and isfinite(self.kappa))):
             raise ValueError("config.train.noise.kappa: must be above 0, methods are given λ by it")
         return self
 
     @property
     def kappa(self) -> float:
-        """Noise, as above, of the noise level λ = 1 of the training."""
+        """Noise at the noise level λ = 1 of the training.
+
+        Where it is not stated: 1 for a network, which needs no λ, and 0, which is refused, for
+        other methods.
+        """
         try:
             return float(self.config["train"]["noise"]["kappa"])
         except (LookupError, TypeError, ValueError):
-            return 1.0 if self.dae else 0.0  # the network is given no λ
+            return 1.0 if self.dae else 0.0
 
     @property
     def adapted(self) -> str | None:
@@ -131,7 +138,7 @@ class BundleInfo(_Described):
 
     @property
     def scale_assumed(self) -> bool:
-        """Whether nothing said the pixel scale of the image that it was trained on."""
+        """True if the pixel scale was assumed, because the training image did not state it."""
         try:
             return bool(self.config["stars"]["telescope"]["assumed"])
         except (LookupError, TypeError):
@@ -139,5 +146,5 @@ class BundleInfo(_Described):
 
     def described(self) -> dict[str, Any]:
         """Return the description as a file of this format has it."""
-        other = {*(OTHERS if self.dae else NETWORK), *(() if self.misfit else ("misfit",))}
-        return self.model_dump(mode="json", exclude=other)
+        absent = {*(METHOD_KEYS if self.dae else NETWORK_KEYS)}
+        return self.model_dump(mode="json", exclude=absent if self.misfit else absent | {"misfit"})

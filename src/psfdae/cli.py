@@ -35,15 +35,11 @@ from psfdae.errors import Error, install_line, missing
 from psfdae.joined import joined
 from psfdae.version import __version__
 
-OWN = "psfdae.commands"
-"""The package's own commands; those of others join it by entry points "psfdae.commands"."""
-
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Reader(Protocol):
-    """Makes what a command's parameter `config` receives."""
+    """Function that makes the settings which a command's parameter `config` receives."""
 
     def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
         """Return settings from the other options, a file, or words of the command line."""
@@ -79,21 +75,21 @@ REFUSABLE = (OSError, MemoryError, RuntimeError, ValueError, ImportError)
 
 
 class Careful(click.Group):
-    """Commands whose mistakes are one message and exit code 2."""
+    """Group of commands in which wrong input ends in one line and exit code 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; a refusal of ours is a message, a bug stays a traceback.
+        """Run a command, and print one line for an error that is no bug of the package.
 
-        So is a file that the system does not let us read or write, a lack of memory, and a
-        package that an extra brings.
+        Such errors are wrong input, a file that cannot be read or written, a lack of memory, and a
+        missing package that belongs to an extra. A bug ends in a traceback.
         """
         try:
             return super().invoke(ctx)
         except REFUSABLE as error:
-            said = refusal(error)
-            if said is None:
+            message = refusal(error)
+            if message is None:
                 raise
-            click.echo(f"psfdae: {said}", err=True)
+            click.echo(f"psfdae: {message}", err=True)
             ctx.exit(2)
 
 
@@ -107,32 +103,32 @@ def refusal(error: Exception) -> str | None:
         return missing(error, "this command")
     if isinstance(error, Error):
         return str(error)
-    # HDF5 reports a full disk as a RuntimeError without a number of its own.
-    # So does torch a lack of memory, as its own RuntimeError.
-    known = re.search("errno = |not enough memory", str(error))
-    return " ".join(str(error).split()) if known else None
+    # HDF5 reports a full disk, and torch a lack of memory, as a RuntimeError that only its text
+    # distinguishes from others.
+    is_refusal = re.search("errno = |not enough memory", str(error))
+    return " ".join(str(error).split()) if is_refusal else None
 
 
 class Commands(Careful):
-    """The commands of all stages."""
+    """All commands that begin with the words `prefix`, whose modules are imported when needed."""
 
-    def __init__(self, prefix: str = "", **more: Any) -> None:
-        super().__init__(**more)
+    def __init__(self, prefix: str = "", **attributes: Any) -> None:
+        super().__init__(**attributes)
         self.prefix = prefix
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """First words after the group's own."""
-        size = len(self.prefix.split())
-        names = [name.split() for name in found()]
-        words = {w[size] for w in names if w[:size] == self.prefix.split() and w[size:]}
-        return sorted(words)
+        """Return the words that may follow those of the group."""
+        prefix = self.prefix.split()
+        size = len(prefix)
+        names = [name.split() for name in command_modules()]
+        return sorted({w[size] for w in names if w[:size] == prefix and w[size:]})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """A group, or the command of a stage, whose module is imported now."""
+        """Return a group, or the command of a stage, whose module is imported now."""
         name = f"{self.prefix} {cmd_name}".strip()
         if name in groups():
             return Commands(name, name=cmd_name, help=groups()[name])
-        return as_click(stage(name)) if name in found() else None
+        return as_click(stage(name)) if name in command_modules() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with the first sentence of their help, from the modules' text."""
@@ -159,8 +155,11 @@ def main() -> None:
 
 
 @cache
-def found() -> dict[str, tuple[str, Path]]:
-    """Module and its file by command."""
+def command_modules() -> dict[str, tuple[str, Path]]:
+    """Return the name of the module, and the path of its file, of each command.
+
+    They are found in the text of the modules, none of which is imported.
+    """
     pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
     commands = {}
     for package in _packages():
@@ -172,14 +171,15 @@ def found() -> dict[str, tuple[str, Path]]:
 
 
 def _packages() -> list[str]:
-    return [OWN, *(point.value for point in joined("commands"))]
+    """Return the packages with commands: our own, and those that join by entry points."""
+    return ["psfdae.commands", *(point.value for point in joined("commands"))]
 
 
 def sections(words: Sequence[str]) -> dict[str, list[str]]:
-    """Return those first words of commands that this installation can run, below their headings.
+    """Return the first words of commands that this installation can run, by their heading.
 
-    The packages' `SECTIONS` say what stands where, and their `REQUIRED` which module a command
-    needs; what is in no section is a stage of the paper's.
+    The packages' `SECTIONS` have the commands of each heading, and their `REQUIRED` the module
+    that a command needs; a command in no section is a stage of the paper.
     """
     headings: dict[str, list[str]] = {}
     required: dict[str, str] = {}
@@ -187,36 +187,36 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
         for heading, commands in getattr(package, "SECTIONS", {}).items():
             headings.setdefault(heading, []).extend(commands)
         required |= getattr(package, "REQUIRED", {})
-    placed = {word for commands in headings.values() for word in commands}
-    headings["The paper's stages"] = [word for word in words if word not in placed]
+    in_sections = {word for commands in headings.values() for word in commands}
+    headings["The paper's stages"] = [word for word in words if word not in in_sections]
 
-    def runs(word: str) -> bool:
-        module = required.get(word, "" if word in placed else required.get("*", ""))
+    def can_run(word: str) -> bool:
+        module = required.get(word, "" if word in in_sections else required.get("*", ""))
         return word in words and (not module or find_spec(module) is not None)
 
-    available = {heading: list(filter(runs, names)) for heading, names in headings.items()}
+    available = {heading: list(filter(can_run, names)) for heading, names in headings.items()}
     return {heading: commands for heading, commands in available.items() if commands}
 
 
 @cache
 def groups() -> dict[str, str]:
-    """Help of the first words of commands of two and three words, from the packages' `GROUPS`."""
-    known: dict[str, str] = {}
+    """Return the help of groups of commands, by their words, from the packages' `GROUPS`."""
+    help_texts: dict[str, str] = {}
     for package in _packages():
-        known |= getattr(import_module(package), "GROUPS", {})
-    return known
+        help_texts |= getattr(import_module(package), "GROUPS", {})
+    return help_texts
 
 
 def stage(name: str) -> Callable[..., Any]:
-    """The function of a command; its module is imported."""
-    module = import_module(found()[name][0])
-    marked = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
-    function: Callable[..., Any] = next(f for f in marked if f.stage.name == name)
+    """Import the module of a command, and return its function."""
+    module = import_module(command_modules()[name][0])
+    stages = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
+    function: Callable[..., Any] = next(f for f in stages if f.stage.name == name)
     return function
 
 
 def _shortened(text: str, width: int) -> str:
-    """The first sentence, as much of it as fits."""
+    """Return the first sentence of a text, cut after the last word that fits into the width."""
     from textwrap import shorten
 
     first = " ".join(text.split()).partition(". ")[0].removesuffix(".")
@@ -224,10 +224,10 @@ def _shortened(text: str, width: int) -> str:
 
 
 def _about(name: str) -> str:
-    """First paragraph of a command's help, nothing being imported."""
+    """Return the first paragraph of a command's help from the text of its module."""
     if name in groups():
         return groups()[name]
-    for node in ast.parse(found()[name][1].read_text(encoding="utf-8")).body:
+    for node in ast.parse(command_modules()[name][1].read_text(encoding="utf-8")).body:
         for call in getattr(node, "decorator_list", []):
             if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
                 return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
@@ -235,52 +235,59 @@ def _about(name: str) -> str:
 
 
 def as_click(function: Callable[..., Any]) -> click.Command:
-    """The command of a stage."""
+    """Return the click command of a function that `command` has marked."""
     spec: Stage = function.stage  # type: ignore[attr-defined]
-    fields: dict[str, Any] = {}
+    # Parameters of the function are options; a dataclass has an option for each of its fields.
+    dataclasses: dict[str, Any] = {}
     parameters: list[click.Parameter] = []
     for name, hint, default in _parameters(function):
         if name == "config":
             continue
         if is_dataclass(hint):
-            fields[name] = hint
+            dataclasses[name] = hint
             parameters += [_option(*field) for field in _parameters(hint)]
         else:
             parameters.append(_option(name, hint, default))
-    read = spec.settings if "config" in signature(function).parameters else None
-    if read is not None:
+    # A parameter `config` comes from a file, or from words group.key=value.
+    read_settings = spec.settings if "config" in signature(function).parameters else None
+    if read_settings is not None:
         path = click.Path(path_type=Path, dir_okay=False)
-        about = "Settings as the workflow writes them, instead of overrides."
-        parameters.append(click.Option(["--config", "settings"], type=path, help=about))
+        file_help = "Settings as the workflow writes them, instead of overrides."
+        parameters.append(click.Option(["--config", "settings"], type=path, help=file_help))
         if not any(p.nargs == -1 for p in parameters):
             parameters.append(click.Argument(["overrides"], nargs=-1))
 
-    def run(**given: Any) -> None:
+    def run(**values: Any) -> None:
         config = {}
-        if read is not None:
-            file, overrides = given.pop("settings"), _settings(parameters, given)
+        if read_settings is not None:
+            file, overrides = values.pop("settings"), _settings(parameters, values)
             if file is not None and overrides:
                 raise click.UsageError("--config and overrides exclude each other")
-            config["config"] = read(given, file, overrides)
-        for name, kind in fields.items():
-            given[name] = kind(**{key: given.pop(key) for key, *_ in _parameters(kind)})
-        function(**config, **given)
+            config["config"] = read_settings(values, file, overrides)
+        for name, dataclass_type in dataclasses.items():
+            names = [field_name for field_name, *_ in _parameters(dataclass_type)]
+            values[name] = dataclass_type(**{key: values.pop(key) for key in names})
+        function(**config, **values)
 
     help_text = cleandoc(function.__doc__ or "")
     return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
 
 
-def _settings(parameters: Sequence[click.Parameter], given: dict[str, Any]) -> Sequence[str]:
-    """Take the settings from what is given; a file among them is one as ./a=b.fits."""
-    if "overrides" in given:
-        found: Sequence[str] = given.pop("overrides")
-        return found
-    files = next(p for p in parameters if p.nargs == -1)
-    words = given[files.name or ""]
-    settings = [str(word) for word in words if re.match("[^/]*=", str(word))]
-    if not (kept := tuple(word for word in words if str(word) not in settings)):
-        raise click.MissingParameter(param=files)
-    given[files.name or ""] = kept
+def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> Sequence[str]:
+    """Remove the words group.key=value from the values of a command, and return them.
+
+    They stand among the files of an argument with several values: a word with = before any / is a
+    setting, so that a file a=b.fits is to be named ./a=b.fits.
+    """
+    if "overrides" in values:
+        overrides: Sequence[str] = values.pop("overrides")
+        return overrides
+    argument = next(p for p in parameters if p.nargs == -1)
+    name = argument.name or ""
+    settings = [str(word) for word in values[name] if re.match("[^/]*=", str(word))]
+    values[name] = tuple(word for word in values[name] if str(word) not in settings)
+    if not values[name]:
+        raise click.MissingParameter(param=argument)
     return settings
 
 
@@ -290,21 +297,22 @@ def program(*functions: Callable[..., Any]) -> None:
 
 
 def _parameters(function: Any) -> list[tuple[str, Any, Any]]:
-    """Name, type and default of each parameter."""
-    kept = signature(function).parameters
+    """Return name, type and default of each parameter of a function or dataclass."""
+    parameters = signature(function).parameters
     hints = get_type_hints(function, include_extras=True)
-    return [(name, hints.get(name, Any), p.default) for name, p in kept.items()]
+    return [(name, hints.get(name, Any), p.default) for name, p in parameters.items()]
 
 
 def _option(name: str, hint: Any, default: Any) -> click.Parameter:
-    kind, attributes = _unfolded(hint)
-    attributes = {"type": kind, **attributes}
-    if kind is bool:
+    """Return click's option or argument for a parameter of a function; see `command`."""
+    value_type, attributes = _click_type(hint)
+    attributes = {"type": value_type, **attributes}
+    if value_type is bool:
         attributes |= {"type": None, "is_flag": True}
     required = default is Parameter.empty
     if attributes.pop("argument", False):
-        many = attributes.pop("multiple", False)
-        return click.Argument([name], required=required, nargs=-1 if many else 1, **attributes)
+        nargs = -1 if attributes.pop("multiple", False) else 1
+        return click.Argument([name], required=required, nargs=nargs, **attributes)
     attributes["required"] = required
     if not required and default is not False and default not in (None, ()):
         attributes = {"default": default, "show_default": True, **attributes}
@@ -312,25 +320,27 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
     return click.Option([flag, name], **attributes)
 
 
-def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
-    """Click's type of an annotation, and what else it says of an option."""
-    attributes: dict[str, Any] = {}
+def _click_type(hint: Any) -> tuple[Any, dict[str, Any]]:
+    """Return click's type for an annotation, and further attributes of the option."""
     if get_origin(hint) is Annotated:
-        kind, attributes = _unfolded(get_args(hint)[0])
-        for said in hint.__metadata__:
-            if isinstance(said, str):
-                attributes["help"] = said
+        # A text is the help; a dict has attributes; anything else is a type of click's.
+        value_type, attributes = _click_type(get_args(hint)[0])
+        for metadata in hint.__metadata__:
+            if isinstance(metadata, str):
+                attributes["help"] = metadata
             else:
-                attributes |= said if isinstance(said, dict) else {"type": said}
-        return attributes.pop("type", kind), attributes
+                attributes |= metadata if isinstance(metadata, dict) else {"type": metadata}
+        return attributes.pop("type", value_type), attributes
+    # The first type of a union that is not None: None is the default of an option.
     if get_origin(hint) in (Union, types.UnionType):
-        return _unfolded(next(part for part in get_args(hint) if part is not type(None)))
+        return _click_type(next(part for part in get_args(hint) if part is not type(None)))
     if get_origin(hint) is Literal:
         return click.Choice(get_args(hint)), {}
     if get_origin(hint) is tuple:
-        inner = get_args(hint)
-        if inner[-1] is ...:
-            kind, attributes = _unfolded(inner[0])
-            return kind, {**attributes, "multiple": True}
-        return tuple(_unfolded(part)[0] for part in inner), {}
+        # tuple[X, ...] is an option that may be repeated; tuple[X, Y] takes two values.
+        elements = get_args(hint)
+        if elements[-1] is ...:
+            value_type, attributes = _click_type(elements[0])
+            return value_type, {**attributes, "multiple": True}
+        return tuple(_click_type(element)[0] for element in elements), {}
     return hint, {}

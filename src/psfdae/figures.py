@@ -1,4 +1,4 @@
-"""How every figure looks: type sizes, colours, field angles; and the figure of restored stars."""
+"""Style of all figures, angles in the field, and the figure of restored stars."""
 
 from __future__ import annotations
 
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 WIDTH_IN = 8.0
 """Width of every figure in inches."""
 
-DPI = 150
-"""Dots per inch of every PNG."""
-
 SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
 """Colours of lines that are not methods."""
 
@@ -34,7 +31,7 @@ REFERENCES = {
 """Names of the references in titles."""
 
 RC: dict[str, Any] = {
-    "figure.dpi": DPI,
+    "figure.dpi": 150,
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.labelsize": 9,
@@ -47,18 +44,20 @@ RC: dict[str, Any] = {
     "grid.linewidth": 0.6,
 }
 
+"""Settings of matplotlib for every figure."""
+
 Drawing = Callable[..., "Figure"]
 
 
 def in_style() -> AbstractContextManager[None]:
-    """The style above for a block of code, whatever matplotlibrc the user has."""
+    """Return a context with the style `RC`, whatever matplotlibrc the user has."""
     import matplotlib.style
 
     return matplotlib.style.context(["default", RC])
 
 
 def styled(draw: Drawing) -> Drawing:
-    """Draw in the style above."""
+    """Decorate a function that draws a figure, so that it uses the style `RC`."""
 
     @wraps(draw)
     def wrapped(*args: Any, **kwargs: Any) -> Figure:
@@ -69,7 +68,7 @@ def styled(draw: Drawing) -> Drawing:
 
 
 def new_figure(height_in: float, **kwargs: Any) -> Figure:
-    """An empty figure of the common width, outside pyplot's global state."""
+    """Return an empty figure of the common width, outside pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -78,18 +77,18 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     return figure
 
 
-def as_png(figure: Figure, dpi: int = DPI) -> bytes:
-    """The figure as PNG; the same figure gives the same bytes."""
+def as_png(figure: Figure, dpi: int = 150) -> bytes:
+    """Return a figure as PNG; the same figure gives the same bytes."""
     content = BytesIO()
-    # Ticks are made, and the way of saving is looked up, only now. The default metadata name
-    # matplotlib's version.
+    # The style is needed again, because matplotlib makes ticks only now. Its default metadata
+    # have its version.
     with in_style():
         figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
 
 
 def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
-    """Field angles in degrees, or in arc minutes if the whole field is within ±1°.
+    """Return field angles in degrees, or in arc minutes if the whole field is within ±1°.
 
     Parameters
     ----------
@@ -99,6 +98,7 @@ def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     Returns
     -------
     values : ndarray
+        Angles in this unit.
     unit : str
         "deg" or "arcmin".
     """
@@ -123,7 +123,7 @@ STAMP_PART = 0.97
 
 @dataclass(frozen=True)
 class StripRow:
-    """One row of a restoration strip.
+    """Row of a restoration strip: stamps of one kind, a column for each star.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class StripRow:
 
 
 def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
-    """Stars that lie evenly over the field, the same for the same stars.
+    """Select stars that lie evenly over the field, the same for the same stars.
 
     The targets ((k + ½)/n, fraction of ½ + k/φ), with φ the golden ratio, are a
     lattice that fills the square evenly; the first star nearest to each is
@@ -155,66 +155,80 @@ def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
     position : ndarray, shape (n, 2)
         Field position (x, y) of the stars, any unit.
     count : int
-        Stars wanted; fewer come back if there are fewer.
+        Number of stars to select; all if there are fewer.
 
     Returns
     -------
     ndarray of int, shape (min(count, n),)
+        Indices of the stars, from left to right.
     """
+    # Targets in the unit square, then in the range of the positions.
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     count = min(count, len(position))
     low, high = position.min(axis=0), position.max(axis=0)
     step = np.arange(count)
     target = np.stack([(step + 0.5) / count, (0.5 + step / golden) % 1.0], axis=1)
     target = low + target * (high - low)
-    free = np.ones(len(position), dtype=bool)
-    picks = []
+    # The nearest star to each target that is not yet selected.
+    available = np.ones(len(position), dtype=bool)
+    selected = []
     for point in target:
-        distance = np.where(free, np.hypot(*(position - point).T), np.inf)
+        distance = np.where(available, np.hypot(*(position - point).T), np.inf)
         # Rounding must not choose between equally near stars.
         nearest = int(np.argmax(distance <= distance.min() * (1.0 + 1e-9)))
-        free[nearest] = False
-        picks.append(nearest)
-    return np.array(picks, dtype=int)
+        available[nearest] = False
+        selected.append(nearest)
+    return np.array(selected, dtype=int)
 
 
 @styled
 def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: str) -> Figure:
-    """Stars before and after restoration, as in the paper; the first row is the reference.
+    """Draw stars before and after restoration, as in the paper; the first row is the reference.
 
     All stamps of a column share the colour scale 0 … maximum of the first row,
-    on a square-root scale, except rows with `own_scale`. `columns` are headings of the stars.
+    on a square-root scale, except rows with `own_scale`.
+
+    Parameters
+    ----------
+    rows : sequence of StripRow
+        Rows from top to bottom.
+    columns : sequence of str
+        Heading of each star.
+    title : str
+        Title of the figure.
     """
+    # Margins, height of a row and of the numbers below it, in inches.
     longest = max(len(line) for row in rows for line in _lines(row.label))
-    left, right, top, bottom, cell, text = max(1.0, 0.07 * longest), 0.1, 0.85, 0.35, 0.86, 0.17
+    margin_left, margin_right = max(1.0, 0.07 * longest), 0.1
+    top, bottom, cell, text = 0.85, 0.35, 0.86, 0.17
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
     axes = in_inches(figure)
-    step = (WIDTH_IN - left - right) / len(columns)
-    middle = left + step * (np.arange(len(columns)) + 0.5 * STAMP_PART)
+    step = (WIDTH_IN - margin_left - margin_right) / len(columns)
+    middle = margin_left + step * (np.arange(len(columns)) + 0.5 * STAMP_PART)
     y = height - top
     peak = rows[0].images.max(axis=(1, 2))
     for x, name in zip(middle, columns, strict=True):
         axes.text(x, y + 0.02, name, ha="center", va="bottom", fontsize=8)
     for row in rows:
         y -= cell
-        draw_row(axes, row, (left, y), (step, cell), peak)
+        draw_row(axes, row, (margin_left, y), (step, cell), peak)
         if row.mse is not None:
             for x, error in zip(middle, row.mse, strict=True):
                 number = f"{1e6 * error:#.3g}".rstrip(".")
                 axes.text(x, y - 0.02, number, ha="center", va="top", fontsize=8)
             y -= text
     figure.suptitle(title, y=1.0 - 0.12 / height, va="top")
-    about = (
+    explanation = (
         "Colour: √flux from 0 to the reference's maximum in each column; noisy stamps to their own"
         " maximum. Numbers: MSE × 10⁶."
     )
-    axes.text(0.5 * WIDTH_IN, 0.09, about, ha="center", va="bottom", fontsize=8)
+    axes.text(0.5 * WIDTH_IN, 0.09, explanation, ha="center", va="bottom", fontsize=8)
     return figure
 
 
 def in_inches(figure: Figure) -> Axes:
-    """Empty axes over a whole figure, in inches from its lower left corner."""
+    """Return empty axes over a whole figure, in inches from its lower left corner."""
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     axes.set(xlim=(0.0, figure.get_figwidth()), ylim=(0.0, figure.get_figheight()))
@@ -229,9 +243,20 @@ def draw_row(
     cell: tuple[float, float],
     peak: np.ndarray,
 ) -> None:
-    """The stamps of a row on a square-root scale up to `peak`, (n,), and its label at the left.
+    """Draw the stamps of a row on a square-root scale, with its label at the left.
 
-    In axes of inches, from the lower left `corner` (x, y) on; `cell` is (width, height).
+    Parameters
+    ----------
+    axes : Axes
+        Axes in inches.
+    row : StripRow
+        The row.
+    corner : tuple of float
+        Lower left corner (x, y) of the first cell.
+    cell : tuple of float
+        Width and height of a cell.
+    peak : ndarray, shape (n,)
+        Value of the brightest colour for each star.
     """
     side = STAMP_PART * min(cell)
     lower = corner[1] + 0.5 * (STAMP_PART * cell[1] - side)
@@ -254,5 +279,5 @@ def draw_row(
 
 
 def _lines(label: str) -> list[str]:
-    """Lines of a label: what is in brackets has one of its own."""
+    """Return the lines of a label: a part in brackets has a line of its own."""
     return label.replace(" (", "\n(").splitlines()

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 
 
 class ProductError(Error, RuntimeError):
-    """A data product is missing, damaged, or not what the stage expects."""
-
-
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk; libraries leave out which file has no space."""
+    """Error of a data product that is missing, damaged, or not what the stage expects."""
 
 
 @contextmanager
@@ -55,12 +51,14 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
     Raises
     ------
     OSError
-        As from the system; one of writing names `path`.
+        If the system cannot write; the error names `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     sweep_stale(path.parent, _stem(path))
-    temporary = path.with_name(f"{_stem(path)}.{_writer()}-{secrets.token_hex(4)}.tmp")
+    # The name says which process writes, so that another one can see whether it is dead.
+    writer = f"{_machine()}-{os.getpid()}-{_start_ticks(os.getpid())}"
+    temporary = path.with_name(f"{_stem(path)}.{writer}-{secrets.token_hex(4)}.tmp")
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     try:
         yield temporary
@@ -72,10 +70,12 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
         temporary.replace(path)
         _to_disk(path.parent)
     except OSError as error:
-        if error.errno in FULL or error.filename in (temporary, str(temporary)):
-            named = error.filename not in (None, temporary, str(temporary))
-            where = error.filename if named else str(path)
-            raise OSError(error.errno, os.strerror(error.errno or 0), where) from error
+        # Libraries leave out which file a full disk has no space for, or name the temporary one.
+        is_temporary = error.filename in (temporary, str(temporary))
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        if is_full or is_temporary:
+            name = str(path) if error.filename is None or is_temporary else error.filename
+            raise OSError(error.errno, os.strerror(error.errno or 0), name) from error
         raise
     finally:
         temporary.unlink(missing_ok=True)
@@ -129,19 +129,22 @@ def digest_line(path: Path, record: Path) -> str:
 
 @cache
 def _machine() -> str:
-    """Hash of what makes a process number unique: host, its boot, the namespace of processes."""
+    """Return a hash of host, its boot and the namespace of processes.
+
+    A process number is unique within these three.
+    """
     boot = Path("/proc/sys/kernel/random/boot_id")
     namespace = Path("/proc/self/ns/pid")
-    known = [
+    parts = [
         os.uname().nodename,
         boot.read_text() if boot.exists() else secrets.token_hex(16),
         str(namespace.readlink()) if namespace.exists() else "",
     ]
-    return hashlib.sha256("\n".join(known).encode()).hexdigest()[:12]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 
-def _started(pid: int | str) -> str:
-    """When a process started, in ticks since the boot: its number may be used again."""
+def _start_ticks(pid: int | str) -> str:
+    """Return when a process started, in ticks since the boot: its number may be used again."""
     try:
         # The name of the program may hold blanks and brackets.
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
@@ -149,54 +152,50 @@ def _started(pid: int | str) -> str:
         return ""
 
 
-def _writer() -> str:
-    return f"{_machine()}-{os.getpid()}-{_started(os.getpid())}"
-
-
-_STALE = re.compile(r"\.([0-9a-f]{12})-([0-9]+)-([0-9]+)-[0-9a-f]{8}\.tmp")
-
-
 def sweep_stale(folder: Path, stem: str) -> None:
     """Remove temporary files of `atomic_path` whose writer is certainly dead.
 
-    Certainly: it ran on this host since its last boot. Others are left alone, such as
-    those of another node of a cluster.
+    A writer is certainly dead if it ran on this host since its last boot and has ended. Files of
+    others are left alone, such as those of another node of a cluster.
 
     Parameters
     ----------
     folder : Path
+        Folder with the temporary files.
     stem : str
-        What the names start with.
+        Start of their names.
     """
     for path in _stale(folder, stem):
         path.unlink(missing_ok=True)
 
 
 def _stale(folder: Path, stem: str) -> Iterator[Path]:
+    """Yield the temporary files in a folder whose writer is certainly dead."""
+    pattern = re.compile(r"\.([0-9a-f]{12})-([0-9]+)-([0-9]+)-[0-9a-f]{8}\.tmp")
     for entry in os.scandir(folder):
-        found = _STALE.search(entry.name) if entry.name.startswith(stem) else None
-        if found and found[1] == _machine() and _ended(int(found[2]), found[3]):
+        match = pattern.search(entry.name) if entry.name.startswith(stem) else None
+        if match and match[1] == _machine() and _has_ended(int(match[2]), match[3]):
             yield Path(entry.path)
 
 
 def interrupted(path: Path) -> bool:
-    """Whether a killed writer of a file has left its temporary one.
+    """Return True if a killed writer of a file has left its temporary file.
 
-    What else that run was to leave may be there already then.
+    Other files of that run may exist already then.
     """
     return path.parent.is_dir() and any(_stale(path.parent, _stem(path)))
 
 
-def _ended(pid: int, started: str) -> bool:
-    """Whether a process of this machine has certainly ended."""
+def _has_ended(pid: int, start_ticks: str) -> bool:
+    """Return True if a process of this machine has certainly ended."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return True
     except OSError:
-        # Of another user, whose processes may be hidden from us.
+        # The process of another user, which may be hidden from us.
         return False
-    return _started(pid) not in (started, "")
+    return _start_ticks(pid) not in (start_ticks, "")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -240,7 +239,7 @@ def write_parquet(path: str | Path, table: DataFrame) -> None:
 
 
 def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """CSV of rows with equal keys, the numbers in full."""
+    """Return rows with equal keys as CSV, the numbers with all digits."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -249,7 +248,7 @@ def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
 
 
 def as_yaml(tree: Mapping[str, Any]) -> str:
-    """YAML of a resolved configuration, keys sorted."""
+    """Return a resolved configuration as YAML, keys sorted."""
     import yaml
 
     return str(yaml.safe_dump(tree, sort_keys=True))
@@ -259,14 +258,14 @@ def write_fits(path: str | Path, hdus: HDUList) -> None:
     """Write an astropy `HDUList` atomically."""
     content = io.BytesIO()
     hdus.writeto(content, output_verify="exception")
-    # By us, because astropy does not pass on what the system says of a full disk.
+    # Not by astropy, which hides the error of a full disk.
     with atomic_path(path) as temporary:
         temporary.write_bytes(content.getbuffer())
 
 
 @dataclass(frozen=True)
 class Column:
-    """One array of a product with its unit and a line of explanation."""
+    """Array of a product with its unit and a line of explanation."""
 
     values: np.ndarray
     unit: str
@@ -275,16 +274,12 @@ class Column:
 
 @dataclass(frozen=True)
 class Empty:
-    """A column that is created at its full length and filled slice by slice."""
+    """Column that is created at its full length and filled slice by slice."""
 
     shape: tuple[int, ...]
     dtype: type | np.dtype
     unit: str
     about: str
-
-
-CHUNK_BYTES = 2**18
-"""Size of the chunks of an `Empty` column, which hold whole rows."""
 
 
 def write_product(
@@ -304,25 +299,17 @@ def write_product(
         Target; replaced atomically.
     kind : str
         Product type that `read_product` checks, such as "stars".
-    columns : mapping of name to Column
+    columns : mapping of str to Column
+        Arrays by name.
     config : mapping
-        Resolved config sub-tree of the stage.
+        Resolved configuration of the stage.
     """
     import h5py
 
     # In memory, because HDF5 crashes where a full disk keeps it from closing a file.
     # A name of its own, because HDF5 opens no file twice.
     with h5py.File(secrets.token_hex(16), "w", driver="core", backing_store=False) as file:
-        _describe(file, kind, config)
-        stored: dict[int, str] = {}
-        for name, column in columns.items():
-            if id(column.values) in stored:
-                file[name] = h5py.SoftLink(f"/{stored[id(column.values)]}")
-                continue
-            stored[id(column.values)] = name
-            data = file.create_dataset(name, data=column.values, chunks=True, fletcher32=True)
-            data.attrs["unit"] = column.unit
-            data.attrs["about"] = column.about
+        _create_datasets(file, kind, columns, config, lambda column: id(column.values))
         file.flush()
         content = file.id.get_file_image()
     with atomic_path(path) as temporary:
@@ -331,10 +318,7 @@ def write_product(
 
 @contextmanager
 def stream_product(
-    path: str | Path,
-    kind: str,
-    columns: Mapping[str, Column | Empty],
-    config: Mapping[str, Any],
+    path: str | Path, kind: str, columns: Mapping[str, Column | Empty], config: Mapping[str, Any]
 ) -> Iterator[Mapping[str, Dataset]]:
     """Write a product piece by piece, so that it never has to fit into memory.
 
@@ -354,39 +338,33 @@ def stream_product(
     OSError
         If the disk has too little space.
     """
-    import h5py
-
     with atomic_path(path) as temporary, _reserved(temporary, columns) as file:
-        _describe(file, kind, config)
-        stored: dict[int, str] = {}
-        for name, column in columns.items():
-            if id(column) in stored:
-                file[name] = h5py.SoftLink(f"/{stored[id(column)]}")
-                continue
-            stored[id(column)] = name
-            data = file.create_dataset(name, fletcher32=True, **_storage(column))
-            data.attrs["unit"] = column.unit
-            data.attrs["about"] = column.about
+        names = _create_datasets(file, kind, columns, config, id)
         yield {name: file[name] for name in columns}
         file.flush()
-        for name in stored.values():
+        # HDF5 creates the chunks of an array when they are written.
+        for name in names:
             data = file[name]
-            written = data.id.get_num_chunks() * data.chunks[0]
-            if isinstance(columns[name], Empty) and written < data.shape[0]:
+            filled_rows = data.id.get_num_chunks() * data.chunks[0]
+            if isinstance(columns[name], Empty) and filled_rows < data.shape[0]:
                 raise ProductError(f"{path}: array {name!r} was not filled to its end")
 
 
 @contextmanager
 def _reserved(path: Path, columns: Mapping[str, Column | Empty]) -> Iterator[File]:
-    """A new HDF5 file that has its space: HDF5 crashes where a full disk keeps it from closing."""
+    """Yield a new HDF5 file whose space on the disk is reserved.
+
+    HDF5 crashes if a full disk keeps it from closing a file.
+    """
     import h5py
 
-    most = sum(_most_bytes(column) for column in columns.values()) + 2**20
+    max_bytes = sum(_max_bytes(column) for column in columns.values()) + 2**20
     with path.open("wb") as space:
-        # Once before HDF5 opens the file, and cuts it to nothing, to fail while that is safe.
-        _reserve(space, most)
+        # HDF5 truncates the file when it opens it. Reserve the space before, too, to fail while
+        # that is safe.
+        _reserve(space, max_bytes)
         with h5py.File(path, "w") as file:
-            _reserve(space, most)
+            _reserve(space, max_bytes)
             yield file
             file.flush()
             size = file.id.get_filesize()
@@ -394,16 +372,16 @@ def _reserved(path: Path, columns: Mapping[str, Column | Empty]) -> Iterator[Fil
 
 
 def _reserve(file: IO[bytes], size: int) -> None:
+    """Reserve space on the disk for a file, in bytes, where the file system can."""
     try:
         os.posix_fallocate(file.fileno(), 0, size)
     except OSError as error:
-        # Not every file system and C library can.
         if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
             raise
 
 
-def _most_bytes(column: Column | Empty) -> int:
-    """Upper limit of what HDF5 stores of a column, with the table of its chunks."""
+def _max_bytes(column: Column | Empty) -> int:
+    """Return an upper limit of what HDF5 stores of a column, with the table of its chunks."""
     if isinstance(column, Column):
         # Chunks at the border are whole; h5py gives them at least half of an axis' length.
         return (int(column.values.nbytes) << column.values.ndim) + 2**17
@@ -414,24 +392,51 @@ def _most_bytes(column: Column | Empty) -> int:
 
 
 def _storage(column: Column | Empty) -> dict[str, Any]:
-    """Arguments with which h5py creates the dataset of a streamed column."""
+    """Return the arguments with which h5py creates the dataset of a streamed column."""
     if isinstance(column, Column):
         return {"data": column.values, "chunks": True}
     dtype = np.dtype(column.dtype)
     row_bytes = int(np.prod(column.shape[1:], dtype=int)) * dtype.itemsize
-    rows = max(1, min(column.shape[0], CHUNK_BYTES // row_bytes))
+    rows = max(1, min(column.shape[0], 2**18 // row_bytes))  # chunks of whole rows, 256 KiB
     return {"shape": column.shape, "dtype": dtype, "chunks": (rows, *column.shape[1:])}
 
 
-def _describe(file: File, kind: str, config: Mapping[str, Any]) -> None:
+def _create_datasets(
+    file: File,
+    kind: str,
+    columns: Mapping[str, Any],
+    config: Mapping[str, Any],
+    identity: Callable[[Any], int],
+) -> list[str]:
+    """Write the attributes of a product, and create a dataset for each of its columns.
+
+    A column with the `identity` of an earlier one becomes a link to it.
+
+    Returns
+    -------
+    list of str
+        Names of the columns that are no links.
+    """
+    import h5py
+
     file.attrs["kind"] = kind
     file.attrs["psfdae_version"] = __version__
     file.attrs["config"] = json.dumps(config, sort_keys=True)
+    names: dict[int, str] = {}
+    for name, column in columns.items():
+        if identity(column) in names:
+            file[name] = h5py.SoftLink(f"/{names[identity(column)]}")
+            continue
+        names[identity(column)] = name
+        data = file.create_dataset(name, fletcher32=True, **_storage(column))
+        data.attrs["unit"] = column.unit
+        data.attrs["about"] = column.about
+    return list(names.values())
 
 
 @dataclass(frozen=True)
 class Product:
-    """A data product: its configuration, and its arrays, each read when it is first asked for.
+    """Data product: its configuration, and its arrays, each read when it is first used.
 
     `kind` is that of `read_product`; "" for a product that is in memory as a whole, of which
     `path` is only a name.
@@ -462,14 +467,14 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
     path = Path(path)
     try:
         with h5py.File(path, "r") as file:
-            found = file.attrs.get("kind")
-            if found != kind:
-                raise ProductError(f"{path}: a product of kind {found!r}, expected {kind!r}")
-            wanted = tuple(file) if names is None else names
-            missing = [name for name in wanted if name not in file]
+            file_kind = file.attrs.get("kind")
+            if file_kind != kind:
+                raise ProductError(f"{path}: a product of kind {file_kind!r}, expected {kind!r}")
+            names = tuple(file) if names is None else names
+            missing = [name for name in names if name not in file]
             if missing:
                 raise ProductError(f"{path}: array {missing[0]!r} is missing")
-            arrays = {name: file[name][()] for name in wanted}
+            arrays = {name: file[name][()] for name in names}
             return Product(path, json.loads(file.attrs["config"]), arrays, kind)
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
@@ -478,17 +483,20 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
 
 
 class OutputError(Error, ValueError):
-    """A result would take the place of what it is made of."""
+    """Output that would replace one of the inputs."""
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
-    """Refuse outputs that are inputs, too; what is no path of a file is passed over.
+    """Refuse outputs that are inputs, too.
+
+    Inputs that are no paths, such as arrays, and outputs that are None are passed over.
 
     Raises
     ------
     OutputError
+        For the first output that is an input.
     """
-    given = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
+    input_paths = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
     for out in outputs:
-        if out is not None and out.resolve() in given:
+        if out is not None and out.resolve() in input_paths:
             raise OutputError(f"{out}: is an input, too; choose another name")

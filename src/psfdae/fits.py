@@ -1,4 +1,6 @@
-"""Fits as files: their names, what is beside them, and whether they belong to stars.
+"""Files of fitted methods: their names, further files beside them, and checks of their origin.
+
+This is about fits of methods to stars; FITS images are in `psfdae.image`.
 
 Functions take the class of a method, whose part `Storage` says what a fit leaves.
 """
@@ -17,53 +19,53 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-def storage_of(kind: type[Method]) -> Storage:
+def storage_of(method: type[Method]) -> Storage:
     """Return how the fits of a method are stored; the method must leave files."""
-    assert kind.storage is not None, f"{kind.name} leaves no file"
-    return kind.storage
+    assert method.storage is not None, f"{method.name} leaves no file"
+    return method.storage
 
 
-def rule_of(kind: type[Method]) -> str:
+def rule_of(method: type[Method]) -> str:
     """Return the name of the rule that fits a method."""
-    return storage_of(kind).rule or f"fit_{kind.name}"
+    return storage_of(method).rule or f"fit_{method.name}"
 
 
-def suffix_of(kind: type[Method]) -> str:
+def suffix_of(method: type[Method]) -> str:
     """Return the ending of the names of a method's bundles."""
-    assert kind.packing is not None, f"{kind.name} is part of no bundle"
-    return f"-{kind.name}" if kind.packing.suffix is None else kind.packing.suffix
+    assert method.packing is not None, f"{method.name} is part of no bundle"
+    return f"-{method.name}" if method.packing.suffix is None else method.packing.suffix
 
 
-def stem(kind: type[Method], dataset: str, split: str, reference: str) -> str:
+def stem(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the part of a path that distinguishes the fits of a method."""
-    return f"{dataset}/{split}" + (f"-{reference}" if storage_of(kind).per_reference else "")
+    return f"{dataset}/{split}" + (f"-{reference}" if storage_of(method).per_reference else "")
 
 
-def place_of(kind: type[Method], dataset: str, split: str, reference: str) -> str:
+def place_of(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the folder or file of a fit, below the folder of results."""
-    return f"{kind.name}/{named(kind, stem(kind, dataset, split, reference))}"
+    return f"{method.name}/{named(method, stem(method, dataset, split, reference))}"
 
 
-def named(kind: type[Method], text: str) -> str:
+def named(method: type[Method], text: str) -> str:
     """Return the name of a fit: as it is for a folder, with the ending ".h5" for a file."""
-    return text if storage_of(kind).files else f"{text}.h5"
+    return text if storage_of(method).files else f"{text}.h5"
 
 
-def own_files(kind: type[Method], place: str | Path) -> list[Path]:
+def own_files(method: type[Method], place: str | Path) -> list[Path]:
     """Return the files of a fit that the method itself reads."""
-    return [Path(place, name) for name in storage_of(kind).files] or [Path(place)]
+    return [Path(place, name) for name in storage_of(method).files] or [Path(place)]
 
 
-def beside(kind: type[Method], place: str | Path, name: str) -> Path:
+def path_beside(method: type[Method], place: str | Path, name: str) -> Path:
     """Return the path of a further file of a fit: in its folder, or beside its product."""
     place = Path(place)
-    return place / name if storage_of(kind).files else place.with_name(f"{place.stem}.{name}")
+    return place / name if storage_of(method).files else place.with_name(f"{place.stem}.{name}")
 
 
-def outputs(kind: type[Method], place: str | Path) -> list[Path]:
-    """All files of a fit."""
-    more = (TRAINED_ON, *storage_of(kind).diagnostics)
-    return own_files(kind, place) + [beside(kind, place, name) for name in more]
+def outputs(method: type[Method], place: str | Path) -> list[Path]:
+    """Return the paths of all files of a fit."""
+    further_names = (TRAINED_ON, *storage_of(method).diagnostics)
+    return own_files(method, place) + [path_beside(method, place, name) for name in further_names]
 
 
 def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Product) -> None:
@@ -71,41 +73,54 @@ def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Prod
     fitted.save(place, described)
     write_origin(place, stars)
     for name in storage_of(type(fitted)).diagnostics:
-        write_text(beside(type(fitted), place, name), as_csv(fitted.diagnosed[name]))
+        write_text(path_beside(type(fitted), place, name), as_csv(fitted.diagnosed[name]))
 
 
 def described_by(
-    kind: type[Method], tree: Mapping[str, Any], split: str, reference: str
+    method: type[Method], tree: Mapping[str, Any], split: str, reference: str
 ) -> dict[str, Any]:
-    """The configuration that is written with a fit: its settings, and what it was fitted to."""
-    own = {"reference": reference} if storage_of(kind).per_reference else {}
-    return {**tree, "split": split, **own}
+    """Return the configuration that is written with a fit.
+
+    It has the settings `tree`, the split of the stars, and the reference, if the method is fitted
+    to each reference by itself.
+    """
+    has_reference = storage_of(method).per_reference
+    return {**tree, "split": split, **({"reference": reference} if has_reference else {})}
 
 
-def learnt(kind: type[Method], reference: str) -> str:
-    """Reference to which a fit that restores one is made: one that serves both has templates."""
-    each = kind.storage is None or kind.storage.per_reference
-    return reference if each else "template"
+def learnt(method: type[Method], reference: str) -> str:
+    """Return the reference to which a method is fitted that is to restore `reference`.
+
+    A method with one fit for both references is fitted to templates.
+    """
+    fits_each = method.storage is None or method.storage.per_reference
+    return reference if fits_each else "template"
 
 
 def require(
-    kind: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
+    method: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
     """Refuse a fit that does not belong to test stars.
 
     Parameters
     ----------
-    kind : type of Method
+    method : type of Method
+        Class of the method.
     place : Path
-    stars : product "stars" with its realisations
-    config : stage config (seed, parts)
+        Folder or file of the fit.
+    stars : Product
+        Stars of the test, a product "stars".
+    config : pydantic model
+        Configuration of the test, with seed and parts.
     split : "random" or "held_out"
+        How stars are split into training and test.
     reference : "realisation" or "template"
+        Images that the method is fitted to.
 
     Raises
     ------
     ProductError
-        With both values of what differs.
+        For the first setting that differs, with both values.
     """
-    options = described_by(kind, {}, split, reference)
-    require_training(place, kind.described(place), stars, config, **options)
+    options = described_by(method, {}, split, reference)
+    require_training(place, method.described(place), stars, config, **options)

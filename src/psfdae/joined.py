@@ -1,4 +1,4 @@
-"""Commands, methods and settings of other packages, by entry points."""
+"""Commands, methods and settings of other packages, which join by entry points."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 
-def joined(what: str) -> list[EntryPoint]:
-    """Entry points "psfdae.<what>" of all packages that are installed."""
-    return list(_all().select(group=f"psfdae.{what}"))
+def joined(topic: str) -> list[EntryPoint]:
+    """Return the entry points "psfdae.<topic>" of all packages that are installed."""
+    return list(_entry_points().select(group=f"psfdae.{topic}"))
 
 
 @cache
-def _all() -> Any:
-    """Read once: the files of every package of the environment are opened for it."""
+def _entry_points() -> Any:
+    # Read once, because that opens the files of every package of the environment.
     return entry_points()

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
 SSIM_WINDOW = 7
 """Side of the uniform SSIM window in pixels, scikit-image's default."""
 
-BLOCK = 256
-"""Stars whose moving sums fit into a processor's cache together."""
-
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return the mean squared error of every stamp, shape (n,)."""
@@ -54,29 +51,33 @@ def ssim(
     ranges = np.array([np.broadcast_to(r, count) for r in data_ranges], np.float64)
     if not (ranges > 0).all():
         raise ValueError(f"SSIM data_range must be positive, got {ranges.min()}")
-    # Column j holds the pixels of the window at place j, of which there are side − window + 1.
+    # Matrix that averages the pixels of an axis over the window: column j is 1/window at the pixels
+    # of the window at place j, of which there are side − window + 1.
     place = np.arange(side)[:, None] - np.arange(side - SSIM_WINDOW + 1)
-    inside = ((place >= 0) & (place < SSIM_WINDOW)) / SSIM_WINDOW
+    window_mean = ((place >= 0) & (place < SSIM_WINDOW)) / SSIM_WINDOW
 
     def mean(images: np.ndarray) -> np.ndarray:
         """Return the mean of every window, transposed: only its sum over all places is used."""
-        rows = (images.reshape(-1, side) @ inside).reshape(len(images), side, -1)
+        rows = (images.reshape(-1, side) @ window_mean).reshape(len(images), side, -1)
         columns = np.ascontiguousarray(rows.swapaxes(1, 2)).reshape(-1, side)
-        return np.asarray((columns @ inside).reshape(len(images), *inside.shape[1:], -1))
+        return np.asarray((columns @ window_mean).reshape(len(images), *window_mean.shape[1:], -1))
 
     out = np.empty(ranges.shape)
-    for first in range(0, count, BLOCK):
-        block = slice(first, first + BLOCK)
+    # The moving sums of 256 stars fit into a processor's cache.
+    for first in range(0, count, 256):
+        block = slice(first, first + 256)
         # SSIM does not change if both images and the range are scaled alike.
         unit = ranges[0, block, None, None]
         x, y = (a[block].astype(np.float64) / unit for a in (estimates, references))
         with np.errstate(invalid="ignore", over="ignore"):
+            # Sample covariances over the window: n/(n − 1) times ⟨xy⟩ − ⟨x⟩⟨y⟩.
             mean_x, mean_y = mean(x), mean(y)
             product, squares = 2 * mean_x * mean_y, mean_x**2 + mean_y**2
             sample = SSIM_WINDOW**2 / (SSIM_WINDOW**2 - 1)
             covariance = sample * (2 * mean(x * y) - product)
             variances = sample * (mean(x * x + y * y) - squares)
             for row, data_range in zip(out, ranges[:, block, None, None] / unit, strict=True):
+                # SSIM = (2μxμy + c1)(2σxy + c2) / ((μx² + μy² + c1)(σx² + σy² + c2)).
                 c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
                 similar = (product + c1) * (covariance + c2)
                 similar /= (squares + c1) * (variances + c2)
@@ -153,6 +154,7 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
     mean, standard_error : float
         The error is NaN if there is one cluster only.
     """
+    # Sum of the deviations in each cluster.
     mean = float(values.mean())
     _, member = np.unique(cluster, return_inverse=True)
     sums = np.bincount(member, weights=values - mean)
@@ -164,7 +166,7 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
 
 
 def clustered_ratio(
-    values: np.ndarray, others: np.ndarray, cluster: np.ndarray
+    values: np.ndarray, denominators: np.ndarray, cluster: np.ndarray
 ) -> tuple[float, float]:
     """Return the ratio R = v̄/w̄ of two means over the same stars, and its standard error.
 
@@ -173,13 +175,14 @@ def clustered_ratio(
 
     Parameters
     ----------
-    values, others : ndarray, shape (n,)
+    values, denominators : ndarray, shape (n,)
         v and w, star by star.
     cluster : ndarray of int, shape (n,)
         Field of every star.
     """
-    ratio = float(values.mean() / others.mean())
-    _, stderr = clustered_mean((values - ratio * others) / others.mean(), cluster)
+    ratio = float(values.mean() / denominators.mean())
+    residuals = (values - ratio * denominators) / denominators.mean()
+    _, stderr = clustered_mean(residuals, cluster)
     return ratio, stderr
 
 

@@ -1,4 +1,4 @@
-"""Robust scatter, centroids, moves by parts of a pixel, and sizes and shapes of PSFs.
+"""Robust scatter, centroids, shifts by parts of a pixel, and sizes and shapes of PSFs.
 
 Sizes and shapes are the moments of a PSF under an elliptical Gaussian weight that is matched to
 them (Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the
@@ -18,13 +18,10 @@ SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over the median of its modulus."""
 
 SPLINE_ORDER = 3
-"""Order of the splines that move images; a star with a FWHM of 3 px gets an MSE of 1e-8."""
+"""Order of the splines that shift images; a star with a FWHM of 3 px gets an MSE of 1e-8."""
 
 FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-
-WEIGHT_UPDATES = 16  # a Gaussian needs two, the most aberrated PSF 30 for 1e-4
-WEIGHT_WIDER_PX2 = 0.5  # variance by which the weight is wider: narrow PSFs fall between pixels
-LEAST_VARIANCE_PX2 = 0.08  # along an axis, that of the pixel itself
+"""FWHM of a Gaussian over its standard deviation."""
 
 
 def robust_scatter(values: np.ndarray) -> np.ndarray:
@@ -33,38 +30,45 @@ def robust_scatter(values: np.ndarray) -> np.ndarray:
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
 
-def moved(wide: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None) -> np.ndarray:
+def shift_stamps(
+    stamps: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None
+) -> np.ndarray:
     """Return stamps shifted by cubic splines, their edge pixels repeated outside.
 
     Parameters
     ----------
-    wide : ndarray, shape (n, s, s)
+    stamps : ndarray, shape (n, s, s)
+        Images of stars.
     shift : ndarray, shape (m, 2)
-        (row, column) in pixels.
+        Shift of the star along rows and columns, in pixels.
     stamp : ndarray of int, shape (m,), optional
-        Stamp of each shift, once or several times; by default each stamp once, m = n.
+        Index of the stamp of each shift; by default each stamp is shifted once, m = n.
 
     Returns
     -------
     ndarray, shape (m, s, s)
+        Shifted stamps.
     """
     from scipy import ndimage
 
     # A margin of 12 px, beyond which an edge has no influence on a spline inside.
-    side, margin = wide.shape[-1], 12
-    used, stamp = np.unique(np.arange(len(wide)) if stamp is None else stamp, return_inverse=True)
+    side, margin = stamps.shape[-1], 12
+    stamp = np.arange(len(stamps)) if stamp is None else stamp
+    used, stamp = np.unique(stamp, return_inverse=True)
     # Coefficients of the splines through the pixels of each stamp.
-    splines = np.pad(wide[used], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
+    splines = np.pad(stamps[used], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
     for axis in (1, 2):
         splines = ndimage.spline_filter1d(splines, SPLINE_ORDER, axis, mode="nearest")
-    # The pixels of a moved stamp lie at −shift among the knots; R c Cᵀ are their values.
-    out, knots = np.empty((len(stamp), side, side)), side + 2 * margin
+    # The pixels of a shifted stamp lie at −shift among the knots. With coefficients c and matrices
+    # R, C of the splines at the rows and columns of these pixels, their values are R c Cᵀ. 256
+    # stamps at a time limit the memory.
+    shifted, knots = np.empty((len(stamp), side, side)), side + 2 * margin
     pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
     for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
         place = np.clip(pixels - shift[part, :, None], -farthest, farthest)
         rows, columns = cubic_splines(place, knots, 1.0).swapaxes(0, 1)
-        out[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
-    return out
+        shifted[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
+    return shifted
 
 
 def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
@@ -85,22 +89,24 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
     -------
     ndarray, shape (…, knots)
     """
-    # At a part t of the way from one knot to the next, only the two knots on each side count.
-    u = place / spacing + (knots - 1) / 2
-    first = np.floor(u)
-    t = u - first
+    # At a part t of the way from one knot to the next, only the two knots on each side count: the
+    # cubic B-spline is ((1−t)³, 4 − 3t²(2−t), 4 − 3(1−t)²(1+t), t³)/6 there (de Boor 1978, A
+    # Practical Guide to Splines).
+    knot_place = place / spacing + (knots - 1) / 2
+    first = np.floor(knot_place)
+    t = knot_place - first
     if slope:
         parts = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
         values = np.stack(parts, axis=-1) / spacing
     else:
-        last = 1 - t
-        parts = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
+        u = 1 - t
+        parts = (u**3, 4 - 3 * t**2 * (1 + u), 4 - 3 * u**2 * (1 + t), t**3)
         values = np.stack(parts, axis=-1) / 6
-    # Four knots more on each side take what is beyond the others.
-    out = np.zeros((*place.shape, knots + 8))
+    # Four more knots on each side take the values at knots that do not exist; they are cut off.
+    matrix = np.zeros((*place.shape, knots + 8))
     knot = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
-    np.put_along_axis(out, knot[..., None] + np.arange(3, 7), values, axis=-1)
-    return out[..., 4:-4]
+    np.put_along_axis(matrix, knot[..., None] + np.arange(3, 7), values, axis=-1)
+    return matrix[..., 4:-4]
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
@@ -112,34 +118,34 @@ def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
 
 
 def windowed_centres(
-    wide: np.ndarray, start: np.ndarray, window_px: np.ndarray, rounds: int, reach_px: float
+    stamps: np.ndarray, start: np.ndarray, window_px: np.ndarray, rounds: int, reach_px: float
 ) -> np.ndarray:
-    """Return centroids under a Gaussian window that follows the star (Bertin's XWIN), (n, 2).
+    """Return centroids under a Gaussian window that follows the star (SExtractor's XWIN, YWIN).
 
     Parameters
     ----------
-    wide : ndarray, shape (n, s, s)
-        Sky-subtracted.
+    stamps : ndarray, shape (n, s, s)
+        Sky-subtracted images of stars.
     start : ndarray, shape (n, 2)
-        (row, column) from index (s//2, s//2).
+        First estimate (row, column) from index (s//2, s//2).
     window_px : ndarray, shape (n,)
         σ of the window, about that of the star.
     rounds : int
-        Each leaves less than a fifth of the distance.
+        Number of iterations; each leaves less than a fifth of the distance.
     reach_px : float
-        Distance from the start that is not exceeded, per axis.
+        Greatest distance from the start, per axis.
 
     Returns
     -------
     ndarray, shape (n, 2)
         (row, column) from index (s//2, s//2).
     """
-    axis = np.arange(wide.shape[-1]) - wide.shape[-1] // 2
+    axis = np.arange(stamps.shape[-1]) - stamps.shape[-1] // 2
     centre = start.astype(np.float64)
     for _ in range(rounds):
         rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
         along = [np.exp(-0.5 * (a / window_px[:, None]) ** 2) for a in (rows, columns)]
-        light = along[0][:, :, None] * along[1][:, None, :] * wide
+        light = along[0][:, :, None] * along[1][:, None, :] * stamps
         total = light.sum(axis=(1, 2))
         moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
         # A window as wide as the star halves the distance of the centroid, hence the 2.
@@ -170,6 +176,7 @@ class Shapes:
 
 def measure_shapes(psf: np.ndarray) -> Shapes:
     """Return shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
+    # The eigenvalues of the moments are (M_xx + M_yy ± spread)/2, the squares of the semi-axes.
     xx, xy, yy = _adaptive_moments(psf)
     with np.errstate(invalid="ignore"):
         determinant = xx * yy - xy**2
@@ -195,10 +202,11 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     x, y, moments = _centre_and_moments(light @ terms.T)
     moments = _bounded(*moments, side)
     weighted = np.empty_like(light)
-    for _ in range(WEIGHT_UPDATES):
-        # Moments under a weight a little wider than the PSF; then those of the Gaussian that would
-        # have them.
-        weight = (moments[0] + WEIGHT_WIDER_PX2, moments[1], moments[2] + WEIGHT_WIDER_PX2)
+    # A Gaussian needs two updates of the weight, the most aberrated PSF 30 for 1e-4.
+    for _ in range(16):
+        # Moments under a weight a little wider than the PSF, by 0.5 px² of variance because narrow
+        # PSFs fall between pixels; then those of the Gaussian that would have them.
+        weight = (moments[0] + 0.5, moments[1], moments[2] + 0.5)
         np.matmul(_exponent(x, y, *weight), terms, out=weighted)
         np.exp(weighted, out=weighted)
         weighted *= light
@@ -262,7 +270,8 @@ def _without_weight_centre(
 
 def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
     """Return moments between those of a pixel and of a stamp, of an ellipse with real axes."""
-    xx, yy = (np.clip(variance, LEAST_VARIANCE_PX2, (0.5 * side) ** 2) for variance in (xx, yy))
+    # The variance of a pixel of side 1 is 1/12 ≈ 0.08 px² along an axis.
+    xx, yy = (np.clip(variance, 0.08, (0.5 * side) ** 2) for variance in (xx, yy))
     limit = 0.99 * np.sqrt(xx * yy)
     return xx, np.clip(xy, -limit, limit), yy
 
@@ -271,6 +280,7 @@ def _exponent(
     x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray
 ) -> np.ndarray:
     """Return the coefficients of `_monomials` in the exponent of the weight, shape (n, 6)."""
+    # −½ (a (x−x₀)² + 2b (x−x₀)(y−y₀) + c (y−y₀)²) with the inverse (a, b; b, c) of the moments.
     determinant = xx * yy - xy**2
     a, b, c = yy / determinant, -xy / determinant, xx / determinant
     constant = a * x * x + 2.0 * b * x * y + c * y * y

@@ -108,16 +108,16 @@ PHASES = 17
 
 @dataclass(frozen=True)
 class OwnNoise:
-    """Noise of bright stars in their own images.
+    """Noise of bright stars in images of them that were shifted to a common centre.
 
     Attributes
     ----------
     noise : ndarray, shape (n,)
-        RMS of the sky in a pixel over the flux, of every image before it was moved.
+        RMS of the sky in a pixel over the flux, of every image before it was shifted.
     background : float
         Sky level in photons per pixel.
     phase : ndarray, shape (n, 2)
-        Part of a pixel by which the image was moved.
+        Part of a pixel by which the image was shifted.
     star : ndarray of int, shape (n,)
         Star of every image; its images share their noise.
     """
@@ -151,7 +151,7 @@ class OwnNoise:
         place = np.rint(2 * (PHASES - 1) * np.abs(self.phase[images])).astype(int)
         share = np.zeros((PHASES, PHASES))
         np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), 1e-300))
-        along = moved_noise(side)
+        along = shifted_noise(side)
         pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(share, along, 1))
         # RMS of each pixel, by the sky and by the photons of the mean star.
         photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
@@ -163,7 +163,7 @@ class OwnNoise:
 
 
 @cache
-def moved_noise(side: int) -> np.ndarray:
+def shifted_noise(side: int) -> np.ndarray:
     """Return the covariance of white noise along an axis that splines shift, (PHASES, d, d).
 
     Shifts are 0 … ½ pixel. The axis is the middle third of a longer one, so that no edge counts.

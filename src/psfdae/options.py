@@ -10,20 +10,18 @@ import click
 
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 
-
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
-
 
 AboveZero = click.FloatRange(min=0, min_open=True)
 
 
 class NameOrNumber(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 takes none
-    """An extension of a FITS file: its number, in plain digits, or its name."""
+    """Extension of a FITS file: its number, in plain digits, or its name."""
 
     name = "text"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> str | int:
-        """A number from digits; any other text as it is."""
+        """Return a number for up to six digits, and any other text as it is."""
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value

@@ -1,4 +1,4 @@
-"""Text files that people write or disks damage: YAML, JSON and CSV; one line says what is wrong."""
+"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong."""
 
 from __future__ import annotations
 
@@ -13,47 +13,45 @@ from psfdae.files import ProductError
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Made = TypeVar("Made")
-
-MOST_NODES = 1_000_000
-"""Values that a YAML file may have once its aliases are written out."""
+Value = TypeVar("Value")
 
 
 def read_yaml(path: Path | None) -> dict[str, Any]:
-    """A YAML file with a mapping of texts to plain values, as JSON could hold it.
+    """Read a YAML file with a mapping of texts to plain values, as JSON could hold it.
 
     Raises
     ------
     ProductError
-        Names file, line and column of what is wrong.
+        If the file is missing or has something else; names file, line and column.
     """
     tree = parse_yaml(path)
     if not isinstance(tree, dict):
         raise ProductError(f"{path}: damaged (no mapping in it); write it again")
-    _plain(path, tree)
+    _require_plain(path, tree)
     return tree
 
 
-def _plain(path: Path | None, tree: Any) -> None:
+def _require_plain(path: Path | None, tree: Any) -> None:
+    """Refuse keys that are no texts, and values such as dates that JSON does not know."""
     if isinstance(tree, dict):
         for key, value in tree.items():
             if not isinstance(key, str):
                 raise ProductError(f"{path}: key {key!r} is no text")
-            _plain(path, value)
+            _require_plain(path, value)
     elif isinstance(tree, list):
         for value in tree:
-            _plain(path, value)
+            _require_plain(path, value)
     elif not isinstance(tree, str | int | float | None):
         raise ProductError(f"{path}: {tree!r} is neither text nor number")
 
 
 def parse_yaml(path: Path | None) -> Any:
-    """Return the content of a YAML file; a key given twice is a mistake.
+    """Return the content of a YAML file, which is of any type.
 
     Raises
     ------
     ProductError
-        As `read_yaml`.
+        If the file is missing or wrong, or has a key twice; names file, line and column.
     """
     import yaml
 
@@ -64,14 +62,19 @@ def parse_yaml(path: Path | None) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        _check(node, {})
+        # Before any value is made, because aliases of aliases may fill the memory.
+        _count_values(node, {})
         return loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
-        raise ProductError(_complaint(path, error)) from None
+        mark = error.problem_mark or error.context_mark
+        position = f": {_mark(mark)}" if mark is not None else ""
+        problem = " ".join(f"{error.context or ''} {error.problem or ''}".split())
+        raise ProductError(f"{path}{position}: {problem or 'no YAML'}") from None
     except yaml.reader.ReaderError as error:
-        where = _place(text, error.position)
-        found = f"character #x{ord(text[error.position]):04x} is not allowed"
-        raise ProductError(f"{path}: {where}: {found}") from None
+        code = f"#x{ord(text[error.position]):04x}"
+        raise ProductError(
+            f"{path}: {_line_and_column(text[: error.position])}: character {code} is not allowed"
+        ) from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
     except ProductError as error:
@@ -80,48 +83,54 @@ def parse_yaml(path: Path | None) -> Any:
         raise ProductError(f"{path}: a value that cannot be read ({error})") from None
 
 
-def _check(node: Any, sizes: dict[int, int]) -> int:
-    """Number of values below a node; refuses equal keys, and aliases that multiply."""
+def _count_values(node: Any, counts: dict[int, int]) -> int:
+    """Return the number of values of a YAML node once its aliases are written out.
+
+    `counts` has those of nodes that were counted before, by identity: an alias is the same node.
+
+    Raises
+    ------
+    ProductError
+        If a mapping has a key twice, or there are more than a million values.
+    """
     import yaml
 
-    if id(node) in sizes:
-        return sizes[id(node)]
-    sizes[id(node)] = 1
-    parts: list[Any] = []
+    if id(node) in counts:
+        return counts[id(node)]
+    counts[id(node)] = 1
+    children: list[Any] = []
     if isinstance(node, yaml.MappingNode):
-        seen = set()
+        keys = set()
         for key, value in node.value:
-            parts += [key, value]
+            children += [key, value]
+            # The merge key << may be there several times.
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if (key.tag, key.value) in seen:
-                    where = _mark(key.start_mark)
-                    raise ProductError(f": {where}: key {key.value!r} is there twice")
-                seen.add((key.tag, key.value))
+                if (key.tag, key.value) in keys:
+                    raise ProductError(
+                        f": {_mark(key.start_mark)}: key {key.value!r} is there twice"
+                    )
+                keys.add((key.tag, key.value))
     elif isinstance(node, yaml.SequenceNode):
-        parts = node.value
-    sizes[id(node)] = 1 + sum(_check(part, sizes) for part in parts)
-    if sizes[id(node)] > MOST_NODES:
-        raise ProductError(f": {_mark(node.start_mark)}: more than {MOST_NODES} values")
-    return sizes[id(node)]
-
-
-def _complaint(path: Path, error: Any) -> str:
-    mark = error.problem_mark or error.context_mark
-    where = f": {_mark(mark)}" if mark is not None else ""
-    what = " ".join(part for part in (error.context, error.problem) if part)
-    return f"{path}{where}: {' '.join(what.split()) or 'no YAML'}"
+        children = node.value
+    counts[id(node)] = 1 + sum(_count_values(child, counts) for child in children)
+    # No file of ours has a thousandth of this.
+    if counts[id(node)] > 1_000_000:
+        raise ProductError(f": {_mark(node.start_mark)}: more than 1000000 values")
+    return counts[id(node)]
 
 
 def _mark(mark: Any) -> str:
     return f"line {mark.line + 1}, column {mark.column + 1}"
 
 
-def _place(text: str, position: int) -> str:
-    before = text[:position]
-    return f"line {before.count(chr(10)) + 1}, column {position - before.rfind(chr(10))}"
+def _line_and_column(preceding_text: str) -> str:
+    """Return the position in a file after a text, counted from line 1, column 1."""
+    column = len(preceding_text) - preceding_text.rfind("\n")
+    return f"line {preceding_text.count(chr(10)) + 1}, column {column}"
 
 
 def _text(path: Path) -> str:
+    """Return the content of a file in UTF-8; raise ProductError if it cannot be read."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -131,25 +140,35 @@ def _text(path: Path) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        before = data[: error.start].decode("utf-8")
-        where = _place(before, len(before))
-        found = f"byte {data[error.start]:#04x} is not UTF-8"
-        raise ProductError(f"{path}: {where}: {found}") from None
+        position = _line_and_column(data[: error.start].decode("utf-8"))
+        byte = f"{data[error.start]:#04x}"
+        raise ProductError(f"{path}: {position}: byte {byte} is not UTF-8") from None
 
 
 @overload
 def from_tree(path: Path, tree: object, *keys: str) -> Any: ...
 @overload
-def from_tree(path: Path, tree: object, *keys: str, make: Callable[[Any], Made]) -> Made: ...
+def from_tree(path: Path, tree: object, *keys: str, make: Callable[[Any], Value]) -> Value: ...
 def from_tree(
-    path: Path, tree: Any, *keys: str, make: Callable[[Any], Made] | None = None
-) -> Any | Made:
-    """A part of what a file holds, by its keys, made into something.
+    path: Path, tree: Any, *keys: str, make: Callable[[Any], Value] | None = None
+) -> Any | Value:
+    """Return a part of the content of a file, or what `make` makes of it.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    tree : object
+        Its content.
+    *keys : str
+        Keys from the top of the tree to the part.
+    make : callable, optional
+        Makes the result from the part.
 
     Raises
     ------
     ProductError
-        If a key is missing, or `make` refuses what it finds.
+        If a key is missing, or `make` refuses its value.
     """
     name = ".".join(keys)
     for key in keys:
@@ -166,12 +185,12 @@ def from_tree(
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file with an object; raises ProductError that names file, line and column."""
+    """Read a JSON file with an object; raise ProductError that names file, line and column."""
     try:
         tree = json.loads(_text(path))
     except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise ProductError(f"{path}: {where}: {error.msg}") from None
+        position = f"line {error.lineno}, column {error.colno}"
+        raise ProductError(f"{path}: {position}: {error.msg}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
     except ValueError as error:
@@ -182,7 +201,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Rows of a CSV with the columns named; raises ProductError."""
+    """Read the rows of a CSV file; raise ProductError if one of the columns named is missing."""
     try:
         reader = csv.DictReader(_text(path).splitlines(keepends=True))
         missing = [name for name in columns if name not in (reader.fieldnames or ())]
@@ -194,7 +213,7 @@ def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
 
 
 def read_table(path: Path, **options: Any) -> DataFrame:
-    """A CSV as a pandas DataFrame, read with its options; raises ProductError."""
+    """Read a CSV file as a DataFrame, with pandas' options; raise ProductError if it is damaged."""
     import pandas as pd
 
     try:
@@ -208,7 +227,7 @@ def read_table(path: Path, **options: Any) -> DataFrame:
 
 
 def number(path: Path, text: str | SupportsFloat) -> float:
-    """A number of a table; raises ProductError that names the file."""
+    """Return a cell of a table as a number; raise ProductError, which names the file, if none."""
     try:
         return float(text)
     except (TypeError, ValueError):

@@ -31,24 +31,21 @@ CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
 
 
 class Group(BaseModel):
-    """A config group: immutable, and no key beyond those declared."""
+    """Group of settings: immutable, and without keys beyond those that it declares."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 Config = Any
-"""A configuration: a model of which the groups are attributes. Which there are follows from the
-methods, and the class is made of them when it is needed."""
+"""Configuration whose attributes are groups. The methods decide which groups there are; therefore
+the class is made when it is needed."""
 
 
 class ConfigError(Error, ValueError):
-    """The configuration is not usable; every line names a key, its value and the range."""
+    """Wrong settings; every line names a key, its value and the range."""
 
 
 Model = TypeVar("Model", bound=BaseModel)
-
-LONGEST = 200
-"""Characters of a wrong value that a message repeats."""
 
 
 def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
@@ -57,15 +54,16 @@ def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
     Raises
     ------
     ConfigError
-        One line per finding: key = value: what is allowed.
+        With a line for each wrong value: key = value: what is allowed.
     """
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError("\n".join(_finding(e) for e in error.errors())) from None
+        raise ConfigError("\n".join(_line(e) for e in error.errors())) from None
 
 
-def _finding(error: Mapping[str, Any]) -> str:
+def _line(error: Mapping[str, Any]) -> str:
+    """Return an error of pydantic's as a line with the key, its value and what is allowed."""
     key = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
@@ -74,13 +72,13 @@ def _finding(error: Mapping[str, Any]) -> str:
         return f"{key}: missing"
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message
-    given = repr(error["input"])
-    given = given if len(given) <= LONGEST else f"{given[:LONGEST]}…"
-    return f"{key} = {given}: {message[0].lower()}{message[1:]}"
+    value = repr(error["input"])
+    value = value if len(value) <= 200 else f"{value[:200]}…"  # a line or two of a terminal
+    return f"{key} = {value}: {message[0].lower()}{message[1:]}"
 
 
 def deciding(group: Group) -> dict[str, Any]:
-    """The settings of a group, and of groups in it, but for those that cannot change a result."""
+    """Return the settings of a group and its groups, without those that change no result."""
     tree = group.model_dump()
     for name, field in type(group).model_fields.items():
         value = getattr(group, name)
@@ -92,7 +90,7 @@ def deciding(group: Group) -> dict[str, Any]:
 
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:
-    """Hydra overrides that pin every leaf of a tree, in a fixed order.
+    """Return Hydra overrides that pin every leaf of a tree, in a fixed order.
 
     The list is at once a command line, the trigger of a rerun (the same
     configuration gives the same text, comments and number formats do not count)
@@ -102,6 +100,7 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return the dotted key and the value of each leaf of a tree."""
     leaves: list[tuple[str, Any]] = []
     for key, value in tree.items():
         if isinstance(value, Mapping):
@@ -112,6 +111,7 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 
 
 def _literal(value: Any) -> str:
+    """Return a value as it is written in an override."""
     if isinstance(value, list):
         return "[" + ",".join(_literal(item) for item in value) + "]"
     return value if isinstance(value, str) else json.dumps(value)
@@ -136,7 +136,7 @@ class Stamp(Group):
 
 
 class Noise(Group):
-    """A noise band: the levels λ that one dataset mixes."""
+    """Noise band: the levels λ that one dataset mixes."""
 
     name: Name = Field(description="For titles and messages")
     levels: Annotated[list[Positive], Field(min_length=1)] = Field(
@@ -159,7 +159,7 @@ class Parts(Group):
 
 
 class WithNoise(Protocol):
-    """Settings of the noise that methods are told."""
+    """Settings with a noise model, which methods use."""
 
     @property
     def noise(self) -> Noise: ...
@@ -175,7 +175,7 @@ class OfFit(WithNoise, Protocol):
 
 
 class Evaluation(Group):
-    """Image metrics."""
+    """Settings of image metrics and of the restoration of test stars."""
 
     data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
     batch: Count = Field(256, description="Stars per forward pass")
@@ -183,7 +183,7 @@ class Evaluation(Group):
 
 
 class OfTest(OfFit, Protocol):
-    """The same, and those of its test."""
+    """Settings that every fit and its test depend on."""
 
     @property
     def evaluation(self) -> Evaluation: ...
@@ -236,6 +236,7 @@ class CalibrationStars(Group):
 
     @model_validator(mode="after")
     def _levels(self) -> CalibrationStars:
+        """Refuse S/N that are not ascending."""
         if sorted(set(self.snr_levels)) != self.snr_levels:
             raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
         return self
@@ -246,9 +247,9 @@ class CalibrationStars(Group):
         return 100.0 if self.snr_min is None else self.snr_min
 
     def lower_snr(self) -> list[float]:
-        """Least S/N to try one after the other where too few stars have more; none if stated."""
+        """Return the least S/N to try in turn if too few stars have more; none if one is stated."""
         return [70.0, 50.0, 35.0, 25.0, 20.0, 14.0, 10.0] if self.snr_min is None else []
 
     def degraded(self) -> list[float]:
-        """S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
+        """Return the S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
         return sorted({min(level, 0.5 * self.least_snr) for level in self.snr_levels})

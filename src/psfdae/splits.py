@@ -21,7 +21,7 @@ def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Split:
-    """Star indices of the three parts; `fit` and `validation` make up the training part."""
+    """Indices of the stars of three parts; `fit` and `validation` make up the training part."""
 
     fit: np.ndarray
     validation: np.ndarray
@@ -45,9 +45,16 @@ def random_split(count: int, train: int, test: int, validation_fraction: float, 
 
 
 def held_out_fields(grid: np.ndarray) -> np.ndarray:
-    """Return which fields are held out: (ix + 2·iy) mod 5 = 1, a knight's-move pattern, (F,).
+    """Return True for fields that are held out: (ix + 2·iy) mod 5 = 1, a knight's-move pattern.
 
-    `grid`, shape (F, 2), holds (ix, iy) of every field.
+    Parameters
+    ----------
+    grid : ndarray of int, shape (F, 2)
+        (ix, iy) of every field.
+
+    Returns
+    -------
+    ndarray of bool, shape (F,)
     """
     return np.asarray((grid[:, 0] + 2 * grid[:, 1]) % 5 == 1)
 

@@ -8,7 +8,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 Batch = TypeVar("Batch")
 Result = TypeVar("Result")
@@ -17,7 +21,7 @@ Result = TypeVar("Result")
 def side_by_side(
     work: Callable[[Batch], Result], batches: Iterable[Batch], threads: int
 ) -> list[Result]:
-    """Results of `work` for every batch, in the order of the batches.
+    """Return the results of `work` for every batch, in the order of the batches.
 
     The linear algebra should be on one thread meanwhile: on small matrices a core
     per batch does more than two cores per product. What `work` raises is raised.
@@ -39,7 +43,7 @@ def side_by_side(
 def in_order(
     work: Callable[[Batch], Result], batches: Iterable[Batch], threads: int
 ) -> Iterator[tuple[Batch, Result]]:
-    """Batches with their results, in the order of the batches, few of them in memory.
+    """Yield batches with their results, in the order of the batches, few of them in memory.
 
     Batches are taken as they are needed, by the caller's thread: at most `threads` + 1
     are under way. What `batches` or `work` raises is raised, and nothing new is begun.
@@ -93,3 +97,26 @@ def limit_threads(threads: int) -> None:
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(threads)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Limit linear algebra, and networks if torch is loaded, to one thread per calling thread."""
+    torch = sys.modules.get("torch")
+    threads_before = torch.get_num_threads() if torch else 0
+    if torch:
+        torch.set_num_threads(1)
+    try:
+        with _libraries().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        if torch:
+            torch.set_num_threads(threads_before)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Return the libraries of linear algebra that are loaded; a search takes milliseconds."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -1,4 +1,4 @@
-"""Models of runs in MLflow: logged with their runs, and registered by dataset and method."""
+"""Models of runs in MLflow, logged with their runs and registered by dataset and method."""
 
 from __future__ import annotations
 
@@ -15,32 +15,28 @@ from psfdae_paper.tracking import MODEL, Run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities.model_registry import ModelVersion
-
-BEST = "best"
-"""Alias of a version; see `choose_best`."""
 
 TEST_MSE = "test_mse"
 """Tag of a version, and metric of its run: the mean over all noise levels."""
 
-EXAMPLE = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
-"""How MLflow finds what shows the input of a model."""
-
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -> str | None:
-    """Log the model of a run with all its files; its id, or None if the run has no model.
+    """Log the model of a run with all its files; return its id, or None if the run has no model.
 
-    One that restores lone stamps is such that `mlflow.pyfunc` loads it, and says what it takes.
+    `mlflow.pyfunc` can load a model that restores single stamps; its signature and an example
+    describe its input.
     """
     from mlflow.entities import LoggedModelOutput
 
+    # A run without files of a model, such as a sweep, has nothing to log.
     files = {name: path for name, path in record.files.items() if name.startswith(MODEL)}
     if not files:
         return None
     name = registered_name(record)
-    made = client.create_logged_model(experiment, name, run_id, model_type=record.kind)
-    model_id: str = made.model_id
+    logged = client.create_logged_model(experiment, name, run_id, model_type=record.kind)
+    model_id: str = logged.model_id
     client.log_outputs(run_id, [LoggedModelOutput(model_id, 0)])
+    # MLflow copies a folder; links in it save a copy of large files.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, "files")
         link(files, folder, MODEL)
@@ -55,15 +51,15 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -
 
 
 def link(files: Mapping[str, Path], folder: Path, prefix: str = "") -> None:
-    """Links to files in a folder, by their names without a prefix."""
+    """Make links to files in a folder, by their names without a prefix."""
     for name, path in files.items():
-        place = folder / name.removeprefix(prefix)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.symlink_to(path.resolve())
+        target = folder / name.removeprefix(prefix)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(path.resolve())
 
 
 def registered_name(record: Run) -> str:
-    """Name of the models of a dataset and method."""
+    """Return the name of the models of a dataset and method."""
     return f"{record.dataset}-{record.kind}"
 
 
@@ -71,35 +67,38 @@ def register(client: MlflowClient, run_id: str, model_id: str, record: Run) -> N
     """Make the logged model of a run a version of the models of its dataset and method."""
     name = registered_name(record)
     if not client.search_registered_models(f"name = '{name}'"):
-        about = f"PSFs of stamps of {record.dataset}, restored by {record.kind}."
-        client.create_registered_model(name, description=about)
+        description = f"PSFs of stamps of {record.dataset}, restored by {record.kind}."
+        client.create_registered_model(name, description=description)
     tags = {"split": record.split, "reference": record.reference}
     if TEST_MSE in record.metrics:
         tags[TEST_MSE] = f"{record.metrics[TEST_MSE]:.6g}"
-    place = client.get_logged_model(model_id).artifact_location
-    client.create_model_version(name, place, run_id, tags, model_id=model_id)
+    location = client.get_logged_model(model_id).artifact_location
+    client.create_model_version(name, location, run_id, tags, model_id=model_id)
 
 
 def choose_best(client: MlflowClient, name: str) -> None:
-    """Give the alias to that version which errs least on its test stars.
+    """Give the alias "best" to the version with the smallest error on its test stars.
 
-    Those of runs that are superseded do not count. Errors to templates are of another truth than
+    Versions of superseded runs do not count. Errors to templates have another truth than
     errors to realisations; they count if there are no others.
     """
-    counting = [
+    candidates = [
         version
         for version in client.search_model_versions(f"name = '{name}'")
         if TEST_MSE in version.tags
         and client.get_run(str(version.run_id)).data.tags.get("superseded") != "true"
     ]
-    if counting:
-        best = min(counting, key=_rank)
-        if BEST not in best.aliases:
-            client.set_registered_model_alias(name, BEST, best.version)
+    if candidates:
+        winner = min(
+            candidates, key=lambda v: (v.tags["reference"] == "template", float(v.tags[TEST_MSE]))
+        )
+        if "best" not in winner.aliases:
+            client.set_registered_model_alias(name, "best", winner.version)
 
 
 def forget(client: MlflowClient, run_id: str) -> None:
     """Delete a run with its models."""
+    # Registered versions, logged models, then the run itself.
     for version in client.search_model_versions(f"run_id = '{run_id}'"):
         client.delete_model_version(version.name, version.version)
     outputs = client.get_run(run_id).outputs
@@ -108,14 +107,18 @@ def forget(client: MlflowClient, run_id: str) -> None:
     client.delete_run(run_id)
 
 
-def _rank(version: ModelVersion) -> tuple[bool, float]:
-    return version.tags["reference"] == "template", float(version.tags[TEST_MSE])
-
-
 def _loadable(files: Path, stamp: np.ndarray, run_id: str, model_id: str) -> Path:
-    """Return a folder that `mlflow.pyfunc` loads, with all files of one that has a bundle.
+    """Move the files of a model into a folder that `mlflow.pyfunc` can load, and return it.
 
-    Not by `mlflow.pyfunc.save_model`, which looks at all files of all installed packages.
+    `mlflow.pyfunc.save_model` is not used: it reads all files of all installed packages.
+
+    Parameters
+    ----------
+    files : Path
+        Folder with a bundle and further files; it is moved.
+    stamp : ndarray, shape (1, d, d)
+        Example of the model's input.
+    run_id, model_id : str
     """
     from mlflow.models import Model, ModelSignature
     from mlflow.pyfunc import add_to_model
@@ -124,12 +127,15 @@ def _loadable(files: Path, stamp: np.ndarray, run_id: str, model_id: str) -> Pat
     folder, side = files.with_name("loadable"), stamp.shape[-1]
     folder.mkdir()
     files.rename(folder / "data")
-    example = json.dumps(stamp.tolist())
-    (folder / EXAMPLE["artifact_path"]).write_text(example, encoding="utf-8")
+    # The description by which MLflow finds and reads the example.
+    example = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
+    text = json.dumps(stamp.tolist())
+    (folder / example["artifact_path"]).write_text(text, encoding="utf-8")
+    # Stamps in, PSFs of the same size out.
     stamps = Schema([TensorSpec(np.dtype(np.float32), (-1, side, side))])
     signature = ModelSignature(stamps, stamps)
     model = Model(
-        run_id=run_id, model_id=model_id, signature=signature, saved_input_example_info=EXAMPLE
+        run_id=run_id, model_id=model_id, signature=signature, saved_input_example_info=example
     )
     add_to_model(model, loader_module=mlflow_model.__name__, data="data")  # type: ignore[no-untyped-call]
     model.save(str(folder / "MLmodel"))

@@ -1,34 +1,33 @@
-"""Hash of the code of a stage, by which a workflow reruns it if it has changed, and git commit."""
+"""Hash of the code of a stage, with which a workflow finds out that it has changed; git commit."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from psfdae.cli import found
+from psfdae.cli import command_modules
 
 SOURCES = Path(__file__).resolve().parents[1]
 """Folder of the packages."""
 
 
-def source_hash(*names: str, chosen: Iterable[str] = ()) -> str:
+def source_hash(*names: str) -> str:
     """Return the hash of modules and of all modules of the packages on which they depend.
 
     These are the modules that they import, the modules that those import, and so on. Docstrings,
     comments and formatting do not count, nor do imports that only annotations or decorators use.
-    Modules that are imported by a computed name cannot be recognised; name them in `chosen`.
+    Modules that are imported by a computed name, such as that of the method that is fitted, cannot
+    be recognised; name them, too.
 
     Parameters
     ----------
     *names : str
         Commands, such as "figure templates"; modules; or files of programs, relative to the
         repository, whose imports are also searched in their folder.
-    chosen : iterable of str
-        Further modules, such as that of the method that is fitted.
 
     Returns
     -------
@@ -40,8 +39,8 @@ def source_hash(*names: str, chosen: Iterable[str] = ()) -> str:
     ValueError
         If there is no such command, module or file.
     """
-    commands = found()
-    queue = [commands[name][0] if name in commands else name for name in (*names, *chosen)]
+    commands = command_modules()
+    queue = [commands[name][0] if name in commands else name for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)
     for name in queue:
@@ -97,6 +96,8 @@ def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
 
 def _used_names(tree: ast.Module) -> set[str]:
     """Return the names that code uses, without those of annotations and decorators."""
+    # Identities of all nodes below annotations of arguments and variables, return types and
+    # decorators.
     ignored_nodes = set()
     for node in ast.walk(tree):
         parts = [getattr(node, name, None) for name in ("annotation", "returns")]
@@ -108,14 +109,13 @@ def _used_names(tree: ast.Module) -> set[str]:
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
     """Remove all statements that are only a constant, such as docstrings, from a syntax tree."""
-
-    def is_text(statement: ast.stmt) -> bool:
-        return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [s for s in body if not is_text(s)]  # type: ignore[attr-defined]
+        if isinstance(body := getattr(node, "body", None), list):
+            node.body = [  # type: ignore[attr-defined]
+                s
+                for s in body
+                if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
+            ]
     return tree
 
 

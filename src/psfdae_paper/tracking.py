@@ -1,4 +1,4 @@
-"""Finished runs in the results folder, as MLflow shows them: where they are, what they say."""
+"""Finished runs in the results folder, read for MLflow: their files, settings and metrics."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
-from psfdae.files import Product, ProductError, read_product
+from psfdae.files import ProductError, read_product
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
@@ -29,30 +30,15 @@ from psfdae_paper.sweeps.points import hash_of
 WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
 """Files of the networks of scene 3, in their folders."""
 
-MEASURED = ("method", "noise_level", "metric", "value", "stderr")
-"""Columns of tables of errors."""
-
 AVERAGED = ("mse", "ssim")
 """Metrics of which a run has the mean over the noise levels, too."""
 
-STATISTICS = ("mean_abs_error", "bias", "variance")
-
-OF_DATASET = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
-"""Settings by which datasets differ."""
-
 MODEL = "model/"
-"""Files of a run that are its model have names that begin so."""
-
-SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
-POINT_FILES = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
-"""Files that a point of a sweep may have beside its model; a failed one has the first."""
-
-CONTENT = 2
-"""Goes into every content hash: raise it when what is taken from the files changes."""
+"""Prefix of the names of files that are the model of a run."""
 
 
 class Point(NamedTuple):
-    """A metric at an epoch (0: of the finished run); time in ms since 1970."""
+    """Value of a metric at an epoch, 0 for the finished run; time in ms since 1970."""
 
     name: str
     value: float
@@ -60,20 +46,8 @@ class Point(NamedTuple):
     time_ms: int
 
 
-class Named(TypedDict):
-    """Name of a run; see `Run`."""
-
-    kind: str
-    dataset: str
-    split: str
-    reference: str
-    source: str
-    name: str
-    experiment: str
-
-
 class Fit(NamedTuple):
-    """A fit of a method that a model bundle can hold, and its place."""
+    """Fit of a method that a model bundle can hold, and its folder or file."""
 
     kind: type[Method]
     place: Path
@@ -81,38 +55,41 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """Finished run of a method, a network or a sweep.
 
     Attributes
     ----------
     kind, dataset, split, reference : str
+        Method, or kind of network; name of the stars; split and reference of the training.
     source : str
-        The model's place below the results folder, which tells runs apart that agree in
+        Path of the model below the results folder, which distinguishes runs that agree in
         everything else.
     name, experiment : str
-    files : mapping
-        By their names within the run.
+        Name of the run, and of MLflow's experiment that holds it.
+    files : mapping of str to Path
+        Files by their names within the run.
     config : mapping
+        Configuration of the training, with that of its stars.
     end_ms : int
-        In ms since 1970.
-    metrics : mapping
-        Of the finished run.
-    epochs : sequence
-        Rows of the course of the training.
+        Time of the end in ms since 1970.
+    metrics : mapping of str to float
+        Metrics of the finished run.
+    epochs : sequence of mappings
+        Rows of the training history.
     seconds : float or None
-        That the run took; None: those of the last epoch.
+        Duration of the run; by default that up to the last epoch.
     status : str
-        MLflow's.
+        Status in MLflow.
     parent : str
-        Source of the run that this one is a part of, which comes first.
-    tags : mapping
-        Beside those that all runs have.
+        Source of the run that this one is a part of, which is imported before it.
+    tags : mapping of str to str
+        Tags that not all runs have.
     data : Path or None
-        Product that was learnt from.
+        Product with the training data.
     fit : Fit or None
-        Of a run whose model restores lone stamps.
+        Fit of a run whose model restores single stamps.
     content_hash : str
-        Of files and settings.
+        Hash of files and settings.
 
     Raises
     ------
@@ -127,10 +104,10 @@ class Run:
     source: str
     name: str
     experiment: str
-    files: Mapping[str, Path]
-    config: Mapping[str, Any]
-    end_ms: int
-    metrics: Mapping[str, float]
+    files: Mapping[str, Path] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    end_ms: int = 0
+    metrics: Mapping[str, float] = field(default_factory=dict)
     epochs: Sequence[Mapping[str, float]] = ()
     seconds: float | None = None
     status: str = "FINISHED"
@@ -142,39 +119,44 @@ class Run:
 
     def __post_init__(self) -> None:
         contents = {name: digest_of(path) for name, path in self.files.items()}
-        object.__setattr__(self, "content_hash", hash_of([CONTENT, self.config_hash, contents]))
+        # 2 is a version: raise it when other metrics or settings are read from the files, and all
+        # runs are imported again.
+        object.__setattr__(self, "content_hash", hash_of([2, self.config_hash, contents]))
 
     @property
     def config_hash(self) -> str:
-        """Tells settings apart; `content_hash` settings and files."""
+        """Hash of the settings alone."""
         return hash_of(self.config)
 
     @property
     def start_ms(self) -> int:
-        """The end less the seconds that the run took."""
-        took = max((row["seconds"] for row in self.epochs), default=0.0)
-        return self.end_ms - int(1000 * (took if self.seconds is None else self.seconds))
+        """Time of the start in ms since 1970, from the end and the duration."""
+        seconds = self.seconds
+        if seconds is None:
+            seconds = max((row["seconds"] for row in self.epochs), default=0.0)
+        return self.end_ms - int(1000 * seconds)
 
     @property
     def points(self) -> list[Point]:
-        """All metrics that are finite."""
+        """Metrics of all epochs and of the finished run, as far as they are finite."""
         points = epoch_points(self.epochs, self.start_ms)
         points += [Point(name, value, 0, self.end_ms) for name, value in self.metrics.items()]
         return [point for point in points if math.isfinite(point.value)]
 
 
 def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
-    """Finished runs of some datasets.
+    """Read the finished runs of datasets.
 
-    An evaluation is the last file of a run, so it is what counts: models still in
-    training are passed over. A method that is fitted once for both references is measured
-    against each of them; each of these measurements is a run, so that the metrics of all
-    methods with the same tags can be compared.
+    An evaluation is the last file of a run, so that models still in training have none. A method
+    that is fitted once for both references is measured against each of them; each of these
+    measurements is a run, so that the metrics of all methods with the same tags can be compared.
 
     Parameters
     ----------
-    results : folder that the workflow writes to
-    datasets : name of each dataset, and its product "stars"
+    results : Path
+        Folder that the workflow writes to.
+    datasets : mapping of str to Path
+        Product "stars" by name of the dataset.
 
     Raises
     ------
@@ -189,17 +171,18 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
         if not evaluations:
             raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
         for path in evaluations:
+            # Every method in the table of errors that leaves files is a run.
             split, reference = path.stem.split("-", 1)
             key = {"dataset": dataset, "split": split, "reference": reference}
             figures = _figures(results / "figures" / dataset, split, reference)
-            measured = {row["method"] for row in read_csv(path, "method")}
+            evaluated = {row["method"] for row in read_csv(path, "method")}
             for kind in registered():
-                if kind.storage and kind.name in measured:
-                    runs.append(_of_stars(results, kind, key, stars, path, figures))
+                if kind.storage and kind.name in evaluated:
+                    runs.append(_run_of_fit(results, kind, key, stars, path, figures))
     return runs
 
 
-def _of_stars(
+def _run_of_fit(
     results: Path,
     kind: type[Method],
     key: dict[str, str],
@@ -207,86 +190,100 @@ def _of_stars(
     evaluation: Path,
     figures: Mapping[str, Path],
 ) -> Run:
-    """A model and its evaluation.
+    """Read a fit to the stars of a dataset, and its evaluation.
 
     Its config is that of the model together with that of its stars: a network trained on
     the stars of another telescope is another run.
+
+    Parameters
+    ----------
+    results : Path
+    kind : type of Method
+    key : dict of str
+        Dataset, split and reference of the training.
+    stars, evaluation : Path
+        Product "stars", and table of errors.
+    figures : mapping of str to Path
+        Figures by their names within the run.
     """
-    source = fits.place_of(kind, **key)
-    model = results / source
-    files = {**_model_files(kind, model), "evaluation.csv": evaluation, **figures}
+    # The model must have been trained on the stars of the dataset.
+    model = results / fits.place_of(kind, **key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
-    own, run_kind = kind.described(model), fits.storage_of(kind).run or kind.name
-    # Which start succeeded is an outcome, not a setting.
-    own.pop("attempt", None)
+    try:
+        experiment = str(product.config["scene"]["experiment"])
+    except (KeyError, TypeError):
+        raise ProductError(f"{stars}: its config has no scene.experiment") from None
+    settings = kind.described(model)
+    # The number of the start that succeeded is a result, not a setting.
+    settings.pop("attempt", None)
+    # Value and standard error at each noise level, then means over the levels.
     metrics: dict[str, float] = {}
-    rows = [row for row in read_csv(evaluation, *MEASURED) if row["method"] == kind.name]
+    columns = ("method", "noise_level", "metric", "value", "stderr")
+    rows = [row for row in read_csv(evaluation, *columns) if row["method"] == kind.name]
     for row in rows:
-        metrics |= _measured(evaluation, row)
+        metric, level = row["metric"], f"{number(evaluation, row['noise_level']):g}"
+        metrics[f"test_{metric}_{level}"] = number(evaluation, row["value"])
+        metrics[f"test_{metric}_stderr_{level}"] = number(evaluation, row["stderr"])
     for metric in AVERAGED:
         values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
         if values:
             metrics[f"test_{metric}"] = fmean(values)
-    trained = HISTORY in fits.storage_of(kind).diagnostics
-    return Run(
-        dataset=key["dataset"],
-        split=key["split"],
-        reference=key["reference"],
-        kind=run_kind,
-        source=source,
-        name=" ".join([*key.values(), run_kind]),
-        experiment=_experiment(product),
-        files=files,
-        config={**product.config, **own},
+    # Methods that are trained in epochs have a history.
+    epochs: Sequence[Mapping[str, float]] = ()
+    if HISTORY in fits.storage_of(kind).diagnostics:
+        epochs = _epochs(fits.path_beside(kind, model, HISTORY), "train_mse", "validation_mse")
+    return replace(
+        _named_after_fit(kind, **key, experiment=experiment),
+        files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
+        config={**product.config, **settings},
         end_ms=_time_ms(fits.outputs(kind, model)[0]),
         metrics=metrics,
         data=stars,
         fit=Fit(kind, model) if kind.packing else None,
-        epochs=_epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
-        if trained
-        else (),
+        epochs=epochs,
     )
 
 
-def _experiment(stars: Product) -> str:
-    """Name of the experiment of stars, their scene; raises ProductError without one."""
-    try:
-        return str(stars.config["scene"]["experiment"])
-    except (KeyError, TypeError):
-        raise ProductError(f"{stars.path}: its config has no scene.experiment") from None
-
-
-def _measured(path: Path, row: Mapping[str, str]) -> dict[str, float]:
-    """Value and standard error of a row of a table of errors, by their names in MLflow."""
-    metric, level = row["metric"], f"{number(path, row['noise_level']):g}"
-    named = ((metric, "value"), (f"{metric}_stderr", "stderr"))
-    return {f"test_{name}_{level}": number(path, row[column]) for name, column in named}
+def _named_after_fit(
+    kind: type[Method], dataset: str, split: str, reference: str, experiment: str
+) -> Run:
+    """Return a run with the name of a fit to the stars of a dataset, and nothing else."""
+    run_kind = fits.storage_of(kind).run or kind.name
+    return Run(
+        kind=run_kind,
+        dataset=dataset,
+        split=split,
+        reference=reference,
+        source=fits.place_of(kind, dataset, split, reference),
+        name=" ".join([dataset, split, reference, run_kind]),
+        experiment=experiment,
+    )
 
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
-    """Files of a fit by their names within the run; `model/` is what the method loads."""
+    """List the files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
-    more = fits.storage_of(kind).diagnostics
-    return model | {name: fits.beside(kind, place, name) for name in more}
+    diagnostics = fits.storage_of(kind).diagnostics
+    return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:
-    """Figures of a dataset but for those whose path starts with another split or reference."""
-    ours = (f"{split}-{reference}", split)
+    """List figures of a dataset, without those whose path names another split or reference."""
     labels = [f"{s}-{r}" for s in ("random", "held_out") for r in ("realisation", "template")]
     labels += ["random", "held_out"]
-    found = {}
+    # Longer labels first, because "random" begins "random-template", too.
+    figures = {}
     for path in sorted(folder.rglob("*.png")):
         name = path.relative_to(folder).as_posix()
         label = next((label for label in labels if name.startswith(label)), None)
-        if label is None or label in ours:
-            found[f"figures/{name}"] = path
-    return found
+        if label in (None, f"{split}-{reference}", split):
+            figures[f"figures/{name}"] = path
+    return figures
 
 
 def runs_of_alignment(results: Path) -> list[Run]:
-    """The trained networks of scene 3.
+    """Read the trained networks of scene 3.
 
     Raises
     ------
@@ -296,46 +293,48 @@ def runs_of_alignment(results: Path) -> list[Run]:
     errors = results / "tables/alignment_errors.csv"
     if not errors.is_file():
         raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
+    # All networks share the table of errors and the figures of the scene.
     figures = sorted((results / "figures/alignment").glob("*.png"))
-    more = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
-    states = {kind: ALIGNERS[kind].states for kind in TRAINED} | {"dae": "grid"}
-    data = {kind: results / f"data/alignment/{name}.h5" for kind, name in states.items()}
-    return [_of_states(results / "alignment" / kind, data[kind], errors, more) for kind in WEIGHTS]
+    shared = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
+    runs = []
+    for kind, weights in WEIGHTS.items():
+        folder = results / "alignment" / kind
+        config = read_yaml(folder / CONFIG)
+        config.pop("attempt", None)
+        # Errors of the state in units of the range.
+        metrics = {}
+        for row in read_csv(errors, "test_set", "noise_level", "method", "parameter", "unit"):
+            if (row["method"], row["unit"]) == (kind, "range"):
+                level = f"{number(errors, row['noise_level']):g}"
+                for statistic in ("mean_abs_error", "bias", "variance"):
+                    name = f"{row['test_set']}_{row['parameter']}_{statistic}_{level}"
+                    metrics[name] = number(errors, row[statistic])
+        if not metrics:
+            raise ProductError(f"{errors}: no rows of method {kind!r}")
+        # The set of states on which it was trained.
+        states = "grid" if kind == "dae" else ALIGNERS[kind].states
+        runs.append(
+            replace(
+                _named_after_network(kind),
+                files={**_network_files(folder, weights), **shared},
+                config=config,
+                end_ms=_time_ms(folder / weights),
+                metrics=metrics,
+                data=results / f"data/alignment/{states}.h5",
+                epochs=_epochs(folder / HISTORY),
+            )
+        )
+    return runs
 
 
 def _network_files(folder: Path, weights: str) -> dict[str, Path]:
-    return {f"{MODEL}{name}": folder / name for name in (weights, CONFIG)} | {
-        HISTORY: folder / HISTORY
-    }
-
-
-def _of_states(folder: Path, data: Path, errors: Path, more: Mapping[str, Path]) -> Run:
-    kind, weights = folder.name, WEIGHTS[folder.name]
-    files = {**_network_files(folder, weights), **more}
-    config = read_yaml(folder / CONFIG)
-    config.pop("attempt", None)
-    metrics = {}
-    for row in read_csv(errors, "test_set", "noise_level", "method", "parameter", "unit"):
-        if (row["method"], row["unit"]) == (kind, "range"):
-            level = f"{number(errors, row['noise_level']):g}"
-            for statistic in STATISTICS:
-                name = f"{row['test_set']}_{row['parameter']}_{statistic}_{level}"
-                metrics[name] = number(errors, row[statistic])
-    if not metrics:
-        raise ProductError(f"{errors}: no rows of method {kind!r}")
-    return Run(
-        **_of_scene3(kind),
-        files=files,
-        config=config,
-        end_ms=_time_ms(folder / weights),
-        metrics=metrics,
-        data=data,
-        epochs=_epochs(folder / HISTORY),
-    )
+    """List the files of a network of scene 3 by their names within the run."""
+    model = {f"{MODEL}{name}": folder / name for name in (weights, CONFIG)}
+    return model | {HISTORY: folder / HISTORY}
 
 
 def runs_of_sweep(results: Path, name: str) -> list[Run]:
-    """A sweep and the points in its summary, the parent first.
+    """Read a sweep and the points in its summary, the parent first.
 
     Raises
     ------
@@ -346,14 +345,16 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
+    # A row of the summary for each point.
     rows = list(read_csv(summary, "point", "status"))
-    points = [_point_of_sweep(folder / "points" / row["point"], name, row["point"]) for row in rows]
-    figures = sorted((folder / "figures").glob("*.png"))
-    paths = [*(folder / file for file in SUMMARY_FILES), *figures]
-    best, states = read_yaml(folder / "best.yaml"), [row["status"] for row in rows]
-    metrics = {f"best_{key}": value for key, value in best.get("metrics", {}).items()}
+    points = [_run_of_point(results, name, row["point"]) for row in rows]
+    tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
+    paths = [*tables, *sorted((folder / "figures").glob("*.png"))]
+    # Metrics of the best point, and numbers of points by their status.
+    best_point, statuses = read_yaml(folder / "best.yaml"), [row["status"] for row in rows]
+    metrics = {f"best_{key}": value for key, value in best_point.get("metrics", {}).items()}
     for status in ("finished", "stopped", "failed"):
-        metrics[f"points_{status}"] = float(states.count(status))
+        metrics[f"points_{status}"] = float(statuses.count(status))
     parent = Run(
         kind="sweep",
         **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
@@ -365,22 +366,31 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
         config=read_yaml(folder / "sweep.yaml"),
         end_ms=_time_ms(summary),
         metrics=metrics,
-        tags={"best_point": str(best.get("point", ""))},
+        tags={"best_point": str(best_point.get("point", ""))},
     )
     return [parent, *points]
 
 
-def _point_of_sweep(place: Path, name: str, point: str) -> Run:
+def _run_of_point(results: Path, name: str, point: str) -> Run:
+    """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
     from psfdae_paper.sweeps.measured import fit_in, read_cost, read_result
 
-    result = read_result(place / "result.json")
-    model = result["model"]
+    folder = results / "sweeps" / name / "points" / point
+    result = read_result(folder / "result.json")
+    model, config = result["model"], result["config"]
+    # Files of the model, and the product with its training data if the workflow made it.
+    data = None
     if model in SWEPT:
-        of_model = _network_files(place, NETWORK_WEIGHTS)
+        model_files = _network_files(folder, NETWORK_WEIGHTS)
+        data = results / f"data/alignment/{ALIGNERS[model].states}.h5"
     else:
-        of_model = _model_files(method(model), fit_in(method(model), place))
-    files = {file: place / file for file in POINT_FILES} | of_model
-    history = place / HISTORY
+        model_files = _model_files(method(model), fit_in(method(model), folder))
+        with suppress(KeyError):
+            data = results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
+    tables = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
+    files = {file: folder / file for file in tables} | model_files
+    history = folder / HISTORY
+    # The run is named by the values of the point on the axes of the sweep.
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
     return Run(
         kind=model,
@@ -389,61 +399,43 @@ def _point_of_sweep(place: Path, name: str, point: str) -> Run:
         name=values or point,
         experiment=f"sweep_{name}",
         files={file: path for file, path in files.items() if path.is_file()},
-        config={**result["config"], "axes": result["values"]},
-        end_ms=_time_ms(place / "result.json"),
+        config={**config, "axes": result["values"]},
+        end_ms=_time_ms(folder / "result.json"),
         metrics=result["metrics"],
         epochs=_epochs(history) if history.is_file() else (),
-        seconds=read_cost(place)["seconds"],
+        seconds=read_cost(folder)["seconds"],
         status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
-        data=_data_of(place.parents[3], result),
+        data=data,
     )
 
 
-def _data_of(results: Path, result: Mapping[str, Any]) -> Path | None:
-    """Product of a point of a sweep, if the workflow made it under its usual name."""
-    config = result["config"]
-    try:
-        if result["model"] in SWEPT:
-            return results / f"data/alignment/{ALIGNERS[result['model']].states}.h5"
-        return results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
-    except KeyError:
-        return None
-
-
 def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
-    """Return the run of a training under way, by its checkpoint's place; None if it has no run.
+    """Return the run of a training under way, by its checkpoint's path; None if it has no run.
 
-    Those of datasets and of scene 3 have runs.
+    Trainings of datasets and of scene 3 have runs.
     """
     folder = results / "checkpoints"
     if not checkpoint.is_relative_to(folder):
         return None
-    *places, stem = checkpoint.relative_to(folder).with_suffix("").parts
+    # Either method/dataset/split-reference or alignment-network.
+    *folders, stem = checkpoint.relative_to(folder).with_suffix("").parts
     network = stem.removeprefix("alignment-")
-    if len(places) == len(("method", "dataset")):
-        (kind, dataset), (split, reference) = places, stem.split("-", 1)
-        name = fits.storage_of(method(kind)).run or kind
-        said = Named(
-            kind=name,
-            dataset=dataset,
-            split=split,
-            reference=reference,
-            source=fits.place_of(method(kind), dataset, split, reference),
-            name=" ".join([dataset, split, reference, name]),
-            experiment=load((f"dataset={dataset}", f"preset={preset}")).scene.experiment,
-        )
+    if len(folders) == 2:
+        (kind, dataset), (split, reference) = folders, stem.split("-", 1)
+        experiment = load((f"dataset={dataset}", f"preset={preset}")).scene.experiment
+        run = _named_after_fit(method(kind), dataset, split, reference, experiment)
     elif network in WEIGHTS and network != stem:
-        said = _of_scene3(network)
+        run = _named_after_network(network)
     else:
         return None
-    return Run(**said, files={}, config={}, metrics={}, end_ms=0, status="RUNNING")
+    return replace(run, status="RUNNING")
 
 
-def _of_scene3(kind: str) -> Named:
-    """Return the name of the run of a network of scene 3."""
-    return Named(
+def _named_after_network(kind: str) -> Run:
+    """Return a run with the name of a network of scene 3, and nothing else."""
+    return Run(
         kind=kind,
         dataset="alignment",
         split="uniform and grid",
@@ -455,30 +447,31 @@ def _of_scene3(kind: str) -> Named:
 
 
 def settings_of(run: Run, preset: str) -> dict[str, str]:
-    """The settings that tell a run from others, by their dotted names.
+    """Return the settings that distinguish a run from others, by their dotted names.
 
-    They are what its dataset and its method are, and those that are not the configuration's for
-    this dataset and preset. Which they are does not depend on other runs.
+    These are its method, those by which datasets differ, and those that are not the
+    configuration's for this dataset and preset. The choice does not depend on other runs.
     """
-    usual = _usual(run.dataset, preset)
+    dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
+    defaults = _default_settings(run.dataset, preset)
     differing = {
         key: value
         for key, value in flatten(run.config).items()
-        if key in OF_DATASET or usual.get(key) != value
+        if key in dataset_keys or defaults.get(key) != value
     }
     return {"method": run.kind, "split": run.split, "reference": run.reference, **differing}
 
 
 @cache
-def _usual(dataset: str, preset: str) -> dict[str, str]:
-    """Settings of a dataset where nobody gives others; none if the configuration has it not."""
+def _default_settings(dataset: str, preset: str) -> dict[str, str]:
+    """Return the settings of a dataset in the configuration; none if it has no such dataset."""
     if dataset not in dataset_names() or not (config_dir() / f"preset/{preset}.yaml").is_file():
         return {}
     return flatten(load((f"dataset={dataset}", f"preset={preset}")).model_dump())
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Leaves of a config by their dotted names; lists and other values as JSON, text as it is."""
+    """Return the leaves of a config by their dotted names: text unchanged, other values as JSON."""
     leaves: dict[str, str] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):
@@ -498,7 +491,7 @@ def digest_of(path: Path) -> str:
 
 
 def _time_ms(path: Path) -> int:
-    """When a file was written, in ms since 1970."""
+    """Return the time at which a file was written, in ms since 1970; raises ProductError."""
     try:
         return int(path.stat().st_mtime * 1000)
     except FileNotFoundError:
@@ -506,20 +499,25 @@ def _time_ms(path: Path) -> int:
 
 
 def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
+    """Read the rows of a training history, which must have these columns."""
     rows = read_csv(history, "epoch", "seconds", *columns)
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 
 def epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
-    """Metrics of every epoch of a history, and the best validation error."""
+    """List the metrics of every epoch of a history, and the best validation error.
+
+    `start_ms` is the start of the training in ms since 1970.
+    """
+    # Other columns of the history are counters and times, not metrics.
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))
         for row in epochs
         for name, value in row.items()
         if name not in ("epoch", "step", "seconds", "cpu_seconds")
     ]
-    # MLflow's lists show the last value; the network kept is that of the lowest.
-    valid = [p for p in points if p.name == "validation_mse" and math.isfinite(p.value)]
-    if valid:
-        points.append(min(valid, key=lambda p: p.value)._replace(name="best_validation_mse"))
+    # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
+    errors = [p for p in points if p.name == "validation_mse" and math.isfinite(p.value)]
+    if errors:
+        points.append(min(errors, key=lambda p: p.value)._replace(name="best_validation_mse"))
     return points

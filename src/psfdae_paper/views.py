@@ -1,7 +1,7 @@
-"""Tables of runs that MLflow's page of an experiment opens by the links of its description.
+"""Tables of runs that open by links in the description of an MLflow experiment.
 
-MLflow keeps a view that somebody shares as a tag of the experiment, and opens it by an address
-with the tag's name. Views are made here in the same form.
+MLflow stores a view of its table of runs that a user shares as a tag of the experiment, and opens
+it by an address with the tag's name. Views are made here in the same form.
 """
 
 from __future__ import annotations
@@ -17,58 +17,57 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 VIEW = "mlflow.sharedViewState."
-"""Begins the names of tags that are views."""
-
-NOTE = "mlflow.note.content"
-"""Tag with the description of an experiment."""
-
-COMPARED = (*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse")
-"""Metrics of which each has the same meaning for every run of an experiment."""
+"""Prefix of the names of tags that are views."""
 
 
 def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
-    """Set the views of the records of an experiment, and its description if nobody wrote one."""
-    known = dict(client.get_experiment(experiment).tags)
-    wanted = {f"{VIEW}{name}": view for name, view in views(records).items()}
-    if known.get(NOTE) in (None, note(experiment, {*known})):
-        wanted[NOTE] = note(experiment, {*known, *wanted})
-    for key, value in wanted.items():
-        if known.get(key) != value:
+    """Set the views of the records of an experiment, and its description if no user wrote one."""
+    description = "mlflow.note.content"  # MLflow's tag
+    tags = dict(client.get_experiment(experiment).tags)
+    new_tags = {f"{VIEW}{name}": view for name, view in views(records).items()}
+    if tags.get(description) in (None, note(experiment, {*tags})):
+        new_tags[description] = note(experiment, {*tags, *new_tags})
+    for key, value in new_tags.items():
+        if tags.get(key) != value:
             client.set_experiment_tag(experiment, key, value)
 
 
 def views(records: Sequence[Run]) -> dict[str, str]:
-    """Return the views as MLflow reads them: of all runs, and of each dataset by its name."""
-    shown = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
-    made = {"all": _view(shown, "")} if shown else {}
-    for name in dict.fromkeys(r.dataset for r in shown if r.fit and not r.parent):
-        ours = [record for record in shown if record.dataset == name]
-        made[name] = _view(ours, f" and tags.dataset = '{name}'")
-    return made
+    """Return the views of all runs with a model, and of those of each dataset by its name."""
+    with_model = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
+    by_name = {"all": _view(with_model, "")} if with_model else {}
+    for dataset in dict.fromkeys(r.dataset for r in with_model if r.fit and not r.parent):
+        of_dataset = [record for record in with_model if record.dataset == dataset]
+        by_name[dataset] = _view(of_dataset, f" and tags.dataset = '{dataset}'")
+    return by_name
 
 
 def note(experiment: str, tags: set[str]) -> str:
-    """Return the description of an experiment in Markdown, with a link to each view."""
-    names = sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW))
-    links = [f"[{name}]({address(experiment, name)})" for name in names]
+    """Return the description of an experiment in Markdown, with a link to each view.
+
+    `tags` are the names of all tags of the experiment.
+    """
+    links = []
+    for name in sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW)):
+        # The workflow type hides pages that are for language models.
+        query = urlencode({"viewStateShareKey": name, "workflowType": "machine_learning"})
+        links.append(f"[{name}](#/experiments/{experiment}/runs?{query})")
     return f"Runs of {', '.join(links)}; docs/compare.md says what the columns mean."
 
 
-def address(experiment: str, view: str) -> str:
-    """Return the address of a view within MLflow's page."""
-    # The second word hides pages that are for language models.
-    words = {"viewStateShareKey": view, "workflowType": "machine_learning"}
-    return f"#/experiments/{experiment}/runs?{urlencode(words)}"
+def _view(records: Sequence[Run], condition: str) -> str:
+    """Return a view as MLflow reads it: runs that are not superseded, the smallest error first.
 
-
-def _view(records: Sequence[Run], only: str) -> str:
-    """Return a table of the runs that are not superseded, the least error first."""
-    metrics = [name for name in COMPARED if any(name in r.metrics for r in records)]
+    `condition` limits the runs further, in the language of MLflow's search.
+    """
+    # Metrics that have the same meaning for every run; without them, the first eight.
+    common = [*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse"]
+    metrics = [name for name in common if any(name in r.metrics for r in records)]
     metrics = metrics or list(records[0].metrics)[:8]
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
     columns = [f"params.`{axis}`" for axis in axes] + [f"metrics.`{name}`" for name in metrics]
     state = {
-        "searchFilter": f"tags.superseded = 'false'{only}",
+        "searchFilter": f"tags.superseded = 'false'{condition}",
         "orderByKey": f"metrics.`{metrics[0]}`",
         "orderByAsc": True,
         "selectedColumns": [*columns, "attributes.`Models`", "attributes.`Dataset`"],

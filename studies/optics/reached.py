@@ -23,7 +23,7 @@ from psfdae.metrics import clustered_mean
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.threads import limit_threads
 from psfdae_paper.bounds import sampling
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import bounded_stars, true_modes
 from psfdae_paper.configuration.compose import load
 
 BOUND_OF = {"wavefront": "bayes", "wavefront_position": "bayes_position"}
@@ -82,18 +82,14 @@ def misses(config, product, drawn, optics) -> dict:
     fitted = kind.with_bank(drawn, config, data)
     stars = bounded_stars(config, product)
     position, count = field_positions(product)[stars.star], len(stars.star)
-    truth = sampling.Modes.at(
-        np.arange(count),
-        stars.field,
-        product["peak"][stars.star] - product["jitter"][stars.star],
-        np.full(count, sampling.TRUTH),
-        fitted.model.standardised(product["seidel"][stars.star]),
-    )
+    truth = true_modes(fitted.model, product, stars)
     found = {}
     for level, noisy in stars.noisy.items():
         modes, doubtful = fitted.modes(noisy, level, position)
         likelihood = fitted.likelihood(level)
-        right = sampling.climb(truth, likelihood.counts(noisy), likelihood, fitted.model)
+        counts = likelihood.counts(noisy)
+        posteriors = sampling.StarPosteriors(counts, likelihood, fitted.model)
+        right = sampling.climb(truth, posteriors)
         best = np.full(count, -np.inf)
         np.maximum.at(best, modes.star, modes.evidence)
         lost = right.star[right.evidence > best[right.star] + MISSED]

@@ -136,7 +136,7 @@ def places(
         [_cut(star, one[None], side) for star, one in zip(right, at, strict=True)]
     )
     right /= right.sum(axis=(1, 2), keepdims=True)
-    ours = model.engine.estimator.model
+    ours = model.method.model
     terms = ours.terms(position)
     draws = {"psfdae": lambda centre: ours.images(terms, centre, side)}
     for package, file in (other.split("=", 1) for other in others):

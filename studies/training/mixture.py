@@ -21,7 +21,7 @@ PARTS = 5  # by noise, of equally many stars
 def draw(cube: str, truth: str, count: int) -> None:
     """Noisy stamps of stars drawn from the mixture, and their noise-free images of sum 1."""
     model, rng = psfdae.load_model(), np.random.default_rng(0)
-    law, info = model.engine.estimator, model.info
+    law, info = model.method, model.info
     side, ends = info.stamp_px, law.rows.cumsum()
     cluster = rng.choice(len(law.count), count, p=law.count / law.count.sum())
     coordinates = law.mean[cluster].astype(float)

@@ -101,11 +101,12 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     many passes as threads beside each other. Then the memory of the prediction in MB,
     interpreter and libraries included.
     """
-    from psfdae.model.psf_model import BLOCK, load_model
+    from psfdae.model.psf_model import load_model
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
-    model.predict(np.zeros((WARM_UP * BLOCK, side, side), np.float32), threads=threads)
+    warm_up = np.zeros((WARM_UP * model.restorer.block_size, side, side), np.float32)
+    model.predict(warm_up, threads=threads)
     options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
     rates = {"bare_shared": [], "bare_parallel": [], "predict": []}
     for _ in range(repeats):
@@ -125,22 +126,18 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.model.psf_model import BLOCK, one_thread_each
     from psfdae.networks.dae import predict
-    from psfdae.threads import side_by_side
+    from psfdae.threads import one_thread_each, side_by_side
 
-    side, factor, network = (
-        model.info.stamp_px,
-        model.info.image_scale,
-        model.engine.estimator.network,
-    )
+    side, factor, network = model.stamp_px, model.info.image_scale, model.method.network
     mean = model.bundle.flux_model.mean.reshape(1, side, side).astype(np.float32)
     images = np.repeat(mean, min(BARE_STAMPS, stamps), axis=0)
     rounds = -(-stamps // len(images))
-    blocks = rounds * np.array_split(images, range(BLOCK, len(images), BLOCK))
+    size = model.restorer.block_size
+    blocks = rounds * np.array_split(images, range(size, len(images), size))
 
     def apply(some):
-        return predict(network, some, factor, BLOCK)
+        return predict(network, some, factor, size)
 
     if way == "shared":
         before = torch.get_num_threads()

@@ -257,7 +257,7 @@ rule knee_train:
         config=lambda w: settings(
             "fit", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point), name="dae"
         ),
-        source=source_hash("fit", chosen=["psfdae.methods.dae"]),
+        source=source_hash("fit", "psfdae.methods.dae"),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:

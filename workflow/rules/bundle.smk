@@ -19,7 +19,7 @@ for _method in (m for m in registered() if m.storage and m.packing):
             mem_mb=max(1500, _method.needs.memory_mb),
         params:
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
-            source=source_hash("bundle", chosen=[_method.__module__]),
+            source=source_hash("bundle", _method.__module__),
             model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
             # A model that comes with a package is small.
             size=lambda w: ["--largest-mb=4.8"] * (w.dataset == SHIPPED_DATASET),

@@ -80,9 +80,7 @@ def program(name):
 
 def program_code(name, stages):
     """Hash of a command of a program, and of the stages that it runs."""
-    return source_hash(
-        f"workflow/benchmarks/{name.partition('.')[0]}.py", chosen=stages
-    )
+    return source_hash(f"workflow/benchmarks/{name.partition('.')[0]}.py", *stages)
 
 
 # Stars of an image are not simulated: own_stars.smk.
@@ -292,7 +290,7 @@ def bundles_of(dataset, networks):
 def estimators_source(command, dataset):
     """Hash of a command that applies the methods of a dataset."""
     names = names_of(dataset)
-    return source_hash(command, chosen=[method(name).__module__ for name in names])
+    return source_hash(command, *(method(name).__module__ for name in names))
 
 
 def fit_threads(dataset):
@@ -305,7 +303,7 @@ def histories_of(dataset):
     """Courses of the trainings of a dataset, and a label of each."""
     trained = [m for m in methods_of(dataset) if HISTORY in m.storage.diagnostics]
     return {
-        str(fits.beside(m, model_of(m, dataset, split, reference), HISTORY)): ", ".join(
+        str(fits.path_beside(m, model_of(m, dataset, split, reference), HISTORY)): ", ".join(
             [dataset, split, reference] + [m.look.label] * (len(trained) > 1)
         )
         for m in trained

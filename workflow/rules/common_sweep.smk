@@ -73,7 +73,7 @@ def sweep_source(name):
     sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
     own = [] if sweep.model in SWEPT else [method(sweep.model).__module__]
-    return source_hash("sweep point", chosen=[module_of(sweep.model), *own, *search])
+    return source_hash("sweep point", module_of(sweep.model), *own, *search)
 
 
 def sweep_results(w):

@@ -26,7 +26,7 @@ for _method in (m for m in registered() if m.storage):
             config=lambda w, m=_method: settings(
                 "fit", f"dataset={w.dataset}", name=m.name
             ),
-            source=source_hash("fit", chosen=[_method.__module__]),
+            source=source_hash("fit", _method.__module__),
             method=_method.name,
             more=lambda w, input, m=_method: [
                 *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),

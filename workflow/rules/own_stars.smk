@@ -54,7 +54,7 @@ rule own_stars:
             more=(f"methods=[{','.join(OWN_STARS_METHODS)}]",),
         ),
         source=source_hash(
-            "from-stars", chosen=[method(m).__module__ for m in OWN_STARS_METHODS]
+            "from-stars", *(method(m).__module__ for m in OWN_STARS_METHODS)
         ),
         folder=subpath(output.bundle, parent=True),
     message:

@@ -1,8 +1,7 @@
-"""Command `describe`: what a model was trained for, and how well it does."""
+"""Command `describe`: what a model was trained for, and how accurately it restores stars."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated
 
 from psfdae.bundle_info import BundleInfo
@@ -13,9 +12,7 @@ from psfdae.methods import method
 from psfdae.model.bundle import Bundle, estimator, read_bundle
 from psfdae.options import File
 
-Packed = Annotated[File | None, {"argument": True}]
-
-METRICS = {
+METRIC_COLUMNS = {
     "noise_level": ("λ", ".2g"),
     "noise": ("noise/flux", ".2e"),
     "snr": ("S/N", ".1f"),
@@ -27,89 +24,87 @@ METRICS = {
     "coverage95": ("in 95 %", ".1%"),
     "coverage_rms": ("in rms", ".1%"),
 }
-"""Columns of the table: key, heading, format."""
+"""Heading and number format of each column of the table of errors, by the name of the metric."""
 
 
 @command("describe")
-def describe(
-    bundle: Packed = None,
-) -> None:
+def describe(bundle: Annotated[File | None, {"argument": True}] = None) -> None:
     """Say what BUNDLE (default: the shipped one) was trained for and how well it does."""
     print(description(read_bundle(bundle)))
 
 
-def description(packed: Bundle) -> str:
-    """Return the facts and the errors of a bundle as text."""
-    facts = _facts(packed)
+def description(bundle: Bundle) -> str:
+    """Return the facts about a model and the errors of its test stars as text.
+
+    Facts stand one in a line; the table of errors has a row for each noise level.
+    """
+    facts = _facts(bundle)
+    # Names are padded to the longest one, so that all facts begin in the same column.
     width = max(len(name) for name in facts)
     lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
-    return "\n".join([*lines, "", "Errors of the test stars:", _table(packed.info)])
+    return "\n".join([*lines, "", "Errors of the test stars:", _error_table(bundle.info)])
 
 
-def _facts(packed: Bundle) -> dict[str, str]:
-    info = packed.info
+def _facts(bundle: Bundle) -> dict[str, str]:
+    """Return the facts about a model by their names, in the order in which they are printed."""
+    info = bundle.info
+    # Width of a pixel in arcsec, and in units of λ/D where the telescope is known.
     scale = f"{info.pixel_scale_arcsec:g} arcsec{', assumed' if info.scale_assumed else ''}"
     if info.pixel_lambda_d is not None:
         scale += f" ({info.pixel_lambda_d:.3g} λ/D)"
-    framing = f"{info.framing}, ± {info.jitter_px} px"
-    count = sum(array.size for array in packed.weights.values())
+    # A network is described by its layers; another method by its name and by what its fit knows
+    # about the field, such as the order of the polynomial.
+    number_count = sum(array.size for array in bundle.weights.values())
     normalisation = f"{info.normalisation} 1"
     if info.dae:
         normalisation += f"; the network sees it × {info.image_scale:g}"
-        shape = f"kernels {_list(info.dae.kernels)}; widths {_list(info.dae.widths)}"
-        network = {"Network": f"{shape}; {count} weights"}
+        kernels, widths = (" ".join(map(str, v)) for v in (info.dae.kernels, info.dae.widths))
+        method_facts = {"Network": f"kernels {kernels}; widths {widths}; {number_count} weights"}
     else:
-        network = {"Method": f"{method(info.method).look.label}; {count} numbers"}
-    fitted = None if info.dae else estimator(packed)
-    own: Mapping[str, str] = fitted.facts() if isinstance(fitted, KnowsField) else {}
+        method_facts = {"Method": f"{method(info.method).look.label}; {number_count} numbers"}
+        fitted = estimator(bundle)
+        if isinstance(fitted, KnowsField):
+            method_facts |= fitted.facts()
+    star_kind = {"simulated": "simulated stars", "stars": "stars of an image"}[info.source]
     return {
         "Name": info.name,
         "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",
         "Licence": info.licence,
-        "SHA-256": packed.sha256,
+        "SHA-256": bundle.sha256,
         "Stamp": f"{info.stamp_px} × {info.stamp_px} px of {scale}",
-        "Framing": framing + (", any sub-pixel position" if info.subpixel else ""),
+        "Framing": f"{info.framing}, ± {info.jitter_px} px"
+        + (", any sub-pixel position" if info.subpixel else ""),
         "Normalisation": normalisation,
         "S/N": f"{info.snr_min:.3g} to {info.snr_max:.3g}",
         "Noise-equivalent area": f"{info.noise_equivalent_px:.3g} px",
-        **network,
-        **own,
-        "Trained on": f"{info.training_stars} {_KINDS[info.source]}, "
-        f"SHA-256 {info.training_sha256[:16]}…",
+        **method_facts,
+        "Trained on": f"{info.training_stars} {star_kind}, SHA-256 {info.training_sha256[:16]}…",
         **({"Adapted to": f"{info.adapted}, after its training"} if info.adapted else {}),
-        **({"Light beyond the stamp": str(packed.wings)} if packed.wings else {}),
-        "Distance limit": f"{packed.distance_limit:.3g} in {info.components} components",
+        **({"Light beyond the stamp": str(bundle.wings)} if bundle.wings else {}),
+        "Distance limit": f"{bundle.distance_limit:.3g} in {info.components} components",
     }
 
 
-_KINDS = {"simulated": "simulated stars", "stars": "stars of an image"}
+def _error_table(info: BundleInfo) -> str:
+    """Return the errors of the test stars as a table in plain text.
 
-
-def _list(values: tuple[int, ...]) -> str:
-    return " ".join(str(value) for value in values)
-
-
-def _gain(row: dict[str, float]) -> dict[str, float]:
-    """How many times the error of the stamp itself; below 1 the network is no use."""
-    noisy, mse = row.get("mse_noisy"), row.get("mse")
-    return {"gain": noisy / mse} if noisy and mse else {}
-
-
-def _table(info: BundleInfo) -> str:
+    The column "gain" is added: the MSE of the noisy stamps over that of the restored ones. Below
+    1 the model makes stars worse than they were.
+    """
     from astropy.table import Table
 
-    table = Table(_columns(info))
-    head, _, *rows = (
-        table.pformat(max_lines=-1, max_width=-1, align=">") if table.columns else ("", "")
-    )
-    return "\n".join(line.rstrip() for line in (head, *rows))
-
-
-def _columns(info: BundleInfo) -> dict[str, list[str]]:
-    """Errors of the test stars as text, by heading."""
-    metrics = [row | _gain(row) for row in info.metrics]
-    return {
-        heading: [format(row[key], form) if key in row else "" for row in metrics]
-        for key, (heading, form) in METRICS.items()
-        if any(key in row for row in metrics)
+    rows: list[dict[str, float]] = []
+    for metrics in info.metrics:
+        mse_noisy, mse = metrics.get("mse_noisy"), metrics.get("mse")
+        rows.append(metrics | ({"gain": mse_noisy / mse} if mse_noisy and mse else {}))
+    # Columns that no row has are left out; a row without a value has an empty cell.
+    columns = {
+        heading: [format(row[key], number_format) if key in row else "" for row in rows]
+        for key, (heading, number_format) in METRIC_COLUMNS.items()
+        if any(key in row for row in rows)
     }
+    if not columns:
+        return ""
+    # The second line is a rule of dashes below the headings.
+    headings, _, *lines = Table(columns).pformat(max_lines=-1, max_width=-1, align=">")
+    return "\n".join(line.rstrip() for line in (headings, *lines))

@@ -1,12 +1,11 @@
-"""Stage `exposure`: a field model for another exposure, by its own bright stars."""
+"""Command `exposure`: adapt a field model to another exposure by its own bright stars."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 from psfdae.cli import command
-from psfdae.commands.predict import Stated, check_targets
-from psfdae.files import check_outputs
+from psfdae.commands.predict import ImageOptions, check_targets
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.psf_model import load_model
@@ -16,7 +15,7 @@ from psfdae.options import File
 @command("exposure")
 def exposure(
     image: Annotated[File, {"argument": True}],
-    stated: Stated,
+    options: ImageOptions,
     overwrite: Annotated[bool, "Replace a file that exists."] = False,
     *,
     model: Annotated[File, "Bundle of from-stars --method field, of another exposure."],
@@ -26,15 +25,15 @@ def exposure(
 
     The stars of IMAGE show how its PSF differs from that of MODEL; ten may be enough.
     """
-    source = stated.source(image)
-    check_outputs((out,), (*source.files(), model))
-    check_targets(out, None, None, overwrite)
-    if stated.all_extensions:
+    # Refuse wrong options and files that exist before anything is computed.
+    source = options.source(image)
+    check_targets((*source.files(), model), out, overwrite=overwrite)
+    if options.all_extensions:
         raise PredictionError(f"{image}: exposure takes one image, not --all-extensions")
     loaded = load_model(model)
 
-    from psfdae.model.exposures import exposure as adapted
+    from psfdae.model.exposures import exposure as adapt_to_exposure
 
-    made, said = adapted(loaded, source, out.name.removesuffix(SUFFIX))
-    made.save(out)
-    print(f"{out}: {said}")
+    adapted, sentence = adapt_to_exposure(loaded, source, out.name.removesuffix(SUFFIX))
+    adapted.save(out)
+    print(f"{out}: {sentence}")

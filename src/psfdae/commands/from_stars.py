@@ -1,4 +1,4 @@
-"""Stage `from-stars`: from images and their star list to models of their own, in one go."""
+"""Command `from-stars`: train a PSF model on the bright stars of an image, in one call."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 from psfdae import fits
 from psfdae.cli import command
-from psfdae.commands.mosaic import each, images_of, with_name
-from psfdae.commands.predict import Stated, write_list
+from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
+from psfdae.commands.predict import ImageOptions, write_list
 from psfdae.errors import Error
 from psfdae.files import (
     atomic_path,
@@ -32,12 +32,19 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
+from psfdae.model.fitting import (
+    choose_method,
+    described,
+    fitted_to,
+    makes_models,
+    pack_model,
+    worth_trying,
+)
 from psfdae.model.settings import (
-    CHOSEN,
+    DATASET_CHOICE,
     IMAGE_GROUPS,
     Settings,
-    Words,
+    SettingsReader,
     of_config,
     with_keywords,
 )
@@ -46,64 +53,75 @@ from psfdae.model.validation import validate
 from psfdae.options import File, Folder
 from psfdae.settings import ConfigError, as_overrides
 
-LOCK = ".from_stars.lock"
-
-LONGEST_NAME = 255
-"""Bytes of a file's name."""
-
 
 class FolderError(Error, RuntimeError):
     """The folder holds a model already, or another process is making one there."""
 
 
 @dataclass(frozen=True)
-class Made:
-    """Files that the stage leaves in a folder."""
+class ModelFiles:
+    """Paths of the files that the command writes to a folder.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+    name : str
+        Name of the model.
+    methods : tuple of type of Method
+        Methods that are fitted, each with files of its own.
+    exposures : sequence of str
+        Names of the exposures if there are several, each with a model of its own.
+    """
 
     path: Path
     name: str
-    kinds: tuple[type[Method], ...]
+    methods: tuple[type[Method], ...]
     exposures: Sequence[str] = ()
 
     @property
     def stars(self) -> Path:
+        """Product with the stamps of the training stars."""
         return self.path / "stars.h5"
 
     def star_list(self, exposure: str) -> Path:
+        """Return the path of the list of stars that were detected in an image."""
         return self.path / (f"{exposure}_stars.csv" if self.exposures else "stars.csv")
 
-    def fit(self, kind: type[Method]) -> Path:
-        return self.path / fits.named(kind, kind.name)
+    def fit(self, method_class: type[Method]) -> Path:
+        """Return the path of the fit of a method."""
+        return self.path / fits.named(method_class, method_class.name)
 
     @property
     def bundle(self) -> Path:
+        """Bundle of the model, for all images together if there are several."""
         return self.bundle_of(self.name)
 
     def bundle_of(self, exposure: str) -> Path:
+        """Return the path of the bundle of one exposure."""
         return self.path / f"{exposure}{SUFFIX}"
 
-    def written(self) -> list[Path]:
-        """Files of the folder itself."""
+    def paths(self) -> list[Path]:
+        """Return the paths of all files but the star lists and the page."""
         names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
-        own = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
-        for kind in self.kinds:
-            own += fits.outputs(kind, self.fit(kind))
-        own += map(self.bundle_of, self.exposures)
-        return [self.stars, self.bundle, *own]
+        paths = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
+        for method_class in self.methods:
+            paths += fits.outputs(method_class, self.fit(method_class))
+        return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
 
 
-@command("from-stars", Words())
+@command("from-stars", SettingsReader())
 def from_stars(
     config: Settings,
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
-    stated: Stated,
+    options: ImageOptions,
     name: Annotated[str | None, "Name of the model.  [default: the image's; all]"] = None,
-    licence: Annotated[str, "Of the model."] = "not stated",
-    taken: Annotated[
+    licence: Annotated[str, "Licence of the model."] = "not stated",
+    method_name: Annotated[
         str | None,
         {"flag": "--method"},
-        "Method of the model.  [default: that which errs least on validation stars; of several "
-        "images field]",
+        "Method of the model.  [default: the one with the smallest error on validation stars; of "
+        "several images field]",
     ] = None,
     *,
     out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
@@ -125,127 +143,176 @@ def from_stars(
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
+    # The three options of the selection are settings of the configuration by shorter names.
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
-    stated_sizes: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
+    size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
-        stated_sizes["light_min"] = 0.0  # no light asks for other stamps
-    config = with_keywords(of_config(config), IMAGE_GROUPS, stated_sizes)
-    job = {key: value for key, value in locals().items() if key in signature(trained).parameters}
-    stem = _stem(image, name)
-    if not stated.all_extensions:
-        print(trained(**job))
+        # A stated size is used even if stars have light beyond it.
+        size_settings["light_min"] = 0.0
+    config = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
+    job = {key: value for key, value in locals().items() if key in signature(train).parameters}
+    stem = _model_name(image, name)
+    if not options.all_extensions:
+        print(train(**job))
     elif len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
     else:
+        # Each image of the file gets a model in a folder of its own, by a process of its own.
         jobs = {
             extension: {
                 **job,
                 "config": config.model_dump(),
-                "stated": of_image,
+                "options": image_options,
                 "name": f"{stem}_{extension}",
                 "out": out / extension,
-                "page": with_name(page, extension),
+                "page": path_of_image(page, extension),
             }
-            for extension, of_image in images_of(image[0], stated).items()
+            for extension, image_options in options_by_image(image[0], options).items()
         }
-        each(trained, jobs, image[0])
-    print(f"next: {shlex.join(_next(image, stated, out, name))}")
+        run_for_images(train, jobs, image[0])
+    # The command that applies the model to all stars of the image, or of the first exposure. A
+    # list for several images has stars of all of them: those off the image are left out.
+    several = len(image) > 1
+    if several and options.catalogue:
+        options = replace(options, on_image=True)
+    stem = _model_name(image[:1], None if several else name)
+    model = out if several or options.all_extensions else ModelFiles(out, stem, ()).bundle
+    outputs = ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
+    words = ["psfdae", "predict", str(image[0]), *options.words(), *outputs]
+    print(f"next: {shlex.join(words)}")
 
 
-def trained(
+def train(
     config: Settings | Mapping[str, Any],
     image: tuple[Path, ...],
-    stated: Stated,
+    options: ImageOptions,
     name: str | None,
     licence: str,
-    taken: str | None,
+    method_name: str | None,
     out: Path,
     page: Path | None,
     overwrite: bool,
 ) -> str:
-    """Train a model on the stars of one image, or of exposures; how good it is, in a sentence.
+    """Train a model on the stars of one image, or of exposures; return how good it is.
 
-    `config` is what `from_stars` receives, or its tree.
+    Parameters are those of `from_stars`; `config` may also be its tree, which another process
+    receives.
+
+    Returns
+    -------
+    str
+        A sentence on the error of the model.
+
+    Raises
+    ------
+    FolderError
+        If the folder holds a model, or another process works there.
+    ConfigError
+        If no method of the list makes models.
     """
-    sources, settings = stated.source(image[0]).of_each(image), of_config(config)
-    exposures = [_stem((one,), None) for one in image] if len(image) > 1 else []
-    if exposures and taken is None and "field" in settings.methods:
-        taken = "field"  # validation stars would judge the field of all, not those of exposures
-    settings, kinds, tried = _methods(settings, taken)
-    files = Made(out, _stem(image, name), kinds, exposures)
+    sources, settings = options.source(image[0]).of_each(image), of_config(config)
+    exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
+    if exposures and method_name is None and "field" in settings.methods:
+        # Validation stars would judge the field that all exposures share, but each gets its own.
+        method_name = "field"
+    settings, methods, candidates = _methods(settings, method_name)
+    files = ModelFiles(out, _model_name(image, name), methods, exposures)
+    # Refuse outputs that are inputs or exist, before anything is computed.
     if files.name in exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
-    lists = [files.star_list(source.name) for source in sources] if stated.detect else []
-    check_outputs([*files.written(), *lists, page], [f for s in sources for f in s.files()])
+    lists = [files.star_list(source.name) for source in sources] if options.detect else []
+    inputs = [path for source in sources for path in source.files()]
+    check_outputs([*files.paths(), *lists, page], inputs)
     if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
-    with _alone(out):
-        finished = sorted(out.glob(f"*{SUFFIX}"))
-        if finished and not (overwrite or _unfinished(files.bundle)):
-            raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        return _make(settings, sources, files, licence, tried, page)
-
-
-def _unfinished(bundle: Path) -> bool:
-    """Whether a killed run has left models of exposures, but not that of all."""
-    return not bundle.exists() and interrupted(bundle)
+    with _locked(out):
+        # A killed run may have left models of exposures, but not yet the model of all images.
+        unfinished = not files.bundle.exists() and interrupted(files.bundle)
+        bundles = sorted(out.glob(f"*{SUFFIX}"))
+        if bundles and not (overwrite or unfinished):
+            raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
+        return _write_model(settings, sources, files, licence, candidates, page)
 
 
 def _methods(
-    settings: Settings, taken: str | None
+    settings: Settings, method_name: str | None
 ) -> tuple[Settings, tuple[type[Method], ...], list[type[Method]]]:
-    """Settings whose methods are those that are measured; the fits, and who may be the model."""
-    # Those that are given a place on the grid of a simulation know none of an image.
+    """Choose the methods that are compared, that are fitted, and that may become the model.
+
+    Parameters
+    ----------
+    settings : Settings
+        Its list `methods` names the methods to choose from.
+    method_name : str or None
+        Method of the model, if the user names one. Then only methods without a fit, such as the
+        noisy stamps themselves, are compared with it.
+
+    Returns
+    -------
+    settings : Settings
+        The same with the list of the methods that are compared.
+    fitted : tuple of type of Method
+        Methods of this list that leave a fit.
+    candidates : list of type of Method
+        Methods of these that make models.
+    """
+    # Methods that need the field position on the grid of a simulation cannot use an image.
     names = [n for n in settings.methods if method(n).packing or not method(n).needs.position]
-    if taken is not None:
-        names = [n for n in names if method(n).storage is None and n != taken]
-        names.append(method(taken).name)
-    kinds = tuple(kind for kind in map(method, names) if kind.storage is not None)
-    tried = [kind for kind in kinds if makes_models(kind.name)]
-    if not tried:
-        known = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
-        raise ConfigError(f"methods = {settings.methods}: --method takes one of these: {known}")
-    return settings.model_copy(update={"methods": names}), kinds, tried
+    if method_name is not None:
+        names = [n for n in names if method(n).storage is None and n != method_name]
+        names.append(method(method_name).name)
+    fitted = tuple(m for m in map(method, names) if m.storage is not None)
+    candidates = [m for m in fitted if makes_models(m.name)]
+    if not candidates:
+        makers = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
+        raise ConfigError(f"methods = {settings.methods}: --method takes one of these: {makers}")
+    return settings.model_copy(update={"methods": names}), fitted, candidates
 
 
-def _stem(image: tuple[Path, ...], name: str | None) -> str:
-    """The name of a model, with which names of its files start; FolderError if they cannot."""
+def _model_name(image: tuple[Path, ...], name: str | None) -> str:
+    """Return the name of a model, with which the names of its files begin.
+
+    Raises
+    ------
+    FolderError
+        If no file can have such a name.
+    """
     name = name or (ALL if len(image) > 1 else Source(image[0]).name)
-    if "/" in name or len(f"{name}{SUFFIX}".encode()) > LONGEST_NAME:
-        said = f"at most {LONGEST_NAME - len(SUFFIX)} bytes, and no folder"
-        raise FolderError(f"--name {name}: expected the start of a file's name, {said}")
+    # Linux allows 255 bytes in the name of a file.
+    longest = 255 - len(SUFFIX)
+    if "/" in name or len(name.encode()) > longest:
+        raise FolderError(
+            f"--name {name}: expected the start of a file's name, at most {longest} bytes, and no "
+            "folder"
+        )
     return name
 
 
-def _next(image: tuple[Path, ...], stated: Stated, out: Path, name: str | None) -> list[str]:
-    """The command that applies the models to all stars of their image, or of the first one."""
-    several = len(image) > 1
-    name = _stem(image[:1], None if several else name)
-    stated = replace(stated, on_image=True) if several and stated.catalogue else stated
-    model = out if stated.all_extensions or several else Made(out, name, ()).bundle
-    where = ["--model", str(model), "--out", str(out / f"{name}_psf.fits")]
-    return ["psfdae", "predict", str(image[0]), *stated.words(), *where]
-
-
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Refuse a folder in which another process works; its lock ends with the process.
+def _locked(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another process works; the lock ends with the process.
 
     A folder that is left empty is removed again.
+
+    Raises
+    ------
+    FolderError
+        If another process holds the lock.
     """
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / LOCK
+    path = folder / ".from_stars.lock"
     try:
         with path.open("a") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # That of a process which has just ended may be removed, and made anew by a third.
-                mine = os.path.samestat(os.fstat(lock.fileno()), path.stat())
+                # A process that has just ended may have removed the file that is open here, and
+                # a third one may have made it anew: then this lock protects nothing.
+                holds_lock = os.path.samestat(os.fstat(lock.fileno()), path.stat())
             except (BlockingIOError, FileNotFoundError):
-                mine = False
-            if not mine:
+                holds_lock = False
+            if not holds_lock:
                 raise FolderError(f"{folder}: another psfdae from-stars works there")
             try:
                 yield
@@ -256,46 +323,64 @@ def _alone(folder: Path) -> Iterator[None]:
             folder.rmdir()
 
 
-def _make(
+def _write_model(
     settings: Settings,
     sources: list[Source],
-    files: Made,
+    files: ModelFiles,
     licence: str,
-    tried: list[type[Method]],
+    candidates: list[type[Method]],
     page: Path | None,
 ) -> str:
-    """Make all files; how good the model is, in a sentence."""
+    """Select stars, fit the methods, test the best one, and write all files.
+
+    Returns
+    -------
+    str
+        A sentence on the error of the model.
+    """
+    # Choose bright stars without neighbours, and cut them out.
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
-    for part in stars.each:
-        if part.observation.found is not None:
-            write_list(part.observation, files.star_list(part.name))
+    for image_stars in stars.images:
+        if image_stars.observation.found is not None:
+            write_list(image_stars.observation, files.star_list(image_stars.name))
     write_table(files.path / "selection.csv", stars.table)
     write_product(files.stars, "stars", stars.columns, stars.described())
-    write_text(files.path / "overrides.txt", _overrides(stars.settings))
-    taking = worth_trying(stars, tried)
-    fitted = _fits(stars, files, [k for k in files.kinds if k in taking or k not in tried])
-    taken = taking[0]
-    if len(taking) > 1:
-        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in taking})
-        taken = method(name)
-        for other, error in errors.items():
-            print(f"{method(other).look.label}: MSE {error:.3g} on validation stars")
-    print(f"packing {taken.look.label}")
-    model = packed(stars, fitted[taken.name], files.name, licence)
-    for fact in facts_of(fitted[taken.name]):
-        print(f"{taken.look.label}: {fact}")
+    # The settings as words of a command line that repeats this run.
+    overrides = as_overrides(stars.settings.model_dump(exclude={"calibration_stars"}))
+    write_text(files.path / "overrides.txt", "\n".join([DATASET_CHOICE, *overrides]) + "\n")
+    # Fit the candidates, and the other methods that the report compares with them. With few
+    # stars only one candidate is tried.
+    tried_methods = worth_trying(stars, candidates)
+    fitted = _fit_methods(
+        stars, files, [m for m in files.methods if m in tried_methods or m not in candidates]
+    )
+    # The method with the smallest MSE on validation stars becomes the model.
+    model_method = tried_methods[0]
+    if len(tried_methods) > 1:
+        best_name, errors = choose_method(stars, {m.name: fitted[m.name] for m in tried_methods})
+        model_method = method(best_name)
+        for name, error in errors.items():
+            print(f"{method(name).look.label}: MSE {error:.3g} on validation stars")
+    print(f"packing {model_method.look.label}")
+    model = pack_model(stars, fitted[model_method.name], files.name, licence)
+    for fact in facts_of(fitted[model_method.name]):
+        print(f"{model_method.look.label}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
-    # Its name is the last one to be there: it says that all is done.
+    # The bundle gets its name when the stack is left, after all others: a bundle that exists
+    # means that everything is done.
     with ExitStack() as stack:
         model.save(stack.enter_context(atomic_path(files.bundle)))
-        own = for_exposures(model, stars)
-        for part in stars.exposures:
-            count, made = len(part), own[part.name]
-            made.save(stack.enter_context(atomic_path(files.bundle_of(part.name))))
-            said = "get the model of all" if made is model else "change the field of all"
-            print(f"{part.name}: {count} stars {said}")
+        exposure_models = for_exposures(model, stars)
+        for exposure in stars.exposures:
+            exposure_model = exposure_models[exposure.name]
+            exposure_model.save(stack.enter_context(atomic_path(files.bundle_of(exposure.name))))
+            change = (
+                "get the model of all" if exposure_model is model else "change the field of all"
+            )
+            print(f"{exposure.name}: {len(exposure)} stars {change}")
+        # Stars that no fit has seen, degraded to low S/N, test the model.
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
         write_columns(files.path / "evaluation.csv", report.evaluation.columns)
@@ -309,22 +394,18 @@ def _make(
     return str(report)
 
 
-def _fits(stars: Stars, files: Made, kinds: Sequence[type[Method]]) -> dict[str, Method]:
-    """Fit methods to the stars, each to a file, by their names."""
+def _fit_methods(
+    stars: Stars, files: ModelFiles, methods: Sequence[type[Method]]
+) -> dict[str, Method]:
+    """Fit methods to the training stars, write each fit to its file, and return them by name."""
     fitted: dict[str, Method] = {}
-    for kind in kinds:
-        print(f"fitting {kind.look.label}")
-        place = files.fit(kind)
-        checkpoint = fits.beside(kind, place, "checkpoint.pt")
-        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
-        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
+    for method_class in methods:
+        print(f"fitting {method_class.look.label}")
+        place = files.fit(method_class)
+        # A network keeps its state here while it trains, for the case that it is killed.
+        checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
+        fit = fitted_to(stars, method_class, checkpoint)
+        fits.store(fit, place, described(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)
+        fitted[method_class.name] = fit
     return fitted
-
-
-def _overrides(settings: Settings) -> str:
-    """The settings as words of a command line that chooses files of the configuration, too."""
-    return (
-        "\n".join([CHOSEN, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))])
-        + "\n"
-    )

@@ -1,4 +1,7 @@
-"""All images of a FITS file in one call: each by itself, side by side in processes."""
+"""All images of a FITS file in one call, such as the chips of a mosaic camera.
+
+Each image is worked on by itself, in a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -20,81 +23,98 @@ from psfdae.image.observation import require_sky
 from psfdae.threads import available_cores
 
 if TYPE_CHECKING:
-    from psfdae.commands.predict import Stated
-
-ALONE = ("extension", "origin", "mask", "weight", "variance", "error")
-"""Options that belong to one image, and cannot be given for several."""
+    from psfdae.commands.predict import ImageOptions
 
 
 class MosaicError(Error, RuntimeError):
-    """Some images of a file could not be used."""
+    """Failure for some images of a file; the others are done."""
 
 
-def images_of(path: Path, stated: Stated) -> dict[str, Stated]:
-    """Return the stated options of each image of a file by its name (`science_images`).
+def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOptions]:
+    """Return the options of each image of a file by the image's name (`science_images`).
 
-    Stars of the list that is stated belong to the image on which they are.
+    A star list is that of all images: each image takes the stars that are on it.
+
+    Raises
+    ------
+    ObservationError
+        If an option belongs to one image only, or the star list has no sky coordinates.
     """
-    given = [f"--{name}" for name in ALONE if getattr(stated, name) is not None]
-    if given:
-        raise ObservationError(path, f"--all-extensions excludes {' and '.join(given)}")
-    if stated.catalogue is not None:
-        require_sky(stated.catalogue, "--all-extensions")
-    of_each = replace(stated, all_extensions=False, on_image=stated.catalogue is not None)
-    return {name: replace(of_each, extension=n) for name, n in science_images(path).items()}
+    # An extension name, the origin of a list in pixels, or a map of the pixels' noise is
+    # right for one image, and cannot be given for several.
+    one_image_options = ("extension", "origin", "mask", "weight", "variance", "error")
+    excluded = [f"--{name}" for name in one_image_options if getattr(options, name) is not None]
+    if excluded:
+        raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
+    if options.catalogue is not None:
+        require_sky(options.catalogue, "--all-extensions")
+    one_image = replace(options, all_extensions=False, on_image=options.catalogue is not None)
+    return {name: replace(one_image, extension=n) for name, n in science_images(path).items()}
 
 
-def with_name(path: Path | None, name: str) -> Path | None:
-    """The file of one image, beside that of the others."""
+def path_of_image(path: Path | None, name: str) -> Path | None:
+    """Return the output file of one image: the stem of `path` gets the name of the image."""
     return path and path.with_name(f"{path.stem}_{name}{path.suffix}")
 
 
-def each(work: Callable[..., str], jobs: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """Do the work for the images of a file by name; a line for each says how it ended.
+def run_for_images(
+    work: Callable[..., str], jobs: Mapping[str, Mapping[str, Any]], path: Path
+) -> None:
+    """Run a function for each image of a file in parallel, and print how each run ended.
+
+    Parameters
+    ----------
+    work : callable
+        Does the work for one image and returns a sentence about it.
+    jobs : mapping
+        Keyword arguments of `work` by the name of the image.
+    path : Path
+        The file, for messages.
 
     Raises
     ------
     MosaicError
-        At the end, if some failed; the others are done.
+        At the end, if some images failed; the others are done.
     """
     failed = []
     print(f"{path}: {len(jobs)} images: {', '.join(jobs)}")
-    processes = min(len(jobs), available_cores())
-    with _pool(processes) as pool:
-        futures = {name: pool.submit(_quietly, work, job) for name, job in jobs.items()}
+    with _process_pool(min(len(jobs), available_cores())) as pool:
+        futures = {name: pool.submit(_run_quietly, work, job) for name, job in jobs.items()}
         for name, future in futures.items():
             try:
-                good, said = future.result()
-            except BrokenProcessPool:  # with it all that were not done
-                good, said = _alone(work, jobs[name])
-            failed += [] if good else [name]
-            print(f"{name}: {said}", flush=True)
+                succeeded, message = future.result()
+            except BrokenProcessPool:
+                # A process that is killed takes all unfinished ones with it. Repeat each
+                # in one process, which then has the whole memory.
+                with _process_pool(1) as single:
+                    try:
+                        succeeded, message = single.submit(_run_quietly, work, jobs[name]).result()
+                    except BrokenProcessPool:
+                        succeeded = False
+                        message = "its process was killed, perhaps for lack of memory"
+            failed += [] if succeeded else [name]
+            print(f"{name}: {message}", flush=True)
     if failed:
         raise MosaicError(
             f"{path}: {len(failed)} of {len(jobs)} images failed: {', '.join(failed)}"
         )
 
 
-def _pool(processes: int) -> ProcessPoolExecutor:
+def _process_pool(processes: int) -> ProcessPoolExecutor:
+    # "spawn": a copy of a process that has threads, as numpy's and torch's, may hang.
     return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
 
 
-def _alone(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:
-    """`_quietly` in a process of its own, with all memory for it."""
-    with _pool(1) as pool:
-        try:
-            return pool.submit(_quietly, work, job).result()
-        except BrokenProcessPool:
-            return False, "its process was killed, perhaps for lack of memory"
+def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:
+    """Run `work` without its output; return True and its sentence, or False and the refusal.
 
-
-def _quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:
-    """Whether it was done, and what is said of it."""
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+    Errors that are no refusals of wrong input, that is, bugs, are raised again.
+    """
+    with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:
             return True, work(**job)
         except REFUSABLE as error:
-            said = refusal(error)
-            if said is None:
+            message = refusal(error)
+            if message is None:
                 raise
-            return False, said
+            return False, message

@@ -1,19 +1,18 @@
-"""Stage `photometry`: fluxes of all stars of an image with the PSF of its field."""
+"""Command `photometry`: fluxes of all stars of an image with the PSF of its field."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.commands.predict import Stated, check_targets
+from psfdae.commands.predict import ImageOptions, check_targets
 from psfdae.errors import Error
-from psfdae.files import check_outputs, write_fits
+from psfdae.files import write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.observation import list_offset
@@ -27,21 +26,20 @@ if TYPE_CHECKING:
 
     from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
-
-MATCHED_FWHM, FEWEST = 0.5, 3  # distance of a reference star; those that a zero point takes
+    from psfdae.model.field_psfs import FieldPsfs
 
 
 class PhotometryError(Error, ValueError):
-    """Nothing to measure, or no zero point."""
+    """Options that exclude each other, or too few stars for a zero point."""
 
 
 @command("photometry")
 def photometry(
     image: Annotated[File, {"argument": True}],
-    stated: Stated,
+    options: ImageOptions,
     zero_point: Annotated[float | None, "Magnitude of a flux of 1."] = None,
     reference: Annotated[File | None, "Star list with magnitudes, which give it."] = None,
-    magnitude_column: Annotated[str, "Of --reference."] = "mag",
+    magnitude_column: Annotated[str, "Column of --reference with the magnitudes."] = "mag",
     residual: Annotated[File | None, "FITS image without its sky and stars."] = None,
     overwrite: Annotated[bool, "Replace files that exist."] = False,
     *,
@@ -54,71 +52,110 @@ def photometry(
     --catalogue are measured where it says, and no others. Fluxes have the light beyond the
     stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
     """
+    # Refuse options that do not fit together, and outputs that exist.
     if out.suffix.lower() not in SUFFIXES:
         raise PhotometryError(f"{out}: expected a name that ends in {', '.join(SUFFIXES)}")
     if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
         raise PhotometryError("--zero-point takes a number, or --reference gives it")
-    # Of stars that are found, the origin is known; then it is that of the reference.
-    found_here = reference is not None and stated.detect
-    source = (replace(stated, origin=None) if found_here else stated).source(image)
-    check_outputs((out, residual), (*source.files(), reference, model))
-    check_targets(out, residual, None, overwrite)
-    if stated.all_extensions:
+    # With --detect, no list of the image needs an origin: --origin is that of the reference.
+    origin_of_reference = reference is not None and options.detect
+    source = (replace(options, origin=None) if origin_of_reference else options).source(image)
+    check_targets((*source.files(), reference, model), out, residual, overwrite=overwrite)
+    if options.all_extensions:
         raise PhotometryError(f"{image}: photometry takes one image, not --all-extensions")
-    if stated.colour_column:
+    if options.colour_column:
         raise PhotometryError(
             f"{image}: all stars get the PSF of the usual one: no --colour-column"
         )
+    # The model must know the PSF at every place (`field_range` refuses others), and have pixels
+    # as large as those of the image.
     loaded = load_field(model)
-    loaded.field_range()  # or it knows no place
+    loaded.field_range()
     observation = source.open(loaded.stamp_px).assuming()
     if observation.shape is None:
         raise PhotometryError(f"{image}: photometry takes an image, no cube of stamps")
     loaded.check_scale(observation.pixel_scale_arcsec, str(image))
+    # Read the stars of the reference before the long work, in case they cannot be used.
     magnitudes = None
     if reference is not None:
-        listed = replace(stated, catalogue=reference, detect=False, on_image=False)
-        places = listed.source(image).open(loaded.stamp_px).positions
-        assert places is not None  # of an image
-        magnitudes = places, as_catalogue(reference).numbers(magnitude_column)
+        reference_options = replace(options, catalogue=reference, detect=False, on_image=False)
+        positions = reference_options.source(image).open(loaded.stamp_px).positions
+        assert positions is not None  # of an image
+        magnitudes = positions, as_catalogue(reference).numbers(magnitude_column)
 
-    from psfdae.model.crowded import photometry as measured
     from psfdae.model.photon_noise import with_measured_gain
 
     observation = with_measured_gain(loaded, observation)
-    found, offset = _of_all_rows(
-        observation, lambda usable: measured(loaded, usable, stated.threshold)
-    )
+    measured, list_note = _measure(loaded, observation, options.threshold)
     if magnitudes is not None:
-        zero_point, said = _zero_point(found, *magnitudes, reference)
-        print(said)
-    table = photometry_table(found, observation, zero_point)
-    table.meta |= _said(found, image, zero_point)
+        zero_point, zero_point_note = _zero_point(measured, *magnitudes, reference)
+        print(zero_point_note)
+    # Write the table with its header, and the residual image.
+    table = photometry_table(measured, observation, zero_point)
+    table.meta |= {
+        "INFILE": ascii_line(image.name),
+        "PSFMODEL": ascii_line(measured.model.name),
+        "PSFSHA": measured.model.sha256,
+        "FLUXRAD": measured.radius_px,
+        "INMODEL": measured.part_of_model()[0],
+        **({} if zero_point is None else {"ZEROPT": zero_point}),
+    }
     write_table(out, table)
     if residual is not None:
         from astropy.io import fits
 
-        write_fits(residual, fits.PrimaryHDU(found.residual.astype(np.float32)))
-    print(
-        *filter(None, [observation.said(), offset, _summary(found, out, stated.detect)]), sep="\n"
-    )
+        write_fits(residual, fits.PrimaryHDU(measured.residual.astype(np.float32)))
+    summary = _summary(measured, out, options.detect)
+    print(*filter(None, [observation.said(), list_note, *summary]), sep="\n")
 
 
-def _of_all_rows(
-    observation: Observation, measured: Callable[[Observation], CrowdedPhotometry]
+def _measure(
+    model: FieldPsfs, observation: Observation, threshold: float
 ) -> tuple[CrowdedPhotometry, str | None]:
-    """Measure the stars that can be, and return a row for every one; and how far a list is off."""
-    # Rows without a position cannot be fitted, and those of a star that is listed twice have no
-    # light of their own.
+    """Measure the stars that can be measured, and return a row for every star of the list.
+
+    Returns
+    -------
+    measured : CrowdedPhotometry
+        The stars, and the image without them.
+    list_note : str or None
+        A sentence on how far the stars are off the positions of their list, if there is one.
+    """
+    from psfdae.model.crowded import photometry as crowded_photometry
+
+    # A row without a position cannot be fitted, and one of a star that is listed twice has no
+    # light of its own: measure the others, and add flagged rows for these.
     unusable = observation.without_position() | observation.listed_again()
-    found = measured(observation.of(~unusable) if unusable.any() else observation)
+    usable = observation.of(~unusable) if unusable.any() else observation
+    measured = crowded_photometry(model, usable, threshold)
     if unusable.any():
-        found = replace(found, stars=_with_rows(found.stars, observation, unusable))
-    if observation.catalogue is None or len(found.stars) != observation.count:
-        return found, None
+        measured = replace(measured, stars=_with_rows(measured.stars, observation, unusable))
+    if observation.catalogue is None or len(measured.stars) != observation.count:
+        return measured, None
     # The stars are fitted where they are, whatever the list says.
-    fitted = np.stack([found.stars["x"], found.stars["y"]], axis=1)
-    return found, list_offset(observation.catalogue, fitted - observation.positions, accept=True)
+    offset = np.stack([measured.stars["x"], measured.stars["y"]], axis=1) - observation.positions
+    return measured, list_offset(observation.catalogue, offset, accept=True)
+
+
+def _summary(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str]:
+    """Return lines on the number of stars, the light that fluxes contain, and their bias."""
+    measured_count = int(np.isfinite(measured.stars["flux"]).sum())
+    lines = [f"{out}: {len(measured.stars)} stars, {measured_count} measured"]
+    if measured.wings is None:
+        lines.append("no star is bright enough to show light beyond the model's stamp")
+    else:
+        part, part_error = measured.part_of_model()
+        lines.append(
+            f"fluxes are the light within {measured.radius_px:.3g} px; the model of the PSF has "
+            f"{100 * part:.2f} ± {100 * part_error:.2f} % of it"
+        )
+    if detected:
+        # Selection by brightness: Eddington (1913, MNRAS 73, 359).
+        lines.append(
+            "of stars near the detection threshold, those are found that noise makes brighter: "
+            "their fluxes are too large in the mean, the more the fainter they are"
+        )
+    return lines
 
 
 def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
@@ -152,46 +189,70 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
 
 
 def _zero_point(
-    found: CrowdedPhotometry, places: np.ndarray, magnitude: np.ndarray, reference: Path | None
+    measured: CrowdedPhotometry,
+    positions: np.ndarray,
+    magnitude: np.ndarray,
+    reference: Path | None,
 ) -> tuple[float, str]:
-    """Median of what stars of the reference say, in magnitudes, and how sure it is."""
+    """Return the zero point in magnitudes, and a sentence with its standard error.
+
+    Parameters
+    ----------
+    measured : CrowdedPhotometry
+        Stars of the image with their fluxes F.
+    positions : ndarray, shape (n, 2)
+        Pixel positions x, y of the reference stars in the image.
+    magnitude : ndarray, shape (n,)
+        Their magnitudes m.
+    reference : Path or None
+        The star list, for messages.
+
+    Raises
+    ------
+    PhotometryError
+        If fewer than three reference stars are stars of the image.
+    """
     from scipy.spatial import cKDTree
 
     from psfdae.moments import robust_scatter
 
-    stars = found.stars
+    # Stars of the image with a flux above 0, and reference stars with position and magnitude.
+    stars = measured.stars
     flux = np.array(stars["flux"], dtype=np.float64)
-    used = np.flatnonzero(np.isfinite(flux) & (flux > 0))
-    place = np.stack([stars["x"], stars["y"]], axis=1)[used]
-    known = np.isfinite(places).all(axis=1) & np.isfinite(magnitude)
-    off, star = cKDTree(place).query(places[known])
-    near = off < MATCHED_FWHM * found.model.fwhm_px()
-    zero = magnitude[known][near] + 2.5 * np.log10(flux[used[star[near]]])
-    if len(zero) < FEWEST:
+    has_flux = np.flatnonzero(np.isfinite(flux) & (flux > 0))
+    star_positions = np.stack([stars["x"], stars["y"]], axis=1)[has_flux]
+    complete = np.isfinite(positions).all(axis=1) & np.isfinite(magnitude)
+    # Each reference star is the nearest star of the image if that is within half a FWHM.
+    distance_px, star = cKDTree(star_positions).query(positions[complete])
+    matched = distance_px < 0.5 * measured.model.fwhm_px()
+    # ZP = m + 2.5 log₁₀ F for each; the median, as stars may be variable or matched wrongly.
+    zero_points = magnitude[complete][matched] + 2.5 * np.log10(flux[has_flux[star[matched]]])
+    count = len(zero_points)
+    if count < 3:
         raise PhotometryError(
-            f"{reference}: {len(zero)} of its stars with a magnitude are stars of the image, "
-            f"{FEWEST} are needed for a zero point"
+            f"{reference}: {count} of its stars with a magnitude are stars of the image, 3 are "
+            "needed for a zero point"
         )
-    error = float(robust_scatter(zero[:, None])[0]) / math.sqrt(len(zero))
-    value = float(np.median(zero))
-    return value, f"zero point {value:.4f} ± {error:.4f} mag ({len(zero)} stars of {reference})"
+    error = float(robust_scatter(zero_points[:, None])[0]) / math.sqrt(count)
+    value = float(np.median(zero_points))
+    return value, f"zero point {value:.4f} ± {error:.4f} mag ({count} stars of {reference})"
 
 
 def photometry_table(
-    found: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
+    measured: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
 ) -> QTable:
     """Return the stars with units, magnitudes, sky coordinates and the columns of their list.
 
     Parameters
     ----------
-    found : CrowdedPhotometry
-        With a row for every star of the observation if these are of a list.
+    measured : CrowdedPhotometry
+        The stars; one for every star of the observation if these are of a list.
     observation : Observation
         The image, which has the unit of the fluxes and, perhaps, a WCS.
     zero_point : float, optional
         Magnitude of a flux of 1; without it there are no magnitudes.
     """
-    columns = {name: np.array(found.stars[name]) for name in found.stars.colnames}
+    columns = {name: np.array(measured.stars[name]) for name in measured.stars.colnames}
     columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
     with np.errstate(all="ignore"):
         if zero_point is not None:
@@ -199,38 +260,7 @@ def photometry_table(
             flux = np.where(columns["flux"] > 0, columns["flux"], np.nan)
             columns["mag"] = zero_point - 2.5 * np.log10(flux)
             columns["mag_error"] = 2.5 / math.log(10.0) * columns["flux_error"] / flux
-        sky = observation.on_sky(columns["x"], columns["y"])
-    if sky is not None:
-        columns["ra"], columns["dec"] = sky
+        sky_position = observation.on_sky(columns["x"], columns["y"])
+    if sky_position is not None:
+        columns["ra"], columns["dec"] = sky_position
     return star_table(columns, observation.unit, observation.list_columns)
-
-
-def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
-    """Return the header of the table."""
-    return {
-        "INFILE": ascii_line(image.name),
-        "PSFMODEL": ascii_line(found.model.name),
-        "PSFSHA": found.model.sha256,
-        "FLUXRAD": found.radius_px,
-        "INMODEL": found.part_of_model()[0],
-        **({} if zero_point is None else {"ZEROPT": zero_point}),
-    }
-
-
-def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
-    count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
-    beyond = "no star is bright enough to show light beyond the model's stamp"
-    if found.wings is not None:
-        part, error = found.part_of_model()
-        beyond = (
-            f"fluxes are the light within {found.radius_px:.3g} px; the model of the PSF has "
-            f"{100 * part:.2f} ± {100 * error:.2f} % of it"
-        )
-    said = f"{out}: {count} stars, {measured} measured"
-    if detected:
-        # Selection by brightness: Eddington (1913, MNRAS 73, 359).
-        beyond += (
-            "\nof stars near the detection threshold, those are found that noise makes brighter: "
-            "their fluxes are too large in the mean, the more the fainter they are"
-        )
-    return f"{said}\n{beyond}"

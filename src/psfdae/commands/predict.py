@@ -1,9 +1,13 @@
-"""Stage `predict`: a FITS file of stars in, a FITS file of their PSFs out, piece by piece."""
+"""Command `predict`: restore the stars of a FITS file, and write their PSFs to another one.
+
+Stars are read, restored and written in pieces, so that memory does not grow with their number.
+"""
 
 from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,7 +17,7 @@ import click
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.commands.mosaic import each, images_of, with_name
+from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
 from psfdae.figures import write_png
 from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.image.fits_file import Card
@@ -23,19 +27,19 @@ from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
+from psfdae.model.psf_model import PsfModel, load_model
 from psfdae.options import File, NameOrNumber
 from psfdae.progress import silence
 
 
 @dataclass(frozen=True)
-class Stated:
-    """Image options; each overrides the FITS header."""
+class ImageOptions:
+    """Options on an image and its stars, which several commands take; each overrides the header."""
 
     catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None
     detect: Annotated[bool, "Find the stars of an image; the list is written, too."] = False
     on_image: Annotated[bool, "Leave out stars of the list that are off the image."] = False
-    threshold: Annotated[float, "Of --detect, in σ above the sky."] = 5.0
+    threshold: Annotated[float, "Detection limit of --detect, in σ above the sky."] = 5.0
     pixel_scale: Annotated[float | None, "Arcseconds per pixel.  [default: the WCS's]"] = None
     origin: Annotated[int | None, click.IntRange(0, 1), "Index of the first pixel's centre."] = None
     extension: Annotated[
@@ -77,7 +81,7 @@ class Stated:
     accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
 
     def words(self) -> list[str]:
-        """The options that state it, as they are typed."""
+        """Return the options that differ from their defaults, as they are typed."""
         words = []
         for option in fields(self):
             value = getattr(self, option.name)
@@ -89,22 +93,22 @@ class Stated:
     def source(
         self, path: Path, flux_column: str | None = None, background_column: str | None = None
     ) -> Source:
-        """The file with all that is stated about it."""
-        stated = vars(self).copy()
-        threshold, scale = stated.pop("threshold"), stated.pop("pixel_scale")
-        del stated["all_extensions"]
-        stated["detect"] = threshold if stated["detect"] else None
+        """Return the image in the file `path`, with all that the options say about it."""
+        statements = vars(self).copy()
+        threshold, pixel_scale = statements.pop("threshold"), statements.pop("pixel_scale")
+        del statements["all_extensions"]
+        statements["detect"] = threshold if statements["detect"] else None
         return Source(
             path,
-            pixel_scale_arcsec=scale,
+            pixel_scale_arcsec=pixel_scale,
             flux_column=flux_column,
             background_column=background_column,
-            **stated,
+            **statements,
         )
 
 
 def write_list(observation: Observation, path: Path) -> None:
-    """The stars that were found, as a star list."""
+    """Write the stars that were detected in an image as a star list in CSV."""
     assert observation.found is not None
     with atomic_path(path) as temporary:
         observation.found.table.write(temporary, format="ascii.csv", overwrite=True)
@@ -113,7 +117,7 @@ def write_list(observation: Observation, path: Path) -> None:
 @command("predict")
 def predict(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
-    stated: Stated,
+    options: ImageOptions,
     flux_column: Annotated[
         str | None, "Fluxes inside the stamp; estimated where not given."
     ] = None,
@@ -142,40 +146,50 @@ def predict(
     and exit code 2.
     """
     job = dict(locals())
-    if not stated.all_extensions:
-        said = restored(**job)
+    if not options.all_extensions:
+        summary = predict_image(**job)
         if not quiet:
-            print(said)
+            print(summary)
         return
+    # Images are worked on side by side, each by one thread.
     jobs = {
         name: {
             **job,
-            "stated": of_image,
-            "model": bundle_of(model, name),
-            "plot": with_name(plot, name),
+            "options": image_options,
+            "model": _bundle_of_image(model, name),
+            "plot": path_of_image(plot, name),
             "threads": 1,
             "quiet": True,
-            "out": with_name(out, name),
+            "out": path_of_image(out, name),
         }
-        for name, of_image in images_of(stars, stated).items()
+        for name, image_options in options_by_image(stars, options).items()
     }
-    each(restored, jobs, stars)
+    run_for_images(predict_image, jobs, stars)
 
 
-def bundle_of(model: Path | None, name: str) -> Path | None:
-    """The bundle of an image, if the model is a folder with one for each."""
+def _bundle_of_image(model: Path | None, name: str) -> Path | None:
+    """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
+
+    `from-stars` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
+    one bundle in the subfolder NAME.
+
+    Raises
+    ------
+    PredictionError
+        If the folder has no bundle of this image, or several.
+    """
     if model is None or not model.is_dir():
         return model
-    own = model / f"{name}{SUFFIX}"
-    found = [own] if own.is_file() else sorted((model / name).glob(f"*{SUFFIX}"))
-    if len(found) != 1:
-        raise PredictionError(f"{model / name}: {len(found)} models, expected one")
-    return found[0]
+    bundle = model / f"{name}{SUFFIX}"
+    bundles = [bundle] if bundle.is_file() else sorted((model / name).glob(f"*{SUFFIX}"))
+    if len(bundles) != 1:
+        raise PredictionError(f"{model / name}: {len(bundles)} models, expected one")
+    return bundles[0]
 
 
-def restored(
+def predict_image(
     stars: Path,
-    stated: Stated,
+    options: ImageOptions,
     flux_column: str | None,
     background_column: str | None,
     fixed_positions: bool,
@@ -186,20 +200,34 @@ def restored(
     quiet: bool,
     out: Path,
 ) -> str:
-    """Predict the stars of one image; what there is to say of it."""
-    source = stated.source(stars, flux_column=flux_column, background_column=background_column)
-    found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
-    model = bundle_of(model, source.name)
-    check_outputs((out, plot, found), (*source.files(), model))
-    check_targets(out, plot, found, overwrite)
+    """Predict the stars of one image, and write the FITS file, the star list and the map.
+
+    Parameters are those of `predict`.
+
+    Returns
+    -------
+    str
+        Lines about the image, its star list, the model, and the number of stars with each flag.
+
+    Raises
+    ------
+    PredictionError
+        If the options do not fit the image or the model, or a file cannot be written.
+    """
+    # Check all that can be checked without reading pixels.
+    source = options.source(stars, flux_column=flux_column, background_column=background_column)
+    list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
+    model = _bundle_of_image(model, source.name)
+    check_targets((*source.files(), model), out, plot, list_path, overwrite=overwrite)
     loaded = load_model(model)
-    observation = source.open(loaded.info.stamp_px, MARGIN_PX)
-    if loaded.info.source == "stars":  # which may have been trained without knowing it, too
+    observation = source.open(loaded.info.stamp_px, loaded.margin_px)
+    if loaded.info.source == "stars":
+        # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assuming()
     assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
     loaded.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
-    measures = isinstance(loaded.engine.estimator, MeasuresStars)
-    if fixed_positions and not (measures and observation.shape):
+    measures_centres = isinstance(loaded.method, MeasuresStars)
+    if fixed_positions and not (measures_centres and observation.shape):
         raise PredictionError(
             f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
             "psfdae from-stars --method field"
@@ -207,97 +235,101 @@ def restored(
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
-        # Its name is the last one to be there: it says that all is done.
+        # The FITS file gets its name last: if it exists, everything is done.
         with atomic_path(out) as unfinished, silence() if quiet else nullcontext():
-            work = (loaded, source, observation, unfinished, threads)
-            counts, clean, off = write_prediction(*work, fixed_positions)
-            if found is not None:
-                write_list(observation, found)
+            flag_counts, unflagged, list_note = _write_prediction(
+                loaded, source, observation, unfinished, threads, fixed_positions
+            )
+            if list_path is not None:
+                write_list(observation, list_path)
             if plot is not None:
                 from psfdae.model.plot import map_of_file
 
                 write_png(map_of_file(unfinished), plot)
     except OSError as error:
-        said = error.strerror or error
-        raise PredictionError(f"{out}: cannot be written ({said})") from error
-    flagged = zip(StarFlag, counts, strict=True)
-    flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
-    clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
-    other = loaded.other_instrument(observation.instrument, observation.colour_column)
-    unlike = f"{source.path}: {other}" if other else None
-    alone = None
-    if observation.shape and isinstance(loaded.engine.estimator, KnowsField) and not loaded.wings:
-        alone = (
+        raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
+    # Summary: the image, its list, what limits the trust in the model, and the flags.
+    lines = [observation.said(), list_note]
+    instrument_note = loaded.other_instrument(observation.instrument, observation.colour_column)
+    if instrument_note:
+        lines.append(f"{source.path}: {instrument_note}")
+    if observation.shape and isinstance(loaded.method, KnowsField) and not loaded.wings:
+        lines.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{loaded.stamp_px} px; flux is the light in the stamp"
         )
-    return "\n".join(line for line in (observation.said(), off, unlike, alone, clean_of) if line)
+    lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
+    flagged = zip(StarFlag, flag_counts, strict=True)
+    lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
+    return "\n".join(line for line in lines if line)
 
 
-def check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
-    """Refuse files that are there already, unless a killed run left them or `overwrite` says so."""
-    ours = overwrite or (not out.exists() and interrupted(out))
-    for target in (out, plot, found):
-        if target is None:
-            continue
+def check_targets(
+    inputs: Sequence[object], out: Path, *other_outputs: Path | None, overwrite: bool
+) -> None:
+    """Refuse outputs that exist, unless `overwrite` is set or a killed run left them.
+
+    Parameters
+    ----------
+    inputs : sequence
+        All that the command reads.
+    out : Path
+        The output that gets its name last.
+    other_outputs : Path or None
+        Outputs that may be there already if a run was killed.
+
+    Raises
+    ------
+    OutputError, PredictionError
+        If a path is an input, a folder or an existing file, or two outputs have the same name.
+    """
+    targets = [out, *filter(None, other_outputs)]
+    check_outputs(targets, inputs)
+    replaceable = overwrite or (not out.exists() and interrupted(out))
+    for target in targets:
         if target.is_dir():
             raise PredictionError(f"{target}: is a folder, not a file")
-        if target.exists() and not ours:
+        if target.exists() and not replaceable:
             raise PredictionError(f"{target}: exists already; --overwrite replaces it")
-    if plot is not None and plot.resolve() == out.resolve():
-        raise PredictionError(f"{plot}: is the name of the FITS file, too")
+    for target in targets[1:]:
+        if target.resolve() == out.resolve():
+            raise PredictionError(f"{target}: two outputs have this name")
 
 
-def write_prediction(
+def _write_prediction(
     model: PsfModel,
     source: Source,
     observation: Observation,
     out: Path,
     threads: int | None,
-    fixed: bool = False,
+    fixed_positions: bool,
 ) -> tuple[np.ndarray, int, str | None]:
-    """Write the file; number of stars with each flag, of those without any, and how good a list is.
+    """Restore the stars in pieces and write them to a FITS file.
 
-    Nothing is left of it if the list's positions are far off (`list_offset`).
+    Returns
+    -------
+    flag_counts : ndarray of int, shape (flags,)
+        Number of stars with each `StarFlag`.
+    unflagged : int
+        Number of stars without any flag.
+    list_note : str or None
+        A sentence on how far the stars are off the positions of their list.
+
+    Raises
+    ------
+    ObservationError
+        If the positions of the list are far off (`list_offset`); nothing is left of the file.
     """
-    pairs = model.stream(observation, threads, fixed)
-    first = next(pairs)
-    counts = np.zeros(len(StarFlag), dtype=int)
-    done, clean, off = 0, 0, []
-    history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
-    header = (first[1], observation.count, _cards(source, observation), history)
-    with prediction_file(out, model.bundle, *header) as file:
-        for stamps, result in itertools.chain([first], pairs):
-            file.write(done, result)
-            counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
-            clean += int((result.flags == 0).sum())
-            off.append(_off(stamps, result))
-            done += len(result)
-        said = list_offset(observation.catalogue, np.concatenate(off), source.accept_offset)
-    return counts, clean, said if observation.shape else None
-
-
-def _off(stamps: Stamps, found: Prediction) -> np.ndarray:
-    """How far stars are from their positions (n, 2), x and y in px; NaN where that is not clear.
-
-    A model that measures no centres knows how far their stamps were moved, or should have been.
-    """
-    centre = np.stack([found.x_fit - stamps.x, found.y_fit - stamps.y], axis=1)
-    lost = (found.flags & int(StarFlag.OFF_CENTRE)) > 0
-    shift = np.stack([found.shift_x, found.shift_y], axis=1)
-    moved = np.where(lost[:, None], MARGIN_PX + 1.0, shift)
-    unclear = (found.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
-    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
-    return np.where(unclear[:, None], np.nan, np.where(np.isfinite(centre), centre, moved))
-
-
-def _cards(source: Source, observation: Observation) -> list[Card]:
+    pieces = model.stream(observation, threads, fixed_positions)
+    first_piece = next(pieces)
+    flag_counts = np.zeros(len(StarFlag), dtype=int)
+    star_index, unflagged, offsets = 0, 0, []
+    # Header cards: the file, its pixel scale, the star list, and what is known of the detector.
+    assumed = ", assumed" if observation.scale_assumed else ""
+    scale = observation.pixel_scale_arcsec
     cards: list[Card] = [
         ("INFILE", source.path.name, "stars"),
-        (
-            *("PIXSCALE", observation.pixel_scale_arcsec),
-            f"[arcsec] width of a pixel{', assumed' if observation.scale_assumed else ''}",
-        ),
+        ("PIXSCALE", scale, f"[arcsec] width of a pixel{assumed}"),
     ]
     if observation.catalogue is not None:
         cards.append(("CATALOG", observation.catalogue.name, "star list"))
@@ -305,4 +337,36 @@ def _cards(source: Source, observation: Observation) -> list[Card]:
         cards.append(("GAIN", observation.gain, "electrons per count"))
     if observation.saturate is not None:
         cards.append(("SATURATE", observation.saturate, "counts of a saturated pixel"))
-    return [*cards, *observation.header_cards]
+    cards += observation.header_cards
+    history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
+    header = (first_piece[1], observation.count, cards, history)
+    with prediction_file(out, model.bundle, *header) as file:
+        for stamps, prediction in itertools.chain([first_piece], pieces):
+            file.write(star_index, prediction)
+            flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
+            unflagged += int((prediction.flags == 0).sum())
+            offsets.append(_list_offsets(stamps, prediction))
+            star_index += len(prediction)
+        note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
+    return flag_counts, unflagged, note if observation.shape else None
+
+
+def _list_offsets(stamps: Stamps, prediction: Prediction) -> np.ndarray:
+    """Return the offsets of stars from their listed positions.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Along x and y in px; NaN for stars that are too faint, have no flux, or are not listed.
+    """
+    # A model that measures centres (field) gives the offset itself.
+    centre_offset = np.stack([prediction.x_fit - stamps.x, prediction.y_fit - stamps.y], axis=1)
+    # For another one, it is the shift by which the stamp was centred on its brightest pixel. A star
+    # that is off by more than the margin allows is given a pixel more than that.
+    off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
+    shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
+    shift = np.where(off_centre[:, None], PsfModel.margin_px + 1.0, shift)
+    unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
+    offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
+    return np.where(unclear[:, None], np.nan, offset)

@@ -1,4 +1,4 @@
-"""Stage `psf`: the PSF of a model of one's own stars at places of their image."""
+"""Command `psf`: write the PSFs of a field model at places of its image, for other programs."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ import click
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.files import check_outputs
+from psfdae.commands.predict import check_targets
 from psfdae.model import exchange
 from psfdae.model.exchange import PSFEX, STDPSF, load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.options import File
-
-PLACE = re.compile(r"([-+0-9.eE]+),([-+0-9.eE]+)")
-GRID = re.compile(r"([0-9]{1,3})x([0-9]{1,3})")
 
 
 @command("psf")
@@ -38,78 +35,101 @@ def psf(
     3.1 reads one, or a grid. A grid in NAME.stdpsf.fits is as STScI's STDPSF, which older releases
     read, too. NAME.psf has the whole field, for SExtractor and other readers of PSFEx's models.
     """
-    check_outputs((out,), (model,))
-    if out.exists() and not overwrite:
-        raise PredictionError(f"{out}: exists already; --overwrite replaces it")
-    whole, standard = out.name.endswith(PSFEX), out.name.endswith(STDPSF)
-    if whole and (at or grid):
+    # The ending of the name decides the format: PSFEx's, STDPSF, or photutils' cube.
+    check_targets((model,), out, overwrite=overwrite)
+    for_psfex, for_stdpsf = out.name.endswith(PSFEX), out.name.endswith(STDPSF)
+    if for_psfex and (at or grid):
         raise PredictionError(f"{out}: has the whole field; neither --at nor --grid")
-    if not whole and bool(at) == (grid is not None):
+    if not for_psfex and bool(at) == (grid is not None):
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     # Readers of PSFEx's files interpolate with Lanczos' kernel, which errs less the finer they are.
-    oversampling = oversampling or (exchange.PSFEX_SAMPLES if whole else exchange.GRID_SAMPLES)
-    if standard and (at or oversampling != exchange.GRID_SAMPLES):
+    oversampling = oversampling or (exchange.PSFEX_SAMPLES if for_psfex else exchange.GRID_SAMPLES)
+    if for_stdpsf and (at or oversampling != exchange.GRID_SAMPLES):
         raise PredictionError(
             f"{out}: STDPSF has a --grid, and {exchange.GRID_SAMPLES} values per pixel and axis"
         )
     loaded = load_field(model)
-    if whole:
-        off = exchange.write_psfex(out, loaded, oversampling)
-        print(f"{out}: within {off:.1g} of the brightest value of {model} at the places looked at")
+    if for_psfex:
+        # The polynomial of PSFEx's format does not hold the model exactly: print the error.
+        error = exchange.write_psfex(out, loaded, oversampling)
+        print(
+            f"{out}: within {error:.1g} of the brightest value of {model} at the places looked at"
+        )
         return
-    size = None if grid is None else _size(grid)
-    places = np.array([_place(text) for text in at]) if size is None else loaded.grid(*size)
-    for note in _notes(loaded, places):
-        print(f"{model}: {note}")
-    if standard and size is not None:
-        exchange.write_stdpsf(out, loaded, *size)
+    grid_shape = None if grid is None else _grid_shape(grid)
+    if grid_shape is None:
+        positions = np.array([_position(text) for text in at])
     else:
-        exchange.write_grid(out, loaded, places, oversampling)
+        positions = loaded.grid(*grid_shape)
+    for note in _notes(loaded, positions):
+        print(f"{model}: {note}")
+    if for_stdpsf and grid_shape is not None:
+        exchange.write_stdpsf(out, loaded, *grid_shape)
+    else:
+        exchange.write_grid(out, loaded, positions, oversampling)
 
 
-def _place(text: str) -> tuple[float, float]:
-    found = PLACE.fullmatch(text.strip())
+def _position(text: str) -> tuple[float, float]:
+    """Return the pixel position (x, y) that an option --at states as X,Y."""
+    match = re.fullmatch(r"([-+0-9.eE]+),([-+0-9.eE]+)", text.strip())
     try:
-        if found is None:
+        if match is None:
             raise ValueError
-        return float(found[1]), float(found[2])
+        return float(match[1]), float(match[2])
     except ValueError:
         raise PredictionError(f"--at {text!r}: expected X,Y, such as 100,250.5") from None
 
 
-def _size(text: str) -> tuple[int, int]:
-    found = GRID.fullmatch(text.strip())
-    columns, rows = (int(n) for n in found.groups()) if found else (0, 0)
+def _grid_shape(text: str) -> tuple[int, int]:
+    """Return the columns and rows of a grid that the option --grid states as COLUMNSxROWS."""
+    match = re.fullmatch(r"([0-9]{1,3})x([0-9]{1,3})", text.strip())
+    columns, rows = map(int, match.groups()) if match else (0, 0)
     if min(columns, rows) < 2:
         raise PredictionError(f"--grid {text!r}: expected COLUMNSxROWS of 2 to 999, such as 9x9")
     return columns, rows
 
 
-def _notes(model: FieldPsfs, places: np.ndarray) -> list[str]:
-    """Return notes on places (n, 2); PredictionError if one is off the image."""
-    order, size, notes = model.order, model.image_px, []
-    if size is not None:
-        off = ((places < -0.5) | (places >= np.array(size) - 0.5)).any(axis=1)
-        for x, y in places[off][:1]:
+def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
+    """Return sentences on positions at which the model does not know the PSF from stars nearby.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+    positions : ndarray, shape (n, 2)
+        x and y in px.
+
+    Raises
+    ------
+    PredictionError
+        If a position is off the image that the model was trained on.
+    """
+    notes = []
+    order = model.order  # refuses a model that knows no PSF between its stars
+    if model.image_px is not None:
+        # The image ends half a pixel beyond the centres of its outermost pixels.
+        end = np.array(model.image_px) - 0.5
+        is_off_image = ((positions < -0.5) | (positions >= end)).any(axis=1)
+        if is_off_image.any():
+            x, y = positions[is_off_image][0]
+            columns, rows = model.image_px
             raise PredictionError(
-                f"{x:g},{y:g} is off the image of {size[0]} columns and {size[1]} rows that the "
+                f"{x:g},{y:g} is off the image of {columns} columns and {rows} rows that the "
                 f"model {model.name!r} was trained on"
             )
     try:
         low, high = model.field_range()
-    except PredictionError:  # of stars without positions, which have one PSF
-        low, high = np.full((2, 2), (-np.inf, np.inf)).T
-    if beyond := int(((places < low) | (places > high)).any(axis=1).sum()):
-        x, y = (
-            f"{a} {least:.6g} … {most:.6g}" for a, least, most in zip("xy", low, high, strict=True)
-        )
+    except PredictionError:  # stars without positions have one PSF, which holds everywhere
+        low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    extrapolated = int(((positions < low) | (positions > high)).any(axis=1).sum())
+    if extrapolated:
         notes.append(
-            f"{beyond} of {len(places)} places are beyond the training stars, {x}, {y}; the PSF "
-            "there is that of their edge"
+            f"{extrapolated} of {len(positions)} places are beyond the training stars, "
+            f"x {low[0]:.6g} … {high[0]:.6g}, y {low[1]:.6g} … {high[1]:.6g}; the PSF there is "
+            "that of their edge"
         )
-    if order == 0 and len(places) > 1:
+    if order == 0 and len(positions) > 1:
         notes.append(
             "the PSF is the same everywhere (order 0: more is not supported by stars left "
-            f"out): all {len(places)} PSFs are equal"
+            f"out): all {len(positions)} PSFs are equal"
         )
     return notes

@@ -26,7 +26,7 @@ WIDE_PX = 7.0  # FWHM of sources from which an image is smoothed by it before it
 
 @dataclass(frozen=True)
 class Sky:
-    """An image (h, w) with its sky subtracted, and what was subtracted."""
+    """An image (h, w) with its sky subtracted, and what was subtracted, in single precision."""
 
     flat: np.ndarray  # interpolated where bad; 0 where no good pixel is near
     level: np.ndarray
@@ -164,14 +164,15 @@ def sky_of(
     ValueError
         If no mesh has enough pixels that count.
     """
-    values = np.where(bad, 0.0, image)
-    measured = sky_level(values, bad)
+    image = np.where(bad, 0.0, image)
+    measured = sky_level(image, bad)
     level = measured.level
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
-    least_noise = max(least_noise, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))
-    noise = np.maximum(measured.noise, least_noise)
+    least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
+    noise = np.maximum(measured.noise, least_noise, out=measured.noise)
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
-        noise = scale * sigma
-    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale, measured.notes)
+        noise = (scale * sigma).astype(np.float32)
+    flat = interpolated((image - level).astype(np.float32), bad)[0]
+    return Sky(flat, level, noise, bad, scale, measured.notes)

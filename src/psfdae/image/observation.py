@@ -777,7 +777,7 @@ def _sky(layers: Layers) -> Sky:
     with layers.open(is_whole=True) as (_, _, noise):
         assert noise is not None
         stated_sigma = layers.sigma(noise[:], sky.flat)
-    return replace(sky, noise=sky.noise_scale * stated_sigma)
+    return replace(sky, noise=(sky.noise_scale * stated_sigma).astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from psfdae.errors import Error
 from psfdae.image.bad_pixels import interpolated_stamps
 from psfdae.image.observation import Observation, central_pixel
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around, softened
-from psfdae.moments import FWHM_OF_SIGMA, moved, robust_scatter, windowed_centres
+from psfdae.moments import FWHM_OF_SIGMA, robust_scatter, shift_stamps, windowed_centres
 
 if TYPE_CHECKING:
     from psfdae.settings import CalibrationStars, Stamp
@@ -364,7 +364,7 @@ def completed(
             # Median of the neighbours, moved to the star's centre; its flux by least squares over
             # the good pixels of the stamp, F = Σ x p / Σ p².
             psf = np.median(aligned[neighbours[neighbours != star]], axis=0)
-            psf = moved(psf[None], stars.centre[star][None])[0]
+            psf = shift_stamps(psf[None], stars.centre[star][None])[0]
             bad = stars.bad[star]
             good = ~bad[stamp]
             square = float(np.square(psf[stamp][good]).sum())

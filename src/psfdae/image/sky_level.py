@@ -51,17 +51,25 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
         if lines:
             lines_text = ", ".join(map(str, lines))
             notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
-    level, noise = np.zeros((2, *image.shape))
+    # Single precision: of a large image, each map takes much memory.
+    level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
     for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
             if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part])
     pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
-    # Single precision: of a large image, each map takes much memory.
-    share, weight = structure((noise / pixel_sigma).astype(np.float32), bad)
+    # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
+    # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
+    # Both are of meshes: every fourth pixel shows them.
+    sample = np.s_[::4, ::4]
+    ratio = noise[sample] / pixel_sigma[sample]
+    ratio = ratio[~bad[sample] & (ratio > 0)]
+    typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
+    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
     around = _median_level(image - level, bad) if share > 0.05 else None
     if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
+        weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad)
         level += weight * around
         # What is left; its noise changes with the light of the structure, from mesh to mesh of 16.
         remainder, noise = _meshed(image - level, bad)
@@ -194,7 +202,7 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
 
     continued = _continued(mesh, 2, slope)
     row, column = ((np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape)
-    values = np.empty(shape)
+    values = np.empty(shape, np.float32)
     # A few rows at a time: their coordinates take twice the memory of the values.
     for part in (slice(top, top + 256) for top in range(0, len(row), 256)):
         grid = np.meshgrid(row[part], column, indexing="ij")
@@ -234,25 +242,22 @@ def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: 
     return bool(brightest.size < 5 or np.median(height_left) > 0.75)
 
 
-def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the part of an image whose sky changes within a mesh, and where, from 0 to 1, (h, w).
+def structure_weight(noise_excess: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return how much the sky of an image changes within a mesh, from 0 to 1, (h, w).
 
-    `ratio` (h, w) is the σ of a mesh over that from differences of neighbouring pixels. Where the
-    sky has structure it is larger than elsewhere by a factor of 1.5; that of resampled images is
-    larger everywhere.
+    Parameters
+    ----------
+    noise_excess : ndarray, shape (h, w)
+        σ of a mesh over that from differences of neighbouring pixels, over the usual ratio.
+    bad : ndarray of bool, shape (h, w)
     """
     from scipy import ndimage
 
-    good = ratio[~bad & (ratio > 0)]
-    if not good.size:
-        return 0.0, np.zeros(ratio.shape, ratio.dtype)
-    typical_ratio = max(float(np.percentile(good, 25)), 1e-6)
     # Meshes beside those with structure are interpolated from these, and wrong, too.
-    weight = np.clip((ratio / typical_ratio - 1.25) / 0.5, 0.0, 1.0)
+    weight = np.clip((noise_excess - 1.25) / 0.5, 0.0, 1.0)
     weight[bad] = 0.0
     widened = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
-    weight = ndimage.uniform_filter(widened, MESH_PX, mode="nearest")
-    return float(np.mean(good > 1.5 * typical_ratio)), weight
+    return np.asarray(ndimage.uniform_filter(widened, MESH_PX, mode="nearest"))
 
 
 def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:

@@ -120,7 +120,7 @@ def _windows(
     # Brightness: light within 8 px; bad pixels have none.
     clean = np.where(bad, 0.0, flat)
     total = np.zeros((height + 1, width + 1))
-    total[1:, 1:] = clean.cumsum(axis=0).cumsum(axis=1)
+    total[1:, 1:] = clean.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
     low, high = np.clip(place - 8, 0, None), np.minimum(place + 9, flat.shape)
     light = total[high[:, 0], high[:, 1]] - total[low[:, 0], high[:, 1]]
     light += total[low[:, 0], low[:, 1]] - total[high[:, 0], low[:, 1]]

@@ -17,7 +17,7 @@ from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.files import Column
 from psfdae.image.selection import brightest_pixels
 from psfdae.image.stamps import cut
-from psfdae.moments import moved
+from psfdae.moments import shift_stamps
 from psfdae.splits import draw_jitter, draw_phase
 
 if TYPE_CHECKING:
@@ -172,10 +172,10 @@ def make_images(
         # Splines ring beside what is left of a saturated neighbour.
         floor = -DEFECT * stars.noise[star_rows[is_moved], None, None]
         stamps[is_moved] = np.maximum(
-            moved(stars.wide, phase[rows][is_moved], star_rows[is_moved]), floor
+            shift_stamps(stars.wide, phase[rows][is_moved], star_rows[is_moved]), floor
         )
         offset = brightest_pixels(stamps, reach, centring_px)[0] - jitter[rows]
-        shifted = moved(template, stars.centre[star_rows] + phase[rows], star_rows)
+        shifted = shift_stamps(template, stars.centre[star_rows] + phase[rows], star_rows)
         for source, target in ((stamps, realisations), (shifted, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)

@@ -105,12 +105,14 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         sky = replace(sky, bad=bad)
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
-    light, wing_light, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
+    # The first errors are from the pixels themselves, light of neighbours included.
+    wings, wing_light = None, np.zeros_like(image)
+    error = _pixel_error(sky.noise, sky.flat, observation.gain)
     for turn in range(ROUNDS):
-        flat = image - sky.level - wing_light
-        error = np.sqrt(sky.noise**2 + (light / observation.gain if observation.gain else 0.0))
         limits = _box(fwhm), MOST_MOVED_FWHM * fwhm
-        fit = fit_stars(psfs, flat, error, bad, place, flux, *limits, origin)
+        without_wings = image - sky.level - wing_light
+        fit = fit_stars(psfs, without_wings, error, bad, place, flux, *limits, origin)
+        del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         outer_parts = outer_light(model.on_pixels, place)
@@ -118,7 +120,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             image, sky, error, fit.light, place, flux, outer_parts, side, wings
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
-        light = np.maximum(fit.light + wing_light, 0.0)
+        error = _pixel_error(sky.noise, fit.light + wing_light, observation.gain)
         if turn == 0 and observation.found is not None:
             place, flux = _with_hidden(sky, sigma, place, flux, threshold, fwhm)
             origin = np.concatenate([origin, place[len(origin) :]])
@@ -193,6 +195,11 @@ def star_flags(
     pairs = cKDTree(place[located]).query_pairs(fwhm, output_type="ndarray")
     raise_flag(flags, StarFlag.BLENDED, located[pairs.ravel()])
     return flags
+
+
+def _pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
+    """Return σ (h, w) of pixels, σ² = noise² of the sky + light of stars over the gain."""
+    return np.hypot(noise, np.sqrt(np.maximum(light, 0.0) / gain)) if gain else noise
 
 
 def _box(fwhm: float) -> int:

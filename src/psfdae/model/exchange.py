@@ -1,14 +1,16 @@
-"""PSFs at places of an image in files of other programs: PSFEx, STPSF, STDPSF, photutils.
+"""PSFs over the field in files of other programs: PSFEx, STPSF, STDPSF, photutils.
 
-A model of PSFEx (Bertin 2011, ASP Conf. Ser. 442, 435) is a polynomial in the position, of which
-each term has an image with samples of `PSF_SAMP` pixels, to be interpolated by Lanczos' kernel.
-STDPSF (Anderson 2016, WFC3 ISR 2016-12) and STPSF (`psf_grid`) are cubes of PSFs at places of a
-grid. In all of them, as in psfdae, a value is what a whole pixel there would get.
+A model of PSFEx (Bertin 2011, ASP Conf. Ser. 442, 435) is a polynomial in the position. The
+coefficient of each term is an image with a sample every `PSF_SAMP` pixels, to be interpolated by
+Lanczos' kernel. STDPSF (Anderson 2016, WFC3 ISR 2016-12) and STPSF (`psf_grid`) are cubes of PSFs
+at the positions of a grid. In all of them, as in psfdae, a value is the light that a whole pixel
+centred there would get.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -24,20 +26,24 @@ from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
-PSFEX, STDPSF = ".psf", ".stdpsf.fits"
-"""Ends of names: what a file is written as, or read as."""
+PSFEX = ".psf"
+"""End of the name of a file of PSFEx, written or read."""
 
-LANCZOS = 4  # order of the kernel, as of PSFEx
-GRID_SAMPLES, PSFEX_SAMPLES = 4, 8  # values per pixel and axis
-STDPSF_PLACES = 99  # along an axis, at most
-LARGEST_PSF = 1025  # samples, and pixels, along an axis of a file of PSFEx
-HIGHEST_ORDER = 12
-NO_WIDTH = 1.0  # of a field in pixels, whose places nobody knows
-AT_ONCE = 2**20  # values of PSFs that are made before they are written
+STDPSF = ".stdpsf.fits"
+"""End of the name of a file in the format STDPSF."""
+
+GRID_SAMPLES = 4
+"""Values per pixel and axis of a cube of PSFs; STDPSF has no others."""
+
+PSFEX_SAMPLES = 8
+"""Values per pixel and axis of a file of PSFEx."""
+
+UNKNOWN_WIDTH_PX = 1.0
+"""Width of a field in pixels that stands for an unknown one."""
 
 
 def load_field(path: Path) -> FieldPsfs:
-    """The PSF at every place of an image: a bundle of psfdae, or a .psf file of PSFEx.
+    """Return the PSF over an image from a bundle of psfdae, or from a .psf file of PSFEx.
 
     Raises
     ------
@@ -48,12 +54,23 @@ def load_field(path: Path) -> FieldPsfs:
 
 
 class PsfexField(FieldPsfs):
-    """A model of PSFEx; beyond the stars it was made of, the PSF is that of their edge.
+    """Model of PSFEx; beyond the stars it was made of, the PSF is that of their edge.
 
     Parameters
     ----------
     path : Path
-        A .psf file, of one extension, whose polynomial is in the position alone.
+        A .psf file of one extension, whose polynomial is in the position alone.
+
+    Attributes
+    ----------
+    terms : ndarray of int, shape (t, 2)
+        Powers of u and v, the scaled positions, in the terms of the polynomial.
+    basis : ndarray, shape (t, h, w)
+        Sampled image of each term.
+    step_px : float
+        Pixels from one sample to the next.
+    zero, width : ndarray, shape (2,)
+        Position (x, y), 0-based, and pixels per unit of u and v.
 
     Raises
     ------
@@ -67,120 +84,155 @@ class PsfexField(FieldPsfs):
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
+        # PSFEx writes one table with one row, the images of all terms.
         file = plain_file(path)
         with reading(path), open_hdus(file) as hdus:
-            tables = [hdu for hdu in hdus if hdu.name == "PSF_DATA"]
-            found = [(dict(t.header), np.array(t.data["PSF_MASK"][0], float)) for t in tables]
-        if len(found) != 1:
-            self._refuse(f"{len(found)} tables PSF_DATA, expected one, as PSFEx writes it")
+            tables = [
+                (dict(hdu.header), np.array(hdu.data["PSF_MASK"][0], float))
+                for hdu in hdus
+                if hdu.name == "PSF_DATA"
+            ]
+        if len(tables) != 1:
+            self._refuse(f"{len(tables)} tables PSF_DATA, expected one, as PSFEx writes it")
         try:
-            self._read(*found[0])
+            self._read(*tables[0])
+        except PredictionError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, PredictionError):
-                raise
             self._refuse(f"no model of PSFEx ({error})")
 
-    def _refuse(self, why: str) -> NoReturn:
-        raise PredictionError(f"{self.path}: {why}")
+    def _refuse(self, problem: str) -> NoReturn:
+        """Raise PredictionError with a problem of the file."""
+        raise PredictionError(f"{self.path}: {problem}")
 
     def _read(self, header: Mapping[str, Any], mask: np.ndarray) -> None:
-        axes = int(header["POLNAXIS"])
-        names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axes)]
-        at_place = len(names) == 2 and all(
-            name.startswith(axis) and name.endswith("_IMAGE")
-            for axis, name in zip("XY", names, strict=True)
-        )
-        if names and not (at_place and int(header["POLNGRP"]) == 1):
+        """Set polynomial, sampling and scales.
+
+        Parameters
+        ----------
+        header : mapping
+            Header of the table PSF_DATA.
+        mask : ndarray, shape (t, h, w) or (h, w)
+            Images of the terms.
+
+        Raises
+        ------
+        PredictionError, KeyError, TypeError, ValueError
+            If the header lacks a key, or has one that is no model of the position.
+        """
+        # Coordinates of the polynomial: none, or x and y in one group.
+        axis_count = int(header["POLNAXIS"])
+        names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axis_count)]
+        is_position = re.fullmatch(r"X\S*_IMAGE Y\S*_IMAGE", " ".join(names))
+        if names and not (is_position and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
-        self._order = order = int(header["POLDEG1"]) if names else 0
-        self.step = float(header["PSF_SAMP"])
-        zero, width = np.full(2, 0.0), np.full(2, NO_WIDTH)
+        self._order = int(header["POLDEG1"]) if names else 0
+        self.step_px = float(header["PSF_SAMP"])
+        zero, self.width = np.full(2, 0.0), np.full(2, UNKNOWN_WIDTH_PX)
         if names:
-            zero, width = (
+            zero, self.width = (
                 np.array([float(header[f"{key}{i}"]) for i in (1, 2)])
                 for key in ("POLZERO", "POLSCAL")
             )
-        mask = mask.reshape(-1, *mask.shape[-2:])
-        powers = psfex_powers(order) if order <= HIGHEST_ORDER else []
-        self.terms: np.ndarray = np.array(powers)
+        self.zero = zero - 1.0  # FITS counts pixels from 1
+        # Limits far beyond any real PSF keep time and memory of a damaged file small.
+        max_order, max_side = 12, 1025
+        self.basis = mask.reshape(-1, *mask.shape[-2:])
+        self.terms: np.ndarray = np.array(
+            psfex_powers(self._order) if self._order <= max_order else []
+        )
+        # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         side = min(mask.shape[-2:])
-        usable = (
-            0 <= order <= HIGHEST_ORDER
-            and len(self.terms) == len(mask)
-            and 1 < side <= max(mask.shape[-2:]) <= LARGEST_PSF
-            and 0.01 < self.step <= 10
-            and side * self.step <= LARGEST_PSF
-            and np.isfinite([zero, width]).all()
-            and (width > 0).all()
+        is_usable = (
+            0 <= self._order <= max_order
+            and len(self.terms) == len(self.basis)
+            and 1 < side <= max(mask.shape[-2:]) <= max_side
+            and 0.01 < self.step_px <= 10
+            and side * self.step_px <= max_side
+            and np.isfinite([zero, self.width]).all()
+            and (self.width > 0).all()
             and np.isfinite(mask).all()
         )
-        if not usable:
+        if not is_usable:
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
-        self.basis, self.stamp_px = mask, 2 * max(1, int(side * self.step / 2))
-        self.zero, self.width = zero - 1.0, width
+        self.stamp_px = 2 * max(1, int(side * self.step_px / 2))
 
     @property
     def order(self) -> int:
+        """Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere."""
         return self._order
 
     @cached_property
     def sha256(self) -> str:
+        """Checksum of the file."""
         return hashlib.sha256(self.path.read_bytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        if (self.width <= NO_WIDTH).any():
+        """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
+        if (self.width <= UNKNOWN_WIDTH_PX).any():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
-        """Files of PSFEx do not say how large pixels are."""
+        """Accept any scale: files of PSFEx do not say how large pixels are."""
 
-    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        place = place[:, :2]  # neither magnitude nor colour
-        u, v = np.clip((place - self.zero) / self.width, -0.5, 0.5).T
+    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        position = position[:, :2]  # neither magnitude nor colour
+        # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
+        u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
-        phase = place - np.floor(place + 0.5)
+        phase = position - np.floor(position + 0.5)
         count = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
         axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
-        whole = np.arange(self.stamp_px) - self.stamp_px // 2  # of a star in the middle
-        inside = self._interpolated(sampled, whole, np.zeros_like(phase)).sum(axis=(1, 2))
-        return np.asarray(self._interpolated(sampled, axis, phase) / inside[:, None, None])
+        # Sum 1 in the pixels of the stamp of a star in the middle of its pixel.
+        pixels = np.arange(self.stamp_px) - self.stamp_px // 2
+        flux = self._interpolate(sampled, pixels, np.zeros_like(phase)).sum(axis=(1, 2))
+        return np.asarray(self._interpolate(sampled, axis, phase) / flux[:, None, None])
 
-    def _interpolated(self, sampled: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
-        """Images (n, m, m) on an axis (m,) of samples (n, h, w), moved by phases (n, 2), x, y."""
+    def _interpolate(self, sampled: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Interpolate sampled PSFs at pixels about their stars.
+
+        Parameters
+        ----------
+        sampled : ndarray, shape (n, h, w)
+        axis : ndarray, shape (m,)
+            Pixels along x and along y.
+        phase : ndarray, shape (n, 2)
+            Offsets (x, y) of the stars from the middle of their pixel.
+
+        Returns
+        -------
+        ndarray, shape (n, m, m)
+        """
         columns, rows = (
-            _lanczos((axis - phase[:, i, None]) / self.step, sampled.shape[2 - i]) for i in (0, 1)
+            _lanczos((axis - phase[:, i, None]) / self.step_px, sampled.shape[2 - i])
+            for i in (0, 1)
         )
         return np.asarray(rows @ sampled @ columns.transpose(0, 2, 1))
 
 
-def _lanczos(place: np.ndarray, count: int) -> np.ndarray:
-    """Weights (…, count) of samples about the middle one, count//2, at places (…) from it."""
+def _lanczos(offset: np.ndarray, count: int) -> np.ndarray:
+    """Return the weights (…, count) of samples at offsets (…) from the middle one, count//2.
+
+    The kernel is that of PSFEx, sinc(t) sinc(t / 4) for |t| < 4.
+    """
 
     def kernel(t: np.ndarray) -> np.ndarray:
-        return np.where(np.abs(t) < LANCZOS, np.sinc(t) * np.sinc(t / LANCZOS), 0.0)
+        return np.where(np.abs(t) < 4, np.sinc(t) * np.sinc(t / 4), 0.0)
 
-    # The sum over all samples, were there no edge, is nearly 1, and shall be.
-    fraction = (place - np.floor(place))[..., None]
-    total = kernel(fraction - np.arange(1 - LANCZOS, LANCZOS + 1)).sum(axis=-1, keepdims=True)
-    return np.asarray(kernel(place[..., None] - (np.arange(count) - count // 2)) / total)
+    # The sum over all samples would be close to 1 if there were no edge; divide by it.
+    fraction = (offset - np.floor(offset))[..., None]
+    total = kernel(fraction - np.arange(-3, 5)).sum(axis=-1, keepdims=True)
+    return np.asarray(kernel(offset[..., None] - (np.arange(count) - count // 2)) / total)
 
 
 def psfex_powers(order: int) -> list[tuple[int, int]]:
-    """Powers of x and y in the terms of PSFEx's polynomial, in their order."""
+    """Return the powers of x and y in the terms of PSFEx's polynomial, in their order."""
     return [(i, j) for j in range(order + 1) for i in range(order + 1 - j)]
 
 
-def _require_middle(path: Path, model: FieldPsfs, oversampling: int) -> None:
-    """Refuse PSFs without a middle sample, which other programs take for their centre."""
-    if oversampling == 1 and model.stamp_px % 2 == 0:
-        raise PredictionError(
-            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
-        )
-
-
 def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
-    """Write a model for PSFEx's readers; how far it is off, over the brightest value.
+    """Write a model for PSFEx's readers.
 
     Parameters
     ----------
@@ -189,120 +241,151 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     oversampling : int
         Samples per pixel and axis.
 
+    Returns
+    -------
+    float
+        Largest error of the polynomial, over the brightest value of the PSFs.
+
     Raises
     ------
     PredictionError
-        If the model knows no PSF of a place, or the PSF would have no middle sample.
+        If the model knows no PSF of a position, or the PSF would have no middle sample.
     """
     from astropy.io import fits
 
     order = model.order
-    _require_middle(path, model, oversampling)
+    # Other programs take the middle sample for the centre.
+    if oversampling == 1 and model.stamp_px % 2 == 0:
+        raise PredictionError(
+            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
+        )
+    # A grid with about twice as many nodes along an axis as the polynomial has terms. A constant
+    # PSF needs no field.
     try:
         low, high = model.field_range()
-        places = np.rint(model.grid(2 * order + 3, 2 * order + 3))
+        positions = np.rint(model.grid(2 * order + 3, 2 * order + 3))
     except PredictionError:
         if order:
             raise
-        low, high, places = np.zeros(2), np.zeros(2), np.zeros((1, 2))
-    zero, width = (low + high) / 2, np.maximum(high - low, NO_WIDTH)
-    powers = psfex_powers(order)
-    u, v = ((places - zero) / width).T
-    terms = np.stack([u**i * v**j for i, j in powers], axis=1)
-    x, y = places.T
+        low, high, positions = np.zeros(2), np.zeros(2), np.zeros((1, 2))
+    # Least squares for the image of each term: psf(u, v) = Σ uⁱ vʲ b_ij.
+    zero, width = (low + high) / 2, np.maximum(high - low, UNKNOWN_WIDTH_PX)
+    u, v = ((positions - zero) / width).T
+    terms = np.stack([u**i * v**j for i, j in psfex_powers(order)], axis=1)
+    x, y = positions.T
     psfs = model.psf_at(x, y, oversampling)
     basis = np.tensordot(np.linalg.pinv(terms), psfs, 1)
-    off = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
+    error = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
+    # Readers show the FWHM; it is that of the PSF in the middle of the list of positions.
+    fwhm = float(measure_shapes(psfs[len(psfs) // 2][None]).fwhm_px[0]) / oversampling
     size = basis.shape[-1]
-    table = fits.BinTableHDU.from_columns(
-        [
-            fits.Column(
-                "PSF_MASK",
-                f"{basis.size}E",
-                dim=f"({size}, {size}, {len(basis)})",
-                array=basis[None].astype(np.float32),
-            )
-        ],
-        name="PSF_DATA",
+    column = fits.Column(
+        "PSF_MASK",
+        f"{basis.size}E",
+        dim=f"({size}, {size}, {len(basis)})",
+        array=basis[None].astype(np.float32),
     )
-    stars = {"LOADED": 0, "ACCEPTED": 0, "CHI2": 1.0}
-    said: dict[str, str | float] = {**stars, "POLNAXIS": 2}
+    table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    # Cards in the words of PSFEx; scaled positions u = (x − POLZERO) / POLSCAL, x from 1.
+    cards: dict[str, str | float] = {"LOADED": 0, "ACCEPTED": 0, "CHI2": 1.0, "POLNAXIS": 2}
     for i, axis in enumerate("XY"):
-        said[f"POLGRP{i + 1}"] = 1
-        said[f"POLNAME{i + 1}"] = f"{axis}_IMAGE"
-        said[f"POLZERO{i + 1}"] = float(zero[i] + 1.0)
-        said[f"POLSCAL{i + 1}"] = float(width[i])
-    middle = psfs[len(psfs) // 2]
-    fwhm = float(measure_shapes(middle[None]).fwhm_px[0]) / oversampling
-    said |= {"POLNGRP": 1, "POLDEG1": order, "PSF_FWHM": fwhm}
-    said |= {"PSF_SAMP": 1.0 / oversampling, "PSFNAXIS": 3}
-    said |= {"PSFAXIS1": size, "PSFAXIS2": size, "PSFAXIS3": len(basis)}
-    said |= {"CREATOR": f"psfdae {__version__}", "PSFMODEL": ascii_line(model.name)}
-    table.header.update(said)
+        cards[f"POLGRP{i + 1}"] = 1
+        cards[f"POLNAME{i + 1}"] = f"{axis}_IMAGE"
+        cards[f"POLZERO{i + 1}"] = float(zero[i] + 1.0)
+        cards[f"POLSCAL{i + 1}"] = float(width[i])
+    cards |= {"POLNGRP": 1, "POLDEG1": order, "PSF_FWHM": fwhm}
+    cards |= {"PSF_SAMP": 1.0 / oversampling, "PSFNAXIS": 3}
+    cards |= {"PSFAXIS1": size, "PSFAXIS2": size, "PSFAXIS3": len(basis)}
+    cards |= {"CREATOR": f"psfdae {__version__}", "PSFMODEL": ascii_line(model.name)}
+    table.header.update(cards)
     write_fits(path, fits.HDUList([fits.PrimaryHDU(), table]))
-    return off
+    return error
 
 
 def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     """Write PSFs on a grid as STScI's library of PSFs has them, 4 values per pixel and axis.
 
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    columns, rows : int
+        Positions along x and along y, evenly over the field.
+
     Raises
     ------
     PredictionError
-        If the grid has too many places, or photutils would take the name for that of a detector.
+        If the grid has too many positions, or photutils would take the name for that of a detector.
     """
-    if max(columns, rows) > STDPSF_PLACES:
-        raise PredictionError(f"{path}: at most {STDPSF_PLACES} places along an axis")
+    # Keys have two digits for the number of a column or row.
+    if max(columns, rows) > 99:
+        raise PredictionError(f"{path}: at most 99 places along an axis")
     if len(path.name.split("_")) in (3, 4):
         raise PredictionError(
             f"{path}: photutils takes the second part of a name with two or three underscores "
             "for a detector of STScI; expected another number of them"
         )
-    places = np.rint(model.grid(columns, rows))
+    # Columns and rows of the grid, whole pixels counted from 1.
+    positions = np.rint(model.grid(columns, rows))
+    grid = positions.reshape(rows, columns, 2)
     cards: list[Card] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]
-    along = places.reshape(rows, columns, 2)
-    cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(along[0, :, 0])]
-    cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(along[:, 0, 1])]
-    _write_cube(path, model, places, GRID_SAMPLES, cards)
+    cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(grid[0, :, 0])]
+    cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(grid[:, 0, 1])]
+    _write_cube(path, model, positions, GRID_SAMPLES, cards)
 
 
-def write_grid(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: int) -> None:
-    """A cube of PSFs (n, m, m) at places (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
+def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int) -> None:
+    """Write a cube of PSFs at positions (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
     cards: list[Card] = [
         ("OVERSAMP", oversampling, "values per pixel and axis"),
-        # photutils 3.0 takes every key with these letters, in any case, for a place, and would
+        # photutils 3.0 takes every key with these letters, in any case, for a position, and would
         # exchange x and y without a word: now it stops at this one. Others look for capitals.
         ("HIERARCH Det_yx for photutils 3.0", "this needs photutils 3.1 or newer", ""),
     ]
-    for number, (column, row) in enumerate(places.tolist()):
+    for number, (column, row) in enumerate(positions.tolist()):
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
-    _write_cube(path, model, places, oversampling, cards)
+    _write_cube(path, model, positions, oversampling, cards)
 
 
 def _write_cube(
-    path: Path,
-    model: FieldPsfs,
-    places: np.ndarray,
-    oversampling: int,
-    cards: list[Card],
+    path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int, cards: list[Card]
 ) -> None:
+    """Write a FITS cube of centred PSFs.
+
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    positions : ndarray, shape (n, 2)
+        Positions x and y; PSFs are those of the nearest whole pixel.
+    oversampling : int
+        Values per pixel and axis.
+    cards : list of Card
+        Cards of the format, which follow those of the model.
+    """
     from astropy.io import fits
 
-    # About the middle of a pixel: what comes out is centred.
-    x, y = np.rint(places).T
+    # PSFs about the middle of a pixel are centred.
+    x, y = np.rint(positions).T
     first = model.psf_at(x[0], y[0], oversampling)
     header = fits.PrimaryHDU(first[None].astype(np.float32)).header
-    header["NAXIS3"] = len(places)
-    made = ("CREATOR", f"psfdae {__version__}", "program that made this file")
-    of: list[Card] = [("PSFMODEL", ascii_line(model.name), "model"), ("PSFSHA", model.sha256, "")]
-    of += model.wings.cards() if model.wings else []
-    header = fits.Header([*header.cards, made, *of, *cards])  # `extend` takes the square of time
-    # Not by astropy's StreamingHDU: its error on a full disk has no cause and no file.
-    step = max(1, AT_ONCE // first.size)
+    header["NAXIS3"] = len(positions)
+    model_cards: list[Card] = [
+        ("CREATOR", f"psfdae {__version__}", "program that made this file"),
+        ("PSFMODEL", ascii_line(model.name), "model"),
+        ("PSFSHA", model.sha256, ""),
+        *(model.wings.cards() if model.wings else []),
+    ]
+    # One list of cards: `Header.extend` takes a time that grows as their square.
+    header = fits.Header([*header.cards, *model_cards, *cards])
+    # Written as bytes, some million values at a time for memory. Astropy's StreamingHDU would not
+    # name the file when the disk is full.
+    step = max(1, 2**20 // first.size)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(header.tostring().encode("ascii"))
-        for start in range(0, len(places), step):
+        for start in range(0, len(positions), step):
             part = slice(start, start + step)
             file.write(model.psf_at(x[part], y[part], oversampling).astype(">f4").tobytes())
+        # A FITS file ends with a whole block.
         file.truncate(-(-file.tell() // BLOCK_BYTES) * BLOCK_BYTES)

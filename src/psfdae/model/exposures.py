@@ -1,4 +1,4 @@
-"""A field model of some exposures for one, which may have few bright stars of its own."""
+"""Adaptation of a field model to another exposure, which may have few bright stars."""
 
 from __future__ import annotations
 
@@ -17,41 +17,42 @@ from psfdae.model.settings import of_config
 from psfdae.model.stars import Stars
 from psfdae.version import __version__
 
-FEWEST_STARS = 5
-"""Bright stars of an exposure, of which one can be left out to judge the others."""
+MIN_STARS = 5
+"""Number of bright stars of an exposure from which cross-validation can judge a change."""
 
 
 def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]:
-    """A model for another exposure of the same camera, by its own bright stars.
+    """Adapt a model to the bright stars of another exposure of the same camera.
 
-    The PSF at a place changes from that of `model` by as much as the stars that are left out
-    support. The scatter of stars about the field, and the calibration of errors, stay those of the
+    The PSF at a position changes from that of `model` by as much as cross-validation with the stars
+    supports. The scatter of stars about the field, and the calibration of errors, stay those of the
     training of `model`.
 
     Parameters
     ----------
     model : PsfModel
-        Of the method field, of an exposure with many stars.
+        Model of the method field, trained on an exposure with many stars.
     source : Source
         The other exposure, and what is stated about it.
     name : str
-        Of the new model.
+        Name of the new model.
 
     Returns
     -------
     model : PsfModel
-    said : str
-        How many stars it rests on, and whether it is of another telescope, camera or filter.
+    message : str
+        Remarks on the image and its list, the number of stars, and a difference of telescope,
+        camera or filter; one line each.
 
     Raises
     ------
     PredictionError
-        If `model` knows no places, was adapted itself, or is of pixels of another size.
+        If `model` knows no positions, was adapted itself, or has pixels of another size.
     Error
         If the image cannot be used, or has too few bright stars.
     """
-    model.field_range()
-    info, field = model.info, model.engine.estimator
+    model.field_range()  # refuses a model without positions
+    info, field = model.info, model.method
     if not isinstance(field, FieldMixture):
         raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
     if info.adapted:
@@ -59,6 +60,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
             f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
             "exposure it was trained on"
         )
+    # The settings by which the stars of the training were chosen.
     try:
         trained = info.config["stars"]
         settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
@@ -66,7 +68,9 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         raise PredictionError(
             f"the model {model.name!r} does not say how its stars were chosen"
         ) from None
-    calibration = settings.calibration_stars.model_copy(update={"stars_min": FEWEST_STARS})
+    # Its bright stars, chosen as those of the training, but few are enough.
+    calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS})
+    # The image must have the pixels of the training; another filter is only reported.
     observation = source.open(info.stamp_px, calibration.margin_px).assuming()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
@@ -76,65 +80,64 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
     sentence = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
-    off = list_offset(
+    sentence = f"{sentence} ({difference})" if difference else sentence
+    # Remarks for the user: offset of the star list, number of stars, differences.
+    offset_note = list_offset(
         observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
     )
-    adapted = _adapted(model, field, observation, bright, name)
-    sentence = f"{sentence} ({difference})" if difference else sentence
-    return adapted, "\n".join([*observation.remarks, *filter(None, [off]), sentence])
+    lines = [*observation.remarks, *filter(None, [offset_note]), sentence]
+    return _adapt(model, field, observation, bright, name), "\n".join(lines)
 
 
 def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
-    """A model for each exposure of several, by its own bright stars.
+    """Adapt a model of several exposures to each of them.
 
     Parameters
     ----------
     model : PsfModel
-        Fitted to them, as `psfdae.fit` does it.
+        Model that `psfdae.fit` made of the stars of all exposures.
     stars : Stars
-        Of several images.
+        Stars of several images.
 
     Returns
     -------
     dict of str to PsfModel
-        By the images' names without suffix, as `psfdae exposure` adapts a model to an exposure;
-        `model` itself where its method knows no field, or an image has fewer than 5 bright stars.
+        Adapted models, by the images' names without suffix; `model` itself where its method knows
+        no field, or an image has fewer than 5 bright stars.
     """
-    field, models = model.engine.estimator, {}
-    for part in stars.exposures:
-        bright, exposure_model = part.candidates.bright, model
-        if isinstance(field, FieldMixture) and len(bright) >= FEWEST_STARS:
-            exposure_model = _adapted(model, field, part.observation, bright, part.name)
-        models[part.name] = exposure_model
+    field, models = model.method, {}
+    for image in stars.exposures:
+        bright, models[image.name] = image.candidates.bright, model
+        if isinstance(field, FieldMixture) and len(bright) >= MIN_STARS:
+            models[image.name] = _adapt(model, field, image.observation, bright, image.name)
     return models
 
 
-def _adapted(
+def _adapt(
     model: PsfModel, field: FieldMixture, observation: Observation, bright: BrightStars, name: str
 ) -> PsfModel:
-    info, trained = model.info, model.info.config["stars"]
+    """Return a copy of a model with the field of an exposure, and a description that says so."""
+    info, training = model.info, model.info.config["stars"]
+    # New coefficients of the field; all other arrays, and errors, stay those of the training.
     sky = bright.sky_photons(observation.gain, field.noise.background)
     arrays, _ = field.of_exposure(bright, sky).pack(info.stamp_px, info.noise_min)
-    changed = {key: arrays[key].astype(model.bundle.weights[key].dtype) for key in CHANGED}
+    weights = dict(model.bundle.weights)
+    for key in ("coefficients", "listed"):
+        weights[key] = arrays[key].astype(weights[key].dtype)
+    # The description names the new image, and keeps that of the training.
     image = {
         "image": observation.path.name,
         "image_sha256": observation.sha256(),
-        "trained_on": trained.get("image_sha256", ""),
+        "trained_on": training.get("image_sha256", ""),
         "image_px": [*reversed(observation.shape or ())],
         "instrument": observation.instrument,
         "adapted": {"from": model.sha256, "stars": len(bright)},
     }
-    described = info.model_copy(
-        update={
-            "name": name,
-            "created": creation_date(),
-            "psfdae_version": __version__,
-            "config": info.config | {"stars": trained | image},
-        }
-    )
-    bundle = replace(model.bundle, info=described, weights={**model.bundle.weights, **changed})
-    return PsfModel(bundle)
-
-
-CHANGED = ("coefficients", "listed")
-"""Arrays of a bundle that an exposure has of its own."""
+    description = {
+        "name": name,
+        "created": creation_date(),
+        "psfdae_version": __version__,
+        "config": info.config | {"stars": training | image},
+    }
+    info = info.model_copy(update=description)
+    return PsfModel(replace(model.bundle, info=info, weights=weights))

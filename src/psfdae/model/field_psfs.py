@@ -1,4 +1,4 @@
-"""`FieldPsfs`: the PSF at every place of an image, of a model of ours or of another program."""
+"""`FieldPsfs`: the PSF at every position of an image, from psfdae or from another program."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
     from psfdae.model.wings import Wings
 
-MOST_OVERSAMPLED = 32  # values per pixel and axis
-
 
 class _Array(Protocol):
+    """Object that numpy can make an array of."""
+
     def __array__(self) -> np.ndarray: ...
 
 
 Numbers: TypeAlias = float | Sequence[float] | _Array
-"""One number or several; `ArrayLike` would be texts, too."""
+"""Number, or several; `ArrayLike` would include texts."""
 
 
 class PredictionError(Error, ValueError):
-    """Stars or places that a model cannot be applied to; one line with what it takes instead.
+    """Stars or positions that a model cannot be applied to; one line with what it takes instead.
 
     Examples
     --------
@@ -42,12 +42,12 @@ class PredictionError(Error, ValueError):
 
 
 class FieldPsfs(ABC):
-    """A PSF for every place of an image, and what follows from it alone.
+    """PSF at every position of an image, and quantities that follow from it.
 
     Attributes
     ----------
     name : str
-        What the model is called.
+        Name of the model.
     stamp_px : int
         Side d of the stamps in which PSFs have the sum 1, even.
     """
@@ -63,16 +63,16 @@ class FieldPsfs(ABC):
     @property
     @abstractmethod
     def order(self) -> int:
-        """Order of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
+        """Order of the polynomial of the PSF over the field; raises as `psf_at`."""
 
     @property
     @abstractmethod
     def image_px(self) -> tuple[int, int] | None:
-        """Columns and rows of the image that the model is of, if known."""
+        """Columns and rows of the image that the model was trained on, if known."""
 
     @property
     def flux_error(self) -> float:
-        """Standard error over the flux that the model makes of every star on a known sky.
+        """Standard error of a star's flux on a known sky due to the model, over the flux.
 
         0 if it is not known.
         """
@@ -80,20 +80,26 @@ class FieldPsfs(ABC):
 
     @property
     def wings(self) -> Wings | None:
-        """Light of stars beyond their stamps, if the model knows any."""
+        """Light of stars beyond their stamps, if it was measured."""
         return None
 
     @abstractmethod
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+        """Return least and greatest position (x, y) of the training stars; raises as `psf_at`."""
 
     @abstractmethod
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
-        """Refuse, by PredictionError, an image `what` whose pixels are not those of the model."""
+        """Raise PredictionError if pixels have not the size of the model's.
+
+        `what` names the image in the message.
+        """
 
     @abstractmethod
-    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        """PSFs (n, m, m) as `psf_at`, at checked places (n, 2) to (n, 4)."""
+    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        """Return PSFs (n, m, m) as `psf_at`, at checked positions (n, 2) to (n, 4).
+
+        Columns are x, y, magnitude and colour; NaN stands for an average over the training stars.
+        """
 
     def psf_at(
         self,
@@ -104,7 +110,7 @@ class FieldPsfs(ABC):
         mag: Numbers | None = None,
         colour: Numbers | None = None,
     ) -> np.ndarray:
-        """PSFs at places of the image of the training, where no star need be.
+        """Return PSFs at positions of the training image, where no star need be.
 
         Parameters
         ----------
@@ -129,47 +135,59 @@ class FieldPsfs(ABC):
         ------
         PredictionError
             If the model's method knows no PSF between the stars, a number is not usable, or the
-            model has no PSF of a finite flux above 0 at a place.
+            model has no PSF of a finite flux above 0 at a position.
         """
-        stated = {"x": x, "y": y, "mag": mag, "colour": colour}
-        is_stated = [value is not None for value in stated.values()]
+        # Columns up to the last one that is stated; NaN where a column before it is not.
+        columns = {"x": x, "y": y, "mag": mag, "colour": colour}
+        is_stated = [value is not None for value in columns.values()]
         count = 4 if is_stated[3] else 3 if is_stated[2] else 2
         numbers = [
-            real_numbers(name, np.nan if value is None else value) for name, value in stated.items()
+            real_numbers(name, np.nan if value is None else value)
+            for name, value in columns.items()
         ]
         position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
         if position.ndim > 2 or not np.isfinite(position[..., is_stated[:count]]).all():
             raise PredictionError(
                 "positions, mag and colour must be finite, one of each or arrays of as many"
             )
-        if not 1 <= oversampling <= MOST_OVERSAMPLED:
-            raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
+        # Memory grows as its square; the PSF has no structure at a 32nd of a pixel.
+        if not 1 <= oversampling <= 32:
+            raise PredictionError(f"oversampling {oversampling}: 1 to 32")
         with np.errstate(all="ignore"):
-            psfs = self._drawn(position.reshape(-1, count), oversampling)
+            psfs = self._psfs(position.reshape(-1, count), oversampling)
+        # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
+        # give anything.
         flux = psfs.sum(axis=(1, 2))
-        usable = np.isfinite(flux) & (flux > 0)
-        if not usable.all():
-            place = position.reshape(-1, count)[np.argmin(usable)]
+        is_usable = np.isfinite(flux) & (flux > 0)
+        if not is_usable.all():
+            x0, y0 = position.reshape(-1, count)[np.argmin(is_usable)][:2]
             raise PredictionError(
                 f"the model {self.name!r}: damaged, or far outside its image: no PSF of a "
-                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
+                f"finite flux above 0 at x {x0:.6g}, y {y0:.6g}"
             )
         return psfs if position.ndim == 2 else psfs[0]
 
-    def on_pixels(self, place: np.ndarray) -> np.ndarray:
-        """PSFs (n, d, d) in the pixels of the image, at places (n, 2); see `psf_at`."""
-        x, y = place.T
+    def on_pixels(self, position: np.ndarray) -> np.ndarray:
+        """Return PSFs (n, d, d) in the pixels of the image, at positions (n, 2); see `psf_at`."""
+        x, y = position.T
         return self.psf_at(x, y, 1)
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
-        """Flux of a star at a place over what an aperture of a radius about it gets.
+        """Return the flux of a star over its light within an aperture.
 
         The flux is all light within `wings.radius_px[-1]`, or without wings that in the stamp.
+
+        Parameters
+        ----------
+        x, y : float
+            Centre of star and aperture, 0-based pixel coordinates.
+        radius_px : float
+            Radius of the aperture.
 
         Raises
         ------
         ValueError
-            If the radius is not above 0, or beyond that.
+            If the radius is not above 0, or is larger than that of the flux.
         PredictionError
             As `psf_at`.
         """
@@ -178,25 +196,27 @@ class FieldPsfs(ABC):
         return aperture_correction(self, self.wings, x, y, radius_px)
 
     def grid(self, columns: int, rows: int) -> np.ndarray:
-        """Places (n, 2), x and y, that are spread over the field; raises as `field_range`."""
+        """Return positions (n, 2), x and y, evenly over the field; raises as `field_range`."""
+        # Rows of the grid follow each other: x changes fastest.
         low, high = self.field_range()
         x, y = (np.linspace(low[i], high[i], count) for i, count in ((0, columns), (1, rows)))
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def fwhm_px(self) -> float:
-        """FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        """Return the FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        # In the middle of a pixel, so that the FWHM does not depend on a phase.
         x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
         return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
     def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
-        """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
+        """Return the field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
 
         Its PSFs have an odd number of values along an axis.
 
         Parameters
         ----------
         nodes : int
-            Places along either axis, over the field of the training stars.
+            Positions along either axis, over the field of the training stars.
         oversampling : int
             Values per pixel and axis.
 
@@ -210,19 +230,27 @@ class FieldPsfs(ABC):
 
         from psfdae.model.psf_grid import PsfGrid
 
+        # photutils takes PSFs on a regular grid, x changing fastest, and interpolates between them.
         grid = PsfGrid.of(self, nodes, oversampling)
-        places = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
-        meta = {"grid_xypos": [tuple(place) for place in places], "oversampling": oversampling}
-        # A class of its own: photutils 3.0 fits groups with the first model of a class.
-        kind = type(f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}", (GriddedPSFModel,), {})
-        psfs = grid.psfs.reshape(-1, *grid.psfs.shape[2:])
-        return kind(NDData(psfs, meta=meta))
+        positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
+        meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
+        # One class for each model: photutils 3.0 fits groups with the first model of a class.
+        class_name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
+        model_class = type(class_name, (GriddedPSFModel,), {})
+        return model_class(NDData(grid.psfs.reshape(-1, *grid.psfs.shape[2:]), meta=meta))
 
 
 def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
-    """An array of float32 or float64 in the machine's byte order; PredictionError otherwise."""
+    """Return an array of float32 or float64 in the machine's byte order.
+
+    Raises
+    ------
+    PredictionError
+        If the values, called `name` in the message, are no real numbers.
+    """
+    # Floats of up to 32 bits become float32, all other numbers float64.
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
-    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-    return array.astype(np.float32 if narrow else np.float64, copy=False)
+    is_single = array.dtype.kind == "f" and array.dtype.itemsize <= 4
+    return array.astype(np.float32 if is_single else np.float64, copy=False)

@@ -1,4 +1,4 @@
-"""Fit of a model to the bright stars of an image, and its steps."""
+"""Fit of a model to the bright stars of images: choice of a method, fit, errors, wings."""
 
 from __future__ import annotations
 
@@ -14,15 +14,9 @@ from psfdae.method import KnowsField, Method, with_free_flux
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
-from psfdae.model.psf_model import MARGIN_PX, PsfModel
+from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
-from psfdae.model.star_sets import (
-    field_positions,
-    fit_apart,
-    noise_model,
-    split_stars,
-    training_set,
-)
+from psfdae.model.star_sets import field_positions, fit_apart, noise_model, training_set
 from psfdae.model.stars import ENOUGH_STARS, REFERENCE, SPLIT, Stars
 from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream
@@ -40,18 +34,18 @@ def fit(
     licence: str = "not stated",
     **settings: object,
 ) -> PsfModel:
-    """Train a model on the bright stars of an image, without those that are held out.
+    """Train a model on the bright stars of images, without those that are held out.
 
     Parameters
     ----------
     stars : Stars
     method : str, optional
-        "gmm", "field" or "dae"; by default the one of the first two that errs least on validation
-        stars.
+        "gmm", "field" or "dae"; by default the one of the first two with the smaller error on
+        validation stars.
     name : str, optional
-        Of the model; by default the image's.
+        Name of the model; by default the image's.
     licence : str
-        Of the model.
+        Licence of the model.
     **settings
         Keys of the method's settings, such as `orders=[0, 1, 2]` for "field".
 
@@ -70,19 +64,25 @@ def fit(
     >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
     PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
+    # Candidates: the stated method, or all of the settings of which one becomes the model.
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
-    kinds = worth_trying(stars, [model_method(one) for one in names])
-    groups = [group for kind in kinds for group in kind.groups]
+    for method_name in names:
+        if not makes_models(method_name):
+            raise ConfigError(f"method {method_name!r}: makes no model of an image")
+    candidates = worth_trying(stars, [method_of(method_name) for method_name in names])
+    # Keywords belong to the settings of the candidates; no setting of a method changes the stars.
+    groups = [group for candidate in candidates for group in candidate.groups]
     stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
-    fitted = {kind.name: fitted_to(stars, kind) for kind in kinds}
-    best_name = next(iter(fitted)) if len(fitted) == 1 else best(stars, fitted)[0]
-    return packed(stars, fitted[best_name], name or stars.name, licence)
+    # With several fits, validation stars decide.
+    fits = {candidate.name: fitted_to(stars, candidate) for candidate in candidates}
+    chosen_name = next(iter(fits)) if len(fits) == 1 else choose_method(stars, fits)[0]
+    return pack_model(stars, fits[chosen_name], name or stars.name, licence)
 
 
 def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
-    """Return the methods of which one becomes the model: of few stars the field alone.
+    """Return the methods that may become the model: for few stars, the field alone.
 
-    Too few are left to choose a method by validation stars, and only the field falls back to one
+    Too few stars are left to choose a method by validation, and only the field falls back to one
     PSF for all.
     """
     field = [kind for kind in kinds if kind.name == "field"]
@@ -90,28 +90,25 @@ def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Metho
 
 
 def makes_models(name: str) -> bool:
-    """Whether a method makes a model that can be saved, and knows all that it needs of an image."""
+    """Return True if a method makes a model of an image that can be saved."""
     kind = method_of(name)
     return kind.storage is not None and kind.packing is not None
 
 
-def model_method(name: str) -> type[Method]:
-    """The method of a name, if it makes a model of an image.
+def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
+    """Fit a method to the stars that are not held out.
+
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+    checkpoint : Path, optional
+        File for the state of a long fit, from which it goes on if it was interrupted.
 
     Raises
     ------
-    ConfigError
-        If it does not.
-    """
-    if not makes_models(name):
-        raise ConfigError(f"method {name!r}: makes no model of an image")
-    return method_of(name)
-
-
-def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
-    """A fit of a method to the stars that are not held out.
-
-    A long one keeps its state in the file `checkpoint`, if one is given.
+    MissingExtraError
+        If the method needs a package that is not installed.
     """
     data = training_set(
         stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
@@ -121,52 +118,84 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
 
 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
-    """Settings that decide a fit, as its product and its model say them."""
+    """Return the settings that determine a fit, for the description of its product and model.
+
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+        The fitted method, whose groups of settings count beside split and truth.
+    """
     group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
     return described_by(kind, group_settings, SPLIT, REFERENCE)
 
 
-def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
-    """The method that errs least on validation stars, and the MSE of each of PSFs of flux 1.
+def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
+    """Choose the method with the smallest error on validation stars, which no fit has seen.
 
-    No fit that is asked has seen these stars. Every S/N counts alike: the geometric mean of the
-    errors decides.
+    Parameters
+    ----------
+    stars : Stars
+    fits : mapping of str to Method
+        Fits to these stars, by name of the method.
+
+    Returns
+    -------
+    name : str
+        Name of the chosen method.
+    errors : dict of str to float
+        MSE of PSFs of flux 1 by method: the geometric mean over the noise levels, so that every
+        S/N counts alike.
     """
-    settings, product = stars.settings, stars.product
-    judges = split_stars(product, SPLIT, settings).validation
-    truth, positions = product["realisation"][judges], field_positions(product)[judges]
+    # Every method restores the same bright stars, degraded with the same noise.
+    settings, product, validation = stars.settings, stars.product, stars.split.validation
+    truth, positions = product["realisation"][validation], field_positions(product)[validation]
     errors = {}
-    for name, fit_of_all in fitted.items():
-        fitted_kind, kind = fit_of_all, type(fit_of_all)
+    for name, fitted in fits.items():
+        judged, kind = fitted, type(fitted)
         data = training_set(settings, kind, product, SPLIT, REFERENCE)
         with fixed_threads(kind.threads(settings)):
+            # A method that learns from the validation stars as well is fitted without them.
             if not kind.needs.validation:
-                fitted_kind = fit_apart(kind, data, product["field_index"], settings)
+                judged = fit_apart(kind, data, product["field_index"], settings)
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
-            # As of the stars that the model is for.
-            with_free = with_free_flux(fitted_kind)
-            logs = []
+            # Stars of the model's use have an unknown flux.
+            restorer = with_free_flux(judged)
+            # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
+            log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):
-                psf = with_free.restore(images, level, positions)
+                psf = restorer.restore(images, level, positions)
                 psf = psf / psf.sum(axis=(1, 2), keepdims=True)
-                logs.append(np.log(np.square(psf - truth).mean()))
-        errors[name] = float(np.exp(np.mean(logs)))
+                log_mse.append(np.log(np.square(psf - truth).mean()))
+        errors[name] = float(np.exp(np.mean(log_mse)))
     return min(errors, key=errors.__getitem__), errors
 
 
-def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
-    """The model of a fit, with its errors on the stars that are held out, and wings of stars."""
-    of = stars.product, REFERENCE, stars.settings, described(stars, type(fitted)), name, licence
-    with fixed_threads(stars.settings.evaluation.threads):
-        model = model_of(fitted, *of)
+def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
+    """Return the model of a fit, with its errors on held-out stars, and the wings of stars.
+
+    Parameters
+    ----------
+    stars : Stars
+    fitted : Method
+        Fit to these stars.
+    name, licence : str
+        Name and licence of the model.
+    """
+    # Calibrate the errors of the fit on held-out stars.
+    settings = stars.settings
+    description = described(stars, type(fitted))
+    with fixed_threads(settings.evaluation.threads):
+        model = model_of(fitted, stars.product, REFERENCE, settings, description, name, licence)
         if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
             return model
-        wings_of_each = [
-            part.wings or wings_of_stars(model, part.observation.with_margin(MARGIN_PX))
-            for part in stars.each
-        ]
-    known_wings = [wings for wings in wings_of_each if wings is not None]
-    if not known_wings:
+        # Light beyond the stamps, by all stars of each image; neighbours may have measured it.
+        measured = (
+            image.wings or wings_of_stars(model, image.observation.with_margin(model.margin_px))
+            for image in stars.images
+        )
+        wings = [image_wings for image_wings in measured if image_wings is not None]
+    if not wings:
         return model
-    return PsfModel(with_wings(model.bundle, Wings.joined(known_wings)), model.engine.estimator)
+    return PsfModel(with_wings(model.bundle, Wings.joined(wings)), model.method)

@@ -152,7 +152,7 @@ class _Fit:
     ) -> None:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
         side = psfs.side_px
-        self.residual = np.pad(np.where(bad, 0.0, image), side)
+        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float64), side)
         weight = np.pad(np.where(bad, 0.0, 1.0 / error), side)
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
@@ -269,7 +269,8 @@ class _Fit:
             return column
 
         core = np.s_[self.psfs.side_px : -self.psfs.side_px]
-        light = np.where(self.bad, 0.0, self.image) - self.residual[core, core]
+        light = np.where(self.bad, 0.0, self.image).astype(np.float32)
+        np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
         return JointFit(
             of_all(self.place),
             of_all(error[:, 1:]),

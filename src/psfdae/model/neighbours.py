@@ -1,8 +1,8 @@
-"""Bright stars of a crowded image without the light of their neighbours.
+"""Bright stars of a crowded image after the light of their neighbours is subtracted.
 
 Where many bright stars have a neighbour, a model of the field is made of those that have none. All
-stars are then fitted with it, and in the stamp of each star the light of all others is subtracted,
-so that stars can be learnt from whose neighbours are further away than `NEAREST_FWHM`.
+stars are then fitted with it, and in the stamp of each star the light of all others is subtracted.
+Stars whose neighbours are further away than about a FWHM can then be used for the training.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from psfdae.errors import Error
 from psfdae.image.observation import cut_image
+from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
@@ -23,12 +24,16 @@ from psfdae.model.fitting import fitted_to
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.stars import DETECTED_SIGMA, Stars
 
-NEAREST_FWHM = 1.25  # of a neighbour whose light can be told from that of its star
-SAME_PX = 1.5  # from a star of the list to the same star as it was fitted
-
 
 class _Field(FieldPsfs):
-    """The field that a fit knows, without the calibration that a model in a bundle has."""
+    """PSF over the field of a fit, without the errors that a model in a bundle has.
+
+    Parameters
+    ----------
+    fitted : FieldMixture
+    stamp_px : int
+        Side of the stamps that the fit was made of.
+    """
 
     name, image_px = "of stars without neighbours", None
 
@@ -46,83 +51,101 @@ class _Field(FieldPsfs):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low[:2], self.fitted.high[:2]
 
-    def check_scale(self, pixel_scale_arcsec: float | None, purpose: str) -> None:
-        """It is of the image that it is applied to."""
+    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+        """Accept any scale: the fit is used on its own image."""
 
-    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        return self.fitted.psf_at(place, oversampling)
+    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        return self.fitted.psf_at(position, oversampling)
 
 
 def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
-    """The stars of the same image, each without the light of all others.
+    """Choose the bright stars of an image again, with the light of all other stars subtracted.
 
-    Where the stars were chosen in spite of neighbours brighter than `neighbour_ratio`, in units of
-    the star, the stars that come out are the start of a second round. What they were is what comes
-    back if their image cannot be fitted, with a note that says why.
+    Parameters
+    ----------
+    stars : Stars
+        Bright stars of one image. If they were chosen in spite of neighbours that are brighter than
+        `neighbour_ratio`, they start a second round.
+    neighbour_ratio : float
+        Largest brightness of an accepted neighbour, over that of the star.
+
+    Returns
+    -------
+    Stars
+        The stars as they were, with a note that tells why, if their image cannot be fitted.
     """
+    # The new choice has the stated limit on neighbours, and a nearer one on their distance.
     observation, notes = stars.observation, stars.notes
-    accepted = stars.settings.calibration_stars.neighbour_ratio
+    accepted_ratio = stars.settings.calibration_stars.neighbour_ratio
     calibration = stars.settings.calibration_stars.model_copy(
         update={"neighbour_ratio": neighbour_ratio}
     )
     settings = stars.settings.model_copy(update={"calibration_stars": calibration})
     assert observation.positions is not None
-    for _ in range(2 if accepted > neighbour_ratio else 1):
+    for _ in range(2 if accepted_ratio > neighbour_ratio else 1):
+        # A field from the stars so far, photometry of all stars with it, and a new choice of
+        # bright stars in the cleaned image.
         field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
         try:
-            subtracted = crowded.photometry(field, observation, DETECTED_SIGMA)
-            isolation_px = NEAREST_FWHM * field.fwhm_px()
-            cleaned = replace(
-                observation, others=light_of_others(subtracted, observation.positions)
-            )
-            isolated = Stars.chosen(stars.source, cleaned, settings, isolation_px)
+            photometry = crowded.photometry(field, observation, DETECTED_SIGMA)
+            # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
+            isolation_px = 1.25 * field.fwhm_px()
+            light = light_of_others(photometry, observation.positions)
+            cleaned = replace(observation, others=light)
+            candidates = collect(cleaned, calibration, settings.framing, isolation_px)
+            isolated = Stars.of_candidates(stars.source, cleaned, candidates, settings)
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"
             return replace(stars, notes=(*stars.notes, note))
         message = (
-            f"neighbours: the light of {len(subtracted.stars)} stars was subtracted in the others' "
-            f"stamps; {len(stars)} stars are good with no neighbour above {100 * accepted:g} % of "
-            f"their brightness within {calibration.isolation_px:g} px, {len(isolated)} with none "
-            f"above {100 * neighbour_ratio:g} % within {isolation_px:.2g} px"
+            f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
+            f"stamps; bright stars before: {len(stars)}, no neighbour above "
+            f"{100 * accepted_ratio:g} % of their brightness within {calibration.isolation_px:g} "
+            f"px; now: {len(isolated)}, none above {100 * neighbour_ratio:g} % within "
+            f"{isolation_px:.2g} px"
         )
-        stars = replace(isolated, observation=observation, wings=subtracted.wings)
+        stars = replace(isolated, observation=observation, wings=photometry.wings)
         notes = (*isolated.notes, message)
     return replace(stars, notes=notes)
 
 
 def light_of_others(
-    photometry: crowded.CrowdedPhotometry, place: np.ndarray
+    photometry: crowded.CrowdedPhotometry, listed: np.ndarray
 ) -> Callable[[slice, int, int], np.ndarray]:
-    """Light of all stars of an image but the one in the middle, for stamps of stars of a list.
+    """Return a function that gives the light of all stars but the one in the middle of a stamp.
 
     Parameters
     ----------
     photometry : CrowdedPhotometry
-    place : ndarray, shape (n, 2)
-        Positions of the list, x and y.
+    listed : ndarray, shape (n, 2)
+        Positions of a star list, x and y.
 
     Returns
     -------
     callable
-        Of a part of the list, the side of the stamps and the margin around them, as
-        `psfdae.image.observation.cut_image` cuts them; (m, s, s), s with both margins.
+        Its arguments are a slice of the list, the side of the stamps and the margin around them, as
+        `psfdae.image.observation.cut_image` takes them. It returns the light (m, s, s), s with both
+        margins.
     """
     from scipy.spatial import cKDTree
 
     stars = photometry.stars
-    fitted = np.stack([stars["x"], stars["y"]], axis=1)
-    measured = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
-    off, nearest = cKDTree(fitted[measured]).query(np.nan_to_num(place, nan=-np.inf))
-    psfs, flux = PsfGrid.of(photometry.model), np.array(stars["flux_model"])
+    centre = np.stack([stars["x"], stars["y"]], axis=1)
+    flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model)
+    measured = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
+    # The fitted star of each star of the list; none is within 1.5 px of a star without position.
+    distance, nearest = cKDTree(centre[measured]).query(np.nan_to_num(listed, nan=-np.inf))
 
-    def light(part: slice, stamp_px: int, margin: int) -> np.ndarray:
-        x, y = place[part].T
+    # The fit has the light of all stars in one image; a list asks for it a part at a time.
+    def light(rows: slice, stamp_px: int, margin: int) -> np.ndarray:
+        x, y = listed[rows].T
         stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]
-        rows = np.flatnonzero(off[part] <= SAME_PX)
-        star = measured[nearest[part][rows]]
-        corner = np.rint(place[part][rows]).astype(int) - stamp_px // 2 - margin
-        star_light = psfs.stamps(fitted[star], corner, stamps.shape[-1])[:, 0]
-        stamps[rows] -= flux[star, None, None] * star_light
+        # The light of all fitted stars, minus that of the star itself.
+        fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
+        star = measured[nearest[rows][fitted_rows]]
+        corner = np.rint(listed[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
+        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1])[:, 0]
+        stamps[fitted_rows] -= flux[star, None, None] * star_light
         return stamps
 
     return light

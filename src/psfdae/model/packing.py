@@ -48,7 +48,8 @@ from psfdae.model.bundle import (
     mahalanobis,
 )
 from psfdae.model.photometry import FluxModel, signal_to_noise
-from psfdae.model.psf_model import SNR_TOLERANCE, PsfModel
+from psfdae.model.psf_model import PsfModel
+from psfdae.model.restoration import SNR_TOLERANCE
 from psfdae.model.star_sets import (
     field_positions,
     noise_model,
@@ -456,7 +457,7 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
     No training must have seen the stars: where noise is far below the errors that a method makes
     on other stars, those on its own do not tell.
     """
-    bundle, measures = model.bundle, isinstance(model.engine.estimator, MeasuresStars)
+    bundle, measures = model.bundle, isinstance(model.method, MeasuresStars)
     nodes, shape = bundle.noise_nodes, (2, CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))

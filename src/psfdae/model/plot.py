@@ -1,4 +1,4 @@
-"""A map of the PSF over the field: stamps at their positions, size and shape of all stars."""
+"""Map of the PSF over the field: stamps at their positions, size and shape of all stars."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-CELLS = 9  # stamps along the longer side of the field
-WHISKERS = 2500  # stars with a whisker, at most; more would be a carpet
-
-SPOILT = (
+UNUSABLE_FLAGS = (
     StarFlag.NO_FLUX
     | StarFlag.FAINT
     | StarFlag.MASKED
@@ -28,12 +25,24 @@ SPOILT = (
     | StarFlag.OFF_CENTRE
     | StarFlag.UNLIKE_TRAINING
 )
-"""Stars with one of these flags are not drawn."""
+"""Flags of stars whose measured size and shape mean nothing; they are not drawn."""
 
 
 @dataclass(frozen=True)
 class FieldStars:
-    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each."""
+    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each.
+
+    Attributes
+    ----------
+    x, y : ndarray
+        Positions, 0-based pixels of the image; NaN if unknown.
+    snr : ndarray
+        Signal-to-noise ratio, by which stars are ordered.
+    fwhm_px, ellipticity, position_angle_deg : ndarray
+        Size and shape of the PSF of the star; the angle is from +x to +y.
+    flags : ndarray of int
+        Sum of the values of `StarFlag`.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -43,59 +52,83 @@ class FieldStars:
     position_angle_deg: np.ndarray
     flags: np.ndarray
 
-    def drawable(self) -> np.ndarray:
-        """Indices of the stars that can be drawn, brightest first."""
-        finite = np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.fwhm_px)
-        good = np.flatnonzero(finite & ((self.flags & int(SPOILT)) == 0))
-        return good[np.argsort(-self.snr[good], kind="stable")]
+    def usable_stars(self) -> np.ndarray:
+        """Return indices of the stars that can be drawn, brightest first."""
+        is_finite = np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.fwhm_px)
+        usable = np.flatnonzero(is_finite & ((self.flags & int(UNUSABLE_FLAGS)) == 0))
+        return usable[np.argsort(-self.snr[usable], kind="stable")]
 
-    def cell(self) -> float:
-        """Least distance of two stamps in pixels of the image."""
-        drawn = self.drawable()
-        extent = max((np.ptp(axis[drawn]) for axis in (self.x, self.y) if drawn.size), default=0.0)
-        return float(extent) / (CELLS - 1) if extent > 0 else 1.0
+    def stamp_spacing_px(self) -> float:
+        """Return the least distance of two drawn stamps along an axis, in pixels of the image."""
+        stars = self.usable_stars()
+        extent = max((np.ptp(axis[stars]) for axis in (self.x, self.y) if stars.size), default=0.0)
+        # Nine stamps along the longer side of the field.
+        return float(extent) / 8 if extent > 0 else 1.0
 
-    def chosen(self) -> np.ndarray:
-        """Bright stars far enough from each other for their stamps not to overlap, indices."""
-        left, side, chosen = self.drawable(), self.cell(), []
-        while left.size:
-            chosen.append(left[0])
-            apart = np.maximum(*(np.abs(axis[left] - axis[left[0]]) for axis in (self.x, self.y)))
-            left = left[apart >= side]
-        return np.array(chosen, dtype=int)
+    def stamp_stars(self) -> np.ndarray:
+        """Return indices of bright stars so far from each other that their stamps do not overlap.
+
+        They are taken from the brightest down.
+        """
+        # Take the brightest star, drop all whose stamps would overlap with its stamp, and repeat.
+        candidates, spacing_px, selected = self.usable_stars(), self.stamp_spacing_px(), []
+        while candidates.size:
+            star = candidates[0]
+            selected.append(star)
+            distance = np.maximum(
+                *(np.abs(axis[candidates] - axis[star]) for axis in (self.x, self.y))
+            )
+            candidates = candidates[distance >= spacing_px]
+        return np.array(selected, dtype=int)
 
 
-def map_of_file(predicted: Path) -> Figure:
-    """The map of the PSFs in a FITS file of a prediction."""
+def map_of_file(path: Path) -> Figure:
+    """Draw the map of the PSFs in a FITS file of a prediction.
+
+    Parameters
+    ----------
+    path : Path
+        File of `psfdae predict`, with the extensions STARS and PSF.
+    """
     from astropy.io import fits
 
-    with fits.open(predicted, memmap=True) as file:
+    with fits.open(path, memmap=True) as file:
         table: Any = file["STARS"].data
         columns = (table[name] for name in FieldStars.__dataclass_fields__)
         # Copies in the machine's byte order.
         stars = FieldStars(*(values.astype(values.dtype.newbyteorder("=")) for values in columns))
-        sections = [file["PSF"].section[int(star)] for star in stars.chosen()]
-        title = f"{file[0].header['INFILE']}: {len(stars.drawable())} of {len(stars.x)} stars"
-    return psf_map(np.array(sections, dtype=np.float32), stars, title)
+        # Only the PSFs that are drawn are read: a file may have a million.
+        psfs = [file["PSF"].section[int(star)] for star in stars.stamp_stars()]
+        return psf_map(np.array(psfs, dtype=np.float32), stars, file[0].header["INFILE"])
 
 
 @styled
-def psf_map(psf: np.ndarray, stars: FieldStars, title: str) -> Figure:
-    """Stamps (k, d, d) of the stars `stars.chosen` at their positions, a whisker for every star."""
-    drawn, chosen, cell = stars.drawable(), stars.chosen(), stars.cell()
-    x, y = stars.x[drawn], stars.y[drawn]
-    margin = 0.6 * cell
-    box = (
-        (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
-        if drawn.size
-        else (0.0, 1.0, 0.0, 1.0)
-    )
-    shape = np.clip((box[3] - box[2]) / (box[1] - box[0]), 0.3, 2.0)
-    figure = new_figure(0.46 * WIDTH_IN * shape + 1.5, layout="constrained")
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    half = 0.46 * cell
-    for stamp, x0, y0 in zip(psf, stars.x[chosen], stars.y[chosen], strict=True):
-        left.imshow(
+def psf_map(psf: np.ndarray, stars: FieldStars, image_name: str) -> Figure:
+    """Draw stamps at the positions of their stars, and beside them a whisker for every star.
+
+    Parameters
+    ----------
+    psf : ndarray, shape (k, d, d)
+        PSFs of the stars `stars.stamp_stars()`.
+    stars : FieldStars
+    image_name : str
+        Name of the image in the title.
+    """
+    usable, stamp_stars = stars.usable_stars(), stars.stamp_stars()
+    spacing_px = stars.stamp_spacing_px()
+    # Limits of the axes: all usable stars with room for a stamp about each.
+    x, y = stars.x[usable], stars.y[usable]
+    margin = 0.6 * spacing_px
+    limits = (0.0, 1.0, 0.0, 1.0)
+    if usable.size:
+        limits = (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
+    aspect = np.clip((limits[3] - limits[2]) / (limits[1] - limits[0]), 0.3, 2.0)
+    figure = new_figure(0.46 * WIDTH_IN * aspect + 1.5, layout="constrained")
+    stamp_axes, whisker_axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    # Stamps fill 92 % of their spacing. A square root shows core and wings in one picture.
+    half = 0.46 * spacing_px
+    for stamp, x0, y0 in zip(psf, stars.x[stamp_stars], stars.y[stamp_stars], strict=True):
+        stamp_axes.imshow(
             np.sqrt(np.clip(stamp / stamp.max(), 0.0, 1.0)),
             origin="lower",
             extent=(x0 - half, x0 + half, y0 - half, y0 + half),
@@ -104,43 +137,62 @@ def psf_map(psf: np.ndarray, stars: FieldStars, title: str) -> Figure:
             vmax=1.0,
             interpolation="nearest",
         )
-    shown = _whiskers(right, stars, drawn[:WHISKERS], cell)
-    for axes, name in ((left, "PSF, each to its maximum"), (right, "ellipticity and FWHM")):
-        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x (px)", title=name)
-    left.set_ylabel("y (px)")
-    if shown is not None:
-        bar = figure.colorbar(shown, ax=[left, right], location="bottom", shrink=0.6, aspect=40)
+    # More than 2500 whiskers would cover each other.
+    whiskers = _draw_whiskers(whisker_axes, stars, usable[:2500], spacing_px)
+    titles = ((stamp_axes, "PSF, each to its maximum"), (whisker_axes, "ellipticity and FWHM"))
+    for axes, title in titles:
+        axes.set(xlim=limits[:2], ylim=limits[2:], aspect="equal", xlabel="x (px)", title=title)
+    stamp_axes.set_ylabel("y (px)")
+    if whiskers is not None:
+        both_axes = [stamp_axes, whisker_axes]
+        bar = figure.colorbar(whiskers, ax=both_axes, location="bottom", shrink=0.6, aspect=40)
         bar.set_label("FWHM of the PSF (px)")
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(f"{image_name}: {len(usable)} of {len(stars.x)} stars", parse_math=False)
     return figure
 
 
-def _whiskers(
-    axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float
+def _draw_whiskers(
+    axes: Axes, stars: FieldStars, selected: np.ndarray, spacing_px: float
 ) -> LineCollection | None:
-    """Lines along the major axes; a key tells the length of ellipticity 0.2."""
+    """Draw a line along the major axis of each selected star, with a key for ellipticity 0.2.
+
+    Parameters
+    ----------
+    axes : Axes
+    stars : FieldStars
+    selected : ndarray of int
+        Numbers of the stars.
+    spacing_px : float
+        Distance of two stamps of the map.
+
+    Returns
+    -------
+    LineCollection or None
+        Lines, coloured by FWHM; None if no star is selected.
+    """
     from matplotlib.collections import LineCollection
 
-    if not drawn.size:
+    if not selected.size:
         axes.text(0.5, 0.5, "no unflagged star", ha="center", transform=axes.transAxes)
         return None
-    per_ellipticity = 2.0 * cell
-    angle = np.deg2rad(stars.position_angle_deg[drawn])
-    half = 0.5 * per_ellipticity * stars.ellipticity[drawn]
+    # A whisker is as long as two stamps for an ellipticity of 1.
+    px_per_ellipticity = 2.0 * spacing_px
+    angle = np.deg2rad(stars.position_angle_deg[selected])
+    half = 0.5 * px_per_ellipticity * stars.ellipticity[selected]
     step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
-    middle = np.stack([stars.x[drawn], stars.y[drawn]], axis=1)
-    size = stars.fwhm_px[drawn]
-    lines = LineCollection(
-        list(np.stack([middle - step, middle + step], axis=1)), cmap="viridis", linewidths=1.3
-    )
-    lines.set_array(size)
-    lines.set_clim(*np.percentile(size, [2, 98]))
+    centre = np.stack([stars.x[selected], stars.y[selected]], axis=1)
+    ends = np.stack([centre - step, centre + step], axis=1)
+    lines = LineCollection(list(ends), cmap="viridis", linewidths=1.3)
+    # Colours leave out 2 % of the stars at either end, so that outliers do not flatten the scale.
+    fwhm_px = stars.fwhm_px[selected]
+    lines.set_array(fwhm_px)
+    lines.set_clim(*np.percentile(fwhm_px, [2, 98]))
     axes.add_collection(lines)
-    key = 0.2 * per_ellipticity
-    corner = middle.min(axis=0) - 0.45 * cell
-    axes.plot([corner[0], corner[0] + key], [corner[1]] * 2, color="black", lw=2.0)
+    # The key is below the lowest star on the left.
+    length = 0.2 * px_per_ellipticity
+    x, y = centre.min(axis=0) - 0.45 * spacing_px
+    axes.plot([x, x + length], [y, y], color="black", lw=2.0)
     axes.annotate(
-        "0.2", (corner[0] + key, corner[1]), xytext=(3, 0), textcoords="offset points",
-        va="center", fontsize=7,
-    )  # fmt: skip
+        "0.2", (x + length, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=7
+    )
     return lines

@@ -1,9 +1,9 @@
-"""The PSFs of a field as splines at the nodes of a grid, and the light of many stars from these.
+"""PSFs of a field as splines at the nodes of a grid, for the light of many stars.
 
-A PSF between nodes is the bilinear interpolation of the four around it. Each is a bicubic spline
-through values that are `oversampling` to the pixel, so that the pixels of a stamp all lie at the
-same phase between its knots: a stamp takes one set of 4 × 4 weights (de Boor 1978, A practical
-guide to splines), and its derivatives by the position of the star take another.
+A PSF between nodes is the bilinear interpolation of the four around it. The PSF of a node is a
+bicubic spline through `oversampling` values per pixel. All pixels of a stamp then have the same
+phase between the knots: a stamp needs one set of 4 × 4 weights (de Boor 1978, A practical guide to
+splines), and its derivatives by the position of the star another one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class PsfGrid:
     Attributes
     ----------
     columns, rows : ndarray, shape (c,) and (r,)
-        Of the nodes, in pixels of the image, ascending.
+        Positions of the nodes, in pixels of the image, ascending.
     psfs : ndarray, shape (r, c, m, m)
         Values of each PSF; index m//2 is its centre.
     oversampling : int
@@ -39,12 +39,12 @@ class PsfGrid:
 
     @classmethod
     def of(cls, model: FieldPsfs, nodes: int = 9, oversampling: int = 4) -> PsfGrid:
-        """PSFs of a model at `nodes` × `nodes` places over the field of its training stars.
+        """Sample a model at `nodes` × `nodes` positions over the field of its training stars.
 
         Raises
         ------
         PredictionError
-            If the model knows no PSF of a place.
+            If the model knows no PSF of a position.
         """
         x, y = np.rint(model.grid(nodes, nodes)).T
         psfs = model.psf_at(x, y, oversampling)
@@ -62,49 +62,53 @@ class PsfGrid:
 
     @property
     def side_px(self) -> int:
-        """Side of the stamps that hold all light of a PSF wherever its star is in a pixel, odd."""
+        """Odd side of stamps that hold all light of a PSF wherever its star is in a pixel."""
         return 2 * int(self.psfs.shape[-1] // 2 // self.oversampling + 1) + 1
 
-    def stamps(self, place: np.ndarray, corner: np.ndarray, side_px: int) -> np.ndarray:
-        """Light of stars of flux 1 in stamps of the image, and its derivatives.
+    def stamps(self, centre: np.ndarray, corner: np.ndarray, side_px: int) -> np.ndarray:
+        """Return the light of stars of flux 1 in stamps of the image, and its derivatives.
 
         Parameters
         ----------
-        place : ndarray, shape (n, 2)
+        centre : ndarray, shape (n, 2)
             Centres of the stars, x and y, 0-based pixels of the image, finite.
         corner : ndarray of int, shape (n, 2)
             Column and row of the first pixel of each stamp.
         side_px : int
+            Side of the stamps.
 
         Returns
         -------
         ndarray, shape (n, 3, side_px, side_px)
-            The light, and its derivatives by x and y per pixel; that the PSF changes over the
-            field is not in these. 0 beyond the PSF's edge.
+            Light, and its derivatives by x and y per pixel, without the change of the PSF over the
+            field. 0 beyond the edge of the PSF.
         """
-        light = np.zeros((len(place), 3, side_px, side_px))
-        # Splines with room for stamps that reach beyond them, in which there is no light.
+        light = np.zeros((len(centre), 3, side_px, side_px))
+        # Stamps may reach beyond a PSF: pad its spline with zeros.
         room = side_px * self.oversampling + 4
         splines = np.pad(self.splines, ((0, 0), *[(room, room)] * 2))
-        # Knots u = o (pixel − centre) + m//2 of the first pixel, along x and y.
+        # Position of the first pixel among the knots, along x and y:
+        # u = o (pixel − centre) + m//2, with its knot ⌊u⌋ and phase u − ⌊u⌋.
         size = self.psfs.shape[-1]
-        first = self.oversampling * (corner - place) + size // 2
+        first = self.oversampling * (corner - centre) + size // 2
         knot = np.floor(first).astype(int)
-        pixel = knot[..., None] + self.oversampling * np.arange(side_px)
-        inside = (pixel >= 0) & (pixel + (first > knot)[..., None] <= size - 1)
-        lit = np.flatnonzero(inside.any(axis=2).all(axis=1))
-        node, share = self._nodes(place)
+        pixel_knot = knot[..., None] + self.oversampling * np.arange(side_px)
+        is_inside = (pixel_knot >= 0) & (pixel_knot + (first > knot)[..., None] <= size - 1)
+        # Stamps with at least one pixel within the PSF; all others stay 0.
+        stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
+        node, share = self._nodes(centre)
         weights, slopes = _cubic(first - knot)
         span = self.oversampling * (side_px - 1) + 1
-        # Few stars at a time: some 20 values of a spline for every pixel.
-        for rows in np.array_split(lit, len(lit) * side_px**2 // 2**17 + 1):
-            begin = knot[rows] + room + 1
-            squares = self._squares(splines, node[rows], share[rows], begin, span + 3)
-            # Σ over the four coefficients around each pixel, along x, then along y.
-            taps = [slice(t, t + span, self.oversampling) for t in range(4)]
+        taps = [slice(t, t + span, self.oversampling) for t in range(4)]
+        # Batches, for memory: a pixel needs some 20 coefficients.
+        for batch in np.array_split(stars, len(stars) * side_px**2 // 2**17 + 1):
+            begin = knot[batch] + room + 1
+            squares = self._squares(splines, node[batch], share[batch], begin, span + 3)
+            # Σ over the four coefficients around each pixel, along x, then along y:
+            # light, ∂/∂x with the slopes along x, ∂/∂y with those along y.
             smooth, steep = (
                 sum(
-                    kernel[rows, 0, t, None, None] * squares[:, :, tap]
+                    kernel[batch, 0, t, None, None] * squares[:, :, tap]
                     for t, tap in enumerate(taps)
                 )
                 for kernel in (weights, slopes)
@@ -112,22 +116,24 @@ class PsfGrid:
             for derivative, (values, kernel) in enumerate(
                 ((smooth, weights), (steep, weights), (smooth, slopes))
             ):
-                light[rows, derivative] = sum(
-                    kernel[rows, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
+                light[batch, derivative] = sum(
+                    kernel[batch, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
                 )
         # A star that moves by a pixel moves by −o knots under its pixels.
         light[:, 1:] *= -self.oversampling
-        light *= (inside[:, 1, :, None] & inside[:, 0, None, :])[:, None]
+        light *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
         return light
 
     @staticmethod
     def _squares(
         splines: np.ndarray, node: np.ndarray, share: np.ndarray, begin: np.ndarray, side: int
     ) -> np.ndarray:
-        """Coefficients (n, s, s) of the splines at the places of stars, from their first pixel on.
+        """Return the coefficients (n, side, side) of the splines at the positions of n stars.
 
-        They are the means, by shares (n, 4), of the splines of four nodes (n, 4).
+        They are the means of the splines of four nodes `node` (n, 4), weighted by `share` (n, 4),
+        from the column and row `begin` (n, 2) on.
         """
+        # One star at a time: each needs another part of its four splines.
         squares = np.empty((len(node), side, side))
         for star, (column, row) in enumerate(begin.tolist()):
             square = np.s_[row : row + side, column : column + side]
@@ -136,25 +142,31 @@ class PsfGrid:
                 squares[star] += share[star, corner] * splines[node[star, corner]][square]
         return squares
 
-    def _nodes(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (n, 4) of the nodes around each place, and their shares in the PSF there."""
+    def _nodes(self, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers (n, 4) of the nodes around each star, and their bilinear weights."""
+        # Along each axis: the nodes below and above, and their weights.
         axes = []
-        for nodes, value in ((self.columns, place[:, 0]), (self.rows, place[:, 1])):
-            lower = np.clip(np.searchsorted(nodes, value) - 1, 0, max(len(nodes) - 2, 0))
+        for nodes, position in ((self.columns, centre[:, 0]), (self.rows, centre[:, 1])):
+            lower = np.clip(np.searchsorted(nodes, position) - 1, 0, max(len(nodes) - 2, 0))
             upper = np.minimum(lower + 1, len(nodes) - 1)
             width = np.maximum(nodes[upper] - nodes[lower], 1.0)
             # Beyond the grid the PSF is that at its edge.
-            part = np.clip((value - nodes[lower]) / width, 0.0, 1.0)
-            axes.append((np.stack([lower, upper]), np.stack([1.0 - part, part])))
-        (column, across), (row, down) = axes
+            fraction = np.clip((position - nodes[lower]) / width, 0.0, 1.0)
+            axes.append((np.stack([lower, upper]), np.stack([1.0 - fraction, fraction])))
+        # Four corners: weights are products of those along the axes.
+        (column, column_share), (row, row_share) = axes
         number = row[:, None] * len(self.columns) + column[None]
-        share = down[:, None] * across[None]
+        share = row_share[:, None] * column_share[None]
         return number.reshape(4, -1).T, share.reshape(4, -1).T
 
 
-def _cubic(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (…, 4) of cubic B-splines at a part of the way between two knots, and slopes."""
-    t, remainder = part[..., None], 1.0 - part[..., None]
-    weights = [remainder**3, 3 * t**3 - 6 * t**2 + 4, 3 * remainder**3 - 6 * remainder**2 + 4, t**3]
-    slopes = [-(remainder**2), 3 * t**2 - 4 * t, 4 * remainder - 3 * remainder**2, t**2]
+def _cubic(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights (…, 4) of the cubic B-splines around a position, and their slopes.
+
+    `phase` (…) is the fraction t of the way from a knot to the next one. The four B-splines that
+    are not 0 there are, times 6, (1 − t)³, 3t³ − 6t² + 4, the same of 1 − t, and t³.
+    """
+    t, u = phase[..., None], 1.0 - phase[..., None]
+    weights = [u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]
+    slopes = [-(u**2), 3 * t**2 - 4 * t, 4 * u - 3 * u**2, t**2]
     return np.concatenate(weights, axis=-1) / 6.0, np.concatenate(slopes, axis=-1) / 2.0

@@ -1,14 +1,14 @@
-"""Whether to trust a model of one's own stars: beside one mean PSF, and on a page to read.
+"""Report page of a model: errors on held-out stars, comparison with one mean PSF, and checks.
 
-`quality_page` makes one HTML file that needs no other: first what it comes down to, then
-errors, the field, residuals, sizes and shapes, χ², and which stars were left out.
+`quality_page` makes one HTML file that needs no other. It begins with a summary and a table of
+checks; then follow errors, photometry, the field, residuals, sizes and shapes, χ², and the stars
+that were not used.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -18,222 +18,293 @@ from psfdae.figures import SERIES_COLORS, as_png, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.image.tables import html_table
-from psfdae.model.plot import SPOILT
-from psfdae.moments import measure_shapes, moved
+from psfdae.method import facts_of
+from psfdae.methods import method as method_of
+from psfdae.model.plot import UNUSABLE_FLAGS
+from psfdae.moments import measure_shapes, shift_stamps
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from matplotlib.figure import Figure
 
-MEAN_PSF, MEAN_LABEL = "mean_psf", "one mean PSF, its centre fitted"
-LINEAR = "lmmse"
-STEP_PX = 0.25  # between the places at which the mean PSF is tried
-SHOWN_SNR = 10.0
-SHOWN_STARS = 8
+    from psfdae.model.validation import Report
 
-# What a check calls all right.
-SIZE_BIAS = 0.02  # of the FWHM, beyond two standard errors
-COVERED = (0.60, 0.76)  # of the errors, where 68 % are stated
-USUAL_CHI2 = (0.8, 1.3)
-CHI2_SNR = (10.0, 100.0, 1000.0)  # between them, below and above, if there are some stars
-SOME_STARS = 5
-FEW_STARS = 20  # held out
+MEAN_PSF = "mean_psf"
+"""Name, in tables, of the comparison with one mean PSF whose centre is fitted to each star."""
+
+MEAN_LABEL = "one mean PSF, its centre fitted"
+"""Words for `MEAN_PSF` in sentences and legends."""
+
+COVERAGE_RANGE = (0.60, 0.76)
+"""Fractions of errors within their stated 68 % half-width that pass a check."""
 
 
-def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndarray:
-    """One PSF for all stars, moved to where it fits each star best: what a model has to beat.
+# Comparison with one mean PSF.
+
+
+def fit_mean_psf(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndarray:
+    """Shift one PSF to the centre that fits each star best, the least that a model has to beat.
 
     Parameters
     ----------
     noisy : ndarray, shape (n, d, d)
         Stars of flux 1 without sky, brightest pixel near (d/2, d/2).
     mean : ndarray, shape (s, s)
-        Centre at index (s//2, s//2), s ≥ d.
+        Mean PSF, centre at index (s//2, s//2), s ≥ d.
     reach_px : float
-        The centre is searched within ± this of the middle.
+        Largest offset of the centre from the middle along each axis, in pixels.
 
     Returns
     -------
     ndarray, shape (n, d, d)
-        Of sum 1.
+        The shifted PSF of each star, sum 1.
     """
 
-    def at(places: np.ndarray) -> np.ndarray:
-        psf = cut(moved(mean[None], places, np.zeros(len(places), int)), side)
+    def mean_at(offsets: np.ndarray) -> np.ndarray:
+        """Return the mean PSF (k, d, d) of sum 1, shifted by offsets (k, 2) in pixels."""
+        psf = cut(shift_stamps(mean[None], offsets, np.zeros(len(offsets), int)), side)
         return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]
-    axis = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
-    tried = at(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
-    tried = tried.reshape(axis.size**2, -1)
-    # Least squares of white noise: |x − t|² without what does not depend on t.
-    fit = noisy.reshape(count, -1) @ tried.T - 0.5 * np.square(tried).sum(axis=1)
-    fit = fit.reshape(count, axis.size, axis.size)
-    best = np.stack(np.divmod(fit.reshape(count, -1).argmax(axis=1), axis.size), axis=1)
-    inner = np.clip(best, 1, axis.size - 2)
-    star, (row, column) = np.arange(count), inner.T
-    places = axis[inner]
-    for k, step in enumerate(((1, 0), (0, 1))):  # the top of a parabola through three of them
-        lower, middle, upper = (
-            fit[star, row + s * step[0], column + s * step[1]] for s in (-1, 0, 1)
+    # Steps of a quarter of a pixel: between them, the likelihood is close to a parabola.
+    step_px = 0.25
+    axis = np.arange(-reach_px, reach_px + step_px / 2, step_px)
+    lattice = mean_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
+    lattice = lattice.reshape(axis.size**2, -1)
+    # Log likelihood in white noise, −|x − t|² / 2, without the term that does not depend on t.
+    likelihood = noisy.reshape(count, -1) @ lattice.T - 0.5 * np.square(lattice).sum(axis=1)
+    likelihood = likelihood.reshape(count, axis.size, axis.size)
+    maximum = np.stack(np.divmod(likelihood.reshape(count, -1).argmax(axis=1), axis.size), axis=1)
+    # The parabola needs a point on either side of the maximum.
+    middle = np.clip(maximum, 1, axis.size - 2)
+    star, (row, column) = np.arange(count), middle.T
+    offsets = axis[middle]
+    # Vertex of the parabola through three points along each axis, at most one step away.
+    for k, (row_step, column_step) in enumerate(((1, 0), (0, 1))):
+        lower, centre, upper = (
+            likelihood[star, row + s * row_step, column + s * column_step] for s in (-1, 0, 1)
         )
-        curvature = np.minimum(lower - 2 * middle + upper, -1e-30)
-        places[:, k] += STEP_PX * np.clip(0.5 * (lower - upper) / curvature, -1, 1)
-    return at(places)
+        curvature = np.minimum(lower - 2 * centre + upper, -1e-30)
+        offsets[:, k] += step_px * np.clip(0.5 * (lower - upper) / curvature, -1, 1)
+    return mean_at(offsets)
 
 
-def ratios(errors: Table, method: str, other: str) -> dict[float, float]:
-    """MSE of a method over that of another one by S/N, ascending; empty if one is missing.
+def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]:
+    """Return the MSE of a method over that of a reference method by S/N, ascending.
 
-    `errors` has the columns snr, method and mse.
+    `errors` has the columns snr, method and mse. S/N at which a method was not measured are absent.
     """
     mse = {(row["method"], row["snr"]): row["mse"] for row in errors}
-    levels = sorted({snr for name, snr in mse if name == method})
-    pairs = {snr: (mse[method, snr], mse.get((other, snr))) for snr in levels}
-    return {float(snr): float(own / its) for snr, (own, its) in pairs.items() if its is not None}
+    return {
+        float(snr): float(mse[method, snr] / mse[reference, snr])
+        for snr in sorted(snr for name, snr in mse if name == method)
+        if (reference, snr) in mse
+    }
 
 
-def nearest(values: Iterable[float], wanted: float = SHOWN_SNR) -> float:
-    """The value whose ratio to the wanted one is nearest to 1."""
-    return min(values, key=lambda value: abs(np.log(value / wanted)))
+def nearest_snr(values: Iterable[float]) -> float:
+    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors."""
+    return min(values, key=lambda value: abs(np.log(value / 10.0)))
 
 
-def standing(errors: Table, method: str, label: str) -> str:
-    """How good a method is beside one mean PSF and linear MMSE, in a sentence."""
-    mean, linear = (ratios(errors, method, other) for other in (MEAN_PSF, LINEAR))
-    snr = nearest(mean)
-    said = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {MEAN_LABEL}"
-    if linear and method != LINEAR:
-        said += f", {linear[snr]:.2f} times that of linear MMSE"
-    worse = [f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1]
-    where = f"no better than the mean PSF at S/N {', '.join(worse)}" if worse else "better at each"
-    return f"{said}; {where} ({errors['stars'][0]} stars held out)"
+def comparison_sentence(errors: Table, method: str, label: str) -> str:
+    """Return a sentence that compares a method with one mean PSF and with linear MMSE.
+
+    Parameters
+    ----------
+    errors : Table
+        Columns of `report.csv`.
+    method, label : str
+        Name of the method in the table, and in the sentence.
+    """
+    # The S/N nearest to 10 stands for faint stars, for which models differ most.
+    mean, linear = (mse_ratios(errors, method, name) for name in (MEAN_PSF, "lmmse"))
+    snr = nearest_snr(mean)
+    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {MEAN_LABEL}"
+    if linear and method != "lmmse":
+        sentence += f", {linear[snr]:.2f} times that of linear MMSE"
+    levels = ", ".join(f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1)
+    verdict = f"no better than the mean PSF at S/N {levels}" if levels else "better at each"
+    return f"{sentence}; {verdict} ({errors['stars'][0]} stars held out)"
+
+
+def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Compare sizes and shapes of restored stars with those of their bright images.
+
+    Parameters
+    ----------
+    images : mapping of str to ndarray, shape (n, d, d)
+        Held-out stars: restored from degraded images (`model`), and bright (`truth`).
+
+    Returns
+    -------
+    size_error : ndarray, shape (n,)
+        FWHM over that of the bright image, minus 1.
+    ellipticity_error : ndarray, shape (n,)
+        Ellipticity minus that of the bright image.
+    """
+    restored, truth = (measure_shapes(images[name]) for name in ("model", "truth"))
+    return restored.fwhm_px / truth.fwhm_px - 1.0, restored.ellipticity - truth.ellipticity
+
+
+# Checks.
+
+
+Check = tuple[str, str, bool]
+"""Question, answer, and True if the check is passed."""
+
+
+def check_held_out(
+    method: str,
+    errors: Table,
+    photometry: Table,
+    coverage: Mapping[float, float],
+    degraded: Mapping[float, Mapping[str, np.ndarray]],
+) -> list[Check]:
+    """Check a model on held-out stars alone.
+
+    Parameters
+    ----------
+    method : str
+        Name of the model's method.
+    errors, photometry : Table
+        Columns of `report.csv`, and of `found.csv`.
+    coverage : mapping of float to float
+        Fraction of the errors of pixels within their stated 68 % half-width, by S/N.
+    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
+        (`model`) and by one mean PSF (`MEAN_PSF`).
+    """
+    # Each row: question, answer at each S/N, and the verdict. What was not measured has no row.
+    rows: list[Check] = []
+    # MSE beside the two simplest models of the PSF.
+    for label, reference in (("one mean PSF", MEAN_PSF), ("linear MMSE", "lmmse")):
+        ratios = mse_ratios(errors, method, reference)
+        by_snr = ", ".join(f"{ratio:.2f} at S/N {snr:.3g}" for snr, ratio in ratios.items())
+        if ratios:
+            rows.append((f"Better than {label}?", f"MSE × {by_snr}", max(ratios.values()) < 1))
+    # Bias of the size: at most 2 % of the FWHM beyond two standard errors. The standard error of a
+    # median is 1.25 σ/√n, of as many images as there are different stars.
+    snr, held_out = nearest_snr(degraded), int(errors["stars"][0])
+    size_error = size_errors(degraded[snr])[0]
+    bias = float(np.median(size_error))
+    stderr = 1.25 * float(size_error.std()) / np.sqrt(min(held_out, errors["images"][0]))
+    answer = f"median {100 * bias:+.1f} ± {100 * stderr:.1f} %"
+    rows.append((f"Size of stars of S/N {snr:.3g}", answer, abs(bias) < 0.02 + 2 * stderr))
+    # Coverage of the stated errors, of pixels and then of flux and centre.
+    low, high = COVERAGE_RANGE
+    if coverage:
+        by_snr = ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items()))
+        is_covered = all(low < fraction < high for fraction in coverage.values())
+        rows.append(("Are 68 % of pixel errors within ± UNCERT?", by_snr, is_covered))
+    for name in ("flux", "centre"):
+        cells = [(r["snr"], r[f"{name}_within"], r[f"{name}_within_stderr"]) for r in photometry]
+        cells = [cell for cell in cells if np.isfinite(cell[1])]
+        by_snr = ", ".join(f"{100 * v:.0f} ± {100 * e:.0f} % at S/N {s:.3g}" for s, v, e in cells)
+        is_covered = all(low < v + 2 * e and v - 2 * e < high for _, v, e in cells)
+        if cells:
+            rows.append(
+                (
+                    f"Are 68 % of {name} errors within ± σ?",
+                    by_snr,
+                    is_covered,
+                )
+            )
+    # With fewer than 20 stars, all of the above is rough.
+    return [*rows, ("Stars held out", f"{held_out}", held_out >= 20)]
+
+
+def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
+    """Check a model on all stars of its image.
+
+    `stars` has columns of the prediction and `part` of `selection.csv`, shape (n,) each.
+    """
+    checks: list[Check] = []
+    # χ² of stars that the model has not learnt from, by classes of S/N with at least five stars.
+    is_usable = (stars["flags"] == 0) & (stars["part"] != "training") & np.isfinite(stars["chi2"])
+    snr_class = np.searchsorted((10.0, 100.0, 1000.0), stars["snr"])
+    medians, answers = [], []
+    for index, label in enumerate(("below 10", "from 10", "from 100", "from 1000")):
+        chi2 = stars["chi2"][is_usable & (snr_class == index)]
+        if chi2.size >= 5:
+            medians.append(float(np.median(chi2)))
+            answers.append(f"median {medians[-1]:.2f} at S/N {label} ({chi2.size} stars)")
+    if medians:
+        question = "χ² of unflagged stars outside the training"
+        is_passed = all(0.8 < median < 1.3 for median in medians)
+        checks.append((question, ", ".join(answers), is_passed))
+    # Outliers: the model is not meant for an image where more than a tenth of the stars are.
+    outliers = float(((stars["flags"] & int(StarFlag.UNLIKE_TRAINING)) > 0).mean())
+    answer = f"{100 * outliers:.0f} % of the list"
+    return [*checks, ("Stars unlike the training", answer, outliers < 0.1)]
+
+
+def checks_html(rows: Sequence[Check]) -> str:
+    """Return an HTML table of checks, each passed or to be inspected."""
+    words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
+    cells = [(escape(a), escape(b), words[bool(is_passed)]) for a, b, is_passed in rows]
+    return html_table(("check", "result", ""), cells)
 
 
 # The page.
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Contents of the report page of a model.
+def quality_page(
+    report: Report,
+    stars: dict[str, np.ndarray],
+    degraded_rows: np.ndarray,
+    field_map: Figure | None,
+    residuals: Figure | None,
+) -> str:
+    """Return the report page as HTML.
 
-    Attributes
+    Parameters
     ----------
-    name, image : str
-        Of the model, and of the file that it was made of.
-    method, label : str
-        That of the model.
-    notes : sequence of str
-        What is known of the camera, and advice.
-    errors : Table
-        Columns of `report.csv`.
-    found : Table
-        Columns of `found.csv`.
-    coverage : dict
-        Part of the errors within ± the stated 68 % by S/N.
-    faint : dict
-        By S/N the held-out stars degraded, (n, d, d) each: `truth`, `model` and `MEAN_PSF`.
-    degraded : dict
-        Columns of `stars` of these held-out stars, (n,).
-    stars : dict
-        Columns of the prediction of all N stars, (N,) each, and `verdict` and `part` of
-        `selection.csv`.
-    residual : ndarray, shape (k, d, d)
-        Star minus PSF of some bright stars held out, in σ of the sky.
-    bright : ndarray, shape (k, d, d)
-        These stars.
-    strip : bytes
-        PNG of faint held-out stars and what the methods make of them.
-    field : Figure, optional
+    report : Report
+    stars : dict of str to ndarray, shape (n,)
+        Columns of the prediction of all stars, and `verdict` and `part` of `selection.csv`.
+    degraded_rows : ndarray of int
+        Star of each held-out image in `report.restored`.
+    field_map : Figure, optional
         Map of the PSF, if the stars have positions.
-    facts : sequence of str
-        What the model says of itself (`Method.facts`).
+    residuals : Figure, optional
+        Residuals of bright held-out stars (`residual_strip`), if there are any.
     """
-
-    name: str
-    image: str
-    method: str
-    label: str
-    notes: Sequence[str]
-    errors: Table
-    found: Table
-    coverage: dict[float, float]
-    faint: dict[float, dict[str, np.ndarray]]
-    degraded: dict[str, np.ndarray]
-    stars: dict[str, np.ndarray]
-    residual: np.ndarray
-    bright: np.ndarray
-    strip: bytes
-    field: Figure | None
-    facts: Sequence[str] = ()
-
-    def has(self, flag: StarFlag) -> np.ndarray:
-        """Return True for stars that carry one of these flags."""
-        return (self.stars["flags"] & int(flag)) > 0
-
-    def usable(self) -> np.ndarray:
-        """Stars whose shape means something."""
-        return np.asarray(~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"]))
-
-    def chi2(self) -> dict[str, np.ndarray]:
-        """χ² of stars without a flag that were not learnt from, by words for their S/N."""
-        stars = self.stars
-        fair = (stars["flags"] == 0) & (stars["part"] != "training") & np.isfinite(stars["chi2"])
-        place, found = np.searchsorted(CHI2_SNR, stars["snr"]), {}
-        words = [f"below {CHI2_SNR[0]:g}", *(f"from {edge:g}" for edge in CHI2_SNR)]
-        for index, name in enumerate(words):
-            some = stars["chi2"][fair & (place == index)]
-            if some.size >= SOME_STARS:
-                found[name] = some
-        return found
-
-    def sizes(self, snr: float) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of sizes and shapes at a S/N (`size_errors`), (n,) each."""
-        return size_errors(self.faint[snr])
-
-
-def size_errors(faint: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """FWHM of faint held-out stars over that of their bright images, minus 1, shape (n,).
-
-    The second one is by how much their ellipticity is larger. `faint` has the images (n, d, d) of
-    `model` and `truth`.
-    """
-    found, truth = (measure_shapes(faint[kind]) for kind in ("model", "truth"))
-    return found.fwhm_px / truth.fwhm_px - 1.0, found.ellipticity - truth.ellipticity
-
-
-def quality_page(q: Quality) -> str:
-    """The page as HTML."""
-    lead = standing(q.errors, q.method, q.label)
+    method, images = type(report.model.method), report.restored_by_snr
+    name, image = report.model.info.name, report.stars.observation.path.name
+    # Checks of all stars come before the number of stars held out.
+    *checks, held_out_check = report.checks()
+    summary_checks = [*checks, *check_stars(stars), held_out_check]
+    notes = (line for note in report.stars.notes for line in note.splitlines())
     parts = [
-        f"<h1>{escape(q.name)}</h1><p class=lead>{escape(lead)}.</p>",
-        checks_html(checks(q)),
-        "<h2>Errors on stars that no training saw, degraded to low S/N</h2>",
-        _errors_table(q),
-        _picture(errors_figure(q)),
-        _png(q.strip),
+        f"<h1>{escape(name)}</h1><p class=lead>{escape(str(report))}.</p>",
+        checks_html(summary_checks),
+        "<h2>Errors on held-out stars, degraded to low S/N</h2>",
+        _errors_table(report.table, method.name),
+        _image_tag(errors_figure(report.table, method.name)),
+        _image_tag(report.strip_png),
         "<h2>Flux, centre and their errors</h2>",
-        _found_table(q),
+        _photometry_table(report.found),
         "<h2>The PSF over the field</h2>",
-        *(f"<p>{escape(fact)}.</p>" for fact in q.facts),
-        _picture(q.field) if q.field else "<p>The stars have no positions.</p>",
+        *(f"<p>{escape(fact)}.</p>" for fact in facts_of(report.model.method)),
+        _image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         "<h2>Residuals of held-out stars</h2>",
-        "<p>Above: restored minus bright image at the S/N given, over all held-out stars. "
-        "Below: bright held-out stars as they are in the image, and what their PSF leaves, in σ "
-        "of the sky.</p>",
-        _picture(error_maps(q)),
-        _picture(residual_strip(q)) if len(q.residual) else "",
+        "<p>Above: mean and RMS of restored minus bright image, over all held-out stars. Below: "
+        "bright held-out stars, and their residuals after the PSF is subtracted, in σ of the "
+        "sky.</p>",
+        _image_tag(error_maps(images)),
+        _image_tag(residuals) if residuals else "",
         "<h2>Size and shape against magnitude and place</h2>",
-        _picture(shapes_figure(q)),
+        _image_tag(shapes_figure(stars, degraded_rows, images)),
         "<h2>χ²</h2>",
-        _picture(chi2_figure(q)),
+        _image_tag(chi2_figure(stars)),
         "<h2>Stars left out</h2>",
-        _left_out(q),
-        "<h2>What is known of the image</h2><ul>",
-        *(f"<li>{escape(line)}</li>" for note in q.notes for line in note.splitlines()),
+        _verdict_tables(stars),
+        "<h2>Camera, star list and advice</h2><ul>",
+        *(f"<li>{escape(line)}</li>" for line in notes),
         "</ul>",
     ]
-    return PAGE.format(title=escape(q.name), image=escape(q.image), body="\n".join(parts))
+    return PAGE.format(title=escape(name), image=escape(image), body="\n".join(parts))
 
 
 PAGE = """<!doctype html>
@@ -248,108 +319,44 @@ img {{ max-width: 100%; display: block; margin: 1em 0 }}
 {body}
 </body></html>
 """
+"""Frame of the page; its fields are title, image and body."""
 
 
-def _picture(figure: Figure) -> str:
-    return _png(as_png(figure, dpi=110))
-
-
-def _png(content: bytes) -> str:
+def _image_tag(picture: Figure | bytes) -> str:
+    """Return an HTML image with a figure, or the bytes of a PNG file, inside."""
+    content = picture if isinstance(picture, bytes) else as_png(picture, dpi=110)
     return f'<img src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
-Check = tuple[str, str, bool]
-"""Question, answer, and whether the check is passed."""
+def _errors_table(errors: Table, model_method: str) -> str:
+    """Return the HTML table of MSE with standard errors: rows are methods, columns S/N.
 
-
-def checks_of_held_out(
-    method: str,
-    errors: Table,
-    found: Table,
-    coverage: Mapping[float, float],
-    faint: Mapping[float, Mapping[str, np.ndarray]],
-) -> list[Check]:
-    """Checks that rest on the stars held out alone; parameters are attributes of `Quality`."""
-    mean, linear = (ratios(errors, method, other) for other in (MEAN_PSF, LINEAR))
-    snr = nearest(faint)
-    size = size_errors(faint[snr])[0]
-    held = int(errors["stars"][0])
-    # Standard error of a median, 1.25 σ/√n, of as many images as there are different stars.
-    bias = float(np.median(size))
-    error = 1.25 * float(size.std()) / np.sqrt(min(held, errors["images"][0]))
+    Parameters
+    ----------
+    errors : Table
+        Columns of `report.csv`.
+    model_method : str
+        Name of the method that is marked as the model.
+    """
+    levels = np.unique(errors["snr"])
+    # A method that was not measured at a S/N has an empty cell.
+    cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
     rows = [
-        ("Better than one mean PSF?", _by_snr(mean), max(mean.values()) < 1),
-        ("Better than linear MMSE?", _by_snr(linear), max(linear.values(), default=0.0) < 1),
-        (
-            f"Size of stars of S/N {snr:.3g}",
-            f"median {100 * bias:+.1f} ± {100 * error:.1f} %",
-            abs(bias) < SIZE_BIAS + 2 * error,
-        ),
-        (
-            "Does ± UNCERT hold 68 % of the errors?",
-            ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items())),
-            all(COVERED[0] < v < COVERED[1] for v in coverage.values()),
-        ),
-        ("Do errors of the flux hold 68 %?", *_held(found, "flux")),
-        ("Do errors of the centre hold 68 %?", *_held(found, "centre")),
-        ("Stars held out", f"{held}", held >= FEW_STARS),
+        [escape(f"{label} (the model)" if name == model_method else label)]
+        + [cells.get((name, snr), "") for snr in levels]
+        for name, label in _method_labels(errors).items()
     ]
-    return [row for row in rows if row[1]]
-
-
-def checks(q: Quality) -> list[Check]:
-    """Checks before the model is trusted, also those of all stars of the image."""
-    chi2 = {name: (float(np.median(some)), some.size) for name, some in q.chi2().items()}
-    unlike = float(q.has(StarFlag.UNLIKE_TRAINING).mean())
-    rows = [
-        (
-            "χ² of stars without a flag that were not learnt from",
-            ", ".join(f"median {v:.2f} at S/N {s} ({n} stars)" for s, (v, n) in chi2.items()),
-            all(USUAL_CHI2[0] < v < USUAL_CHI2[1] for v, _ in chi2.values()),
-        ),
-        ("Stars unlike the training", f"{100 * unlike:.0f} % of the list", unlike < 0.1),
-    ]
-    *first, held = checks_of_held_out(q.method, q.errors, q.found, q.coverage, q.faint)
-    return [*first, *(row for row in rows if row[1]), held]
-
-
-def _held(found: Table, name: str) -> tuple[str, bool]:
-    """Parts of the errors within the stated ones by S/N, and whether 68 % may be true of each."""
-    rows = [(r["snr"], r[f"{name}_within"], r[f"{name}_within_stderr"]) for r in found]
-    rows = [row for row in rows if np.isfinite(row[1])]
-    said = ", ".join(f"{100 * v:.0f} ± {100 * e:.0f} % at S/N {snr:.3g}" for snr, v, e in rows)
-    return said, all(COVERED[0] < v + 2 * e and v - 2 * e < COVERED[1] for _, v, e in rows)
-
-
-def _by_snr(values: dict[float, float]) -> str:
-    said = ", ".join(f"{value:.2f} at S/N {snr:.3g}" for snr, value in values.items())
-    return f"MSE × {said}" if said else ""
-
-
-def checks_html(rows: Sequence[Check]) -> str:
-    """Return a table of checks, each passed or to be inspected."""
-    words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
-    cells = [(escape(a), escape(b), words[bool(passed)]) for a, b, passed in rows]
-    return html_table(("check", "found", ""), cells)
-
-
-def _errors_table(q: Quality) -> str:
-    labels = _labels(q)
-    levels = np.unique(q.errors["snr"])
-    cell = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in q.errors}
-    rows = [
-        [escape(f"{label} (the model)" if name == q.method else label)]
-        + [cell.get((name, snr), "") for snr in levels]
-        for name, label in labels.items()
-    ]
-    truth = q.errors["truth_mse"][0]
     return html_table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows) + (
-        f"<p>Stars have flux 1. Noise of the bright images is {truth:.1e} of every MSE.</p>"
+        "<p>Stars have flux 1. "
+        f"Noise of the bright images is {errors['truth_mse'][0]:.1e} of every MSE.</p>"
     )
 
 
-def _found_table(q: Quality) -> str:
-    """Return the table of `predict` on held-out stars of which nothing is given."""
+def _photometry_table(photometry: Table) -> str:
+    """Return the HTML table of photometry of held-out stars, given nothing but their stamps.
+
+    `photometry` has the columns of `found.csv`.
+    """
     rows = [
         [
             f"{row['snr']:.3g}",
@@ -357,152 +364,180 @@ def _found_table(q: Quality) -> str:
             f"{row['flux_pull']:.2f}",
             f"{row['centre_rms_px']:.3f}" if np.isfinite(row["centre_rms_px"]) else "",
         ]
-        for row in q.found
+        for row in photometry
     ]
     head = ("S/N", "flux, mean error", "pull of the flux", "centre, RMS error (px)")
     return (
-        "<p>Held-out stars degraded to low S/N, of which neither flux, sky, noise nor centre is "
-        "given. The pull is what 68 % of the errors are below, over the stated error; it is 1 "
-        "where errors hold.</p>" + html_table(head, rows)
+        "<p>Held-out stars degraded to low S/N; the model is given neither flux, sky, noise nor "
+        "centre. The pull is the 68 % quantile of the absolute error, over the stated error; it is "
+        "1 if stated errors are right.</p>" + html_table(head, rows)
     )
 
 
-def _labels(q: Quality) -> dict[str, str]:
-    from psfdae.methods import method
+def _verdict_tables(stars: Mapping[str, np.ndarray]) -> str:
+    """Return HTML tables: counts of stars by verdict of their selection, and by flag of the model.
 
-    names = dict.fromkeys(q.errors["method"])
-    return {n: MEAN_LABEL if n == MEAN_PSF else method(n).look.label for n in names}
+    `stars` has the columns `verdict` and `flags`; a star may have several flags.
+    """
+    verdicts, flags = stars["verdict"], stars["flags"]
+    rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
+    counts = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
+    return (
+        html_table(("selection for the training", "stars"), rows)
+        + "<p>Flags of the model on all stars of the list:</p>"
+        + html_table(("flag", "stars"), [*counts, ("none", str(int((flags == 0).sum())))])
+    )
+
+
+def _method_labels(errors: Table) -> dict[str, str]:
+    """Return the label of each method of a table, in the order of the table."""
+    names = dict.fromkeys(errors["method"])
+    return {n: MEAN_LABEL if n == MEAN_PSF else method_of(n).look.label for n in names}
+
+
+# Figures of the page.
 
 
 @styled
-def errors_figure(q: Quality) -> Figure:
-    """MSE against S/N by method, and the noise of the truth."""
+def errors_figure(errors: Table, model_method: str) -> Figure:
+    """Draw MSE against S/N for each method, with the noise of the bright images as a floor.
+
+    Parameters
+    ----------
+    errors : Table
+        Columns of `report.csv`.
+    model_method : str
+        Name of the method with the thick line.
+    """
     figure = new_figure(3.4, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="MSE")
-    for place, (name, label) in enumerate(_labels(q).items()):
-        rows = q.errors[q.errors["method"] == name]
+    for index, (name, label) in enumerate(_method_labels(errors).items()):
+        rows = errors[errors["method"] == name]
         rows.sort("snr")
+        color, width = SERIES_COLORS[index % len(SERIES_COLORS)], 2.2 if name == model_method else 1
         axes.errorbar(
             rows["snr"], rows["mse"], rows["mse_stderr"], label=label, marker="o", ms=3,
-            color=SERIES_COLORS[place % len(SERIES_COLORS)], lw=2.2 if name == q.method else 1,
+            color=color, lw=width,
         )  # fmt: skip
-    axes.axhline(q.errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
+    axes.axhline(errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
     axes.grid(True, which="both")
     figure.legend(loc="outside right upper")
     return figure
 
 
 @styled
-def error_maps(q: Quality) -> Figure:
-    """Mean and RMS over held-out stars of what is restored minus the bright image."""
-    snr = nearest(q.faint)
-    faint = q.faint[snr]
-    peak = faint["truth"].max(axis=(1, 2)).mean()
+def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
+    """Draw mean and RMS, over held-out stars, of restored minus bright image.
+
+    `degraded` has images by S/N, as of `check_held_out`; those of the S/N nearest to 10 are shown.
+    """
+    snr = nearest_snr(degraded)
+    images = degraded[snr]
+    # In per cent of the mean peak; both means share one scale of colours, symmetric about 0.
+    peak = images["truth"].max(axis=(1, 2)).mean()
     figure = new_figure(2.4, layout="constrained")
-    for place, (kind, who) in enumerate((("model", "model"), (MEAN_PSF, "mean PSF"))):
-        error = 100 * (faint[kind] - faint["truth"]) / peak
-        top = max(np.abs(error.mean(axis=0)).max(), 1e-9)
-        for column, (image, what, look) in enumerate(
-            (
-                (error.mean(axis=0), "mean", {"cmap": "RdBu_r", "vmin": -top, "vmax": top}),
-                (np.sqrt(np.square(error).mean(axis=0)), "RMS", {"cmap": "magma", "vmin": 0}),
-            )
+    grid: Any = figure.subplots(1, 4, subplot_kw={"xticks": [], "yticks": []})
+    for columns, name, label in ((grid[:2], "model", "model"), (grid[2:], MEAN_PSF, "mean PSF")):
+        error = 100 * (images[name] - images["truth"]) / peak
+        mean, rms = error.mean(axis=0), np.sqrt(np.square(error).mean(axis=0))
+        limit = max(np.abs(mean).max(), 1e-9)
+        for axes, image, statistic, look in (
+            (columns[0], mean, "mean", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+            (columns[1], rms, "RMS", {"cmap": "magma", "vmin": 0}),
         ):
-            axes = figure.add_subplot(1, 4, 2 * place + column + 1, xticks=[], yticks=[])
-            shown = axes.imshow(image, origin="lower", interpolation="nearest", **look)
-            axes.set_title(f"{who}, {what}", fontsize=8)
-            figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9)
+            artist = axes.imshow(image, origin="lower", interpolation="nearest", **look)
+            axes.set_title(f"{label}, {statistic}", fontsize=8)
+            figure.colorbar(artist, ax=axes, location="bottom", shrink=0.9)
     figure.suptitle(f"error at S/N {snr:.3g}, % of the mean peak")
     return figure
 
 
 @styled
-def residual_strip(q: Quality) -> Figure:
-    """Bright held-out stars, and their residuals within ± 5 σ of the sky."""
+def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
+    """Draw bright held-out stars, and below them their residuals within ± 5 σ of the sky.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (k, d, d)
+        Stamps of the stars over their flux, without sky.
+    residuals : ndarray, shape (k, d, d)
+        Stamp minus PSF, in σ of the sky.
+    """
     figure = new_figure(2.6, layout="constrained")
-    grid: Any = figure.subplots(2, len(q.residual), squeeze=False)
-    for star, (above, below) in enumerate(grid.T):
-        image = q.bright[star]
-        above.imshow(np.sqrt(np.clip(image / np.nanmax(image), 0, 1)), origin="lower", cmap="magma")
-        shown = below.imshow(q.residual[star], origin="lower", cmap="RdBu_r", vmin=-5, vmax=5)
+    grid: Any = figure.subplots(2, len(residuals), squeeze=False)
+    for (above, below), stamp, residual in zip(grid.T, stamps, residuals, strict=True):
+        # A square root shows core and wings in one picture.
+        above.imshow(np.sqrt(np.clip(stamp / np.nanmax(stamp), 0, 1)), origin="lower", cmap="magma")
+        artist = below.imshow(residual, origin="lower", cmap="RdBu_r", vmin=-5, vmax=5)
     for axes in grid.ravel():
         axes.set(xticks=[], yticks=[])
-    figure.colorbar(shown, ax=grid, label="residual (σ)", shrink=0.8)
+    figure.colorbar(artist, ax=grid, label="residual (σ)", shrink=0.8)
     return figure
 
 
 @styled
-def shapes_figure(q: Quality) -> Figure:
-    """FWHM and ellipticity against magnitude, x and y, and how far faint stars come out off them.
+def shapes_figure(
+    stars: Mapping[str, np.ndarray],
+    degraded_rows: np.ndarray,
+    degraded: Mapping[float, Mapping[str, np.ndarray]],
+) -> Figure:
+    """Draw FWHM and ellipticity against magnitude, x and y.
 
-    Above are all stars, and those held out stand out; below the latter, degraded.
+    Upper panels: all usable stars, with held-out stars in colour. Lower panels: errors of the
+    held-out stars after they were degraded to the S/N nearest to 10. Parameters are those of
+    `quality_page`, with the images by S/N.
     """
-    stars, usable, snr = q.stars, q.usable(), nearest(q.faint)
-    held = usable & (stars["part"] == "held out")
-    size, shape = q.sizes(snr)
+    snr = nearest_snr(degraded)
+    # Shapes of flagged stars mean nothing.
+    usable = ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0) & np.isfinite(stars["fwhm_px"])
+    held_out = usable & (stars["part"] == "held out")
+    size_error, ellipticity_error = size_errors(degraded[snr])
     figure = new_figure(7.6, layout="constrained")
     grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
     rows = (
-        ("FWHM (px)", "fwhm_px", 100 * size, f"FWHM at S/N {snr:.3g} (%)"),
-        ("ellipticity", "ellipticity", shape, f"ellipticity at S/N {snr:.3g}"),
+        ("FWHM (px)", "fwhm_px", 100 * size_error, f"FWHM at S/N {snr:.3g} (%)"),
+        ("ellipticity", "ellipticity", ellipticity_error, f"ellipticity at S/N {snr:.3g}"),
     )
-    for column, (name, across) in enumerate(ACROSS.items()):
-        everywhere, where = across(stars), across(q.degraded)
-        for row, (what, of, residual, off) in enumerate(rows):
-            axes, below = grid[2 * row : 2 * row + 2, column]
-            axes.plot(everywhere[usable], stars[of][usable], ".", ms=2, color="#888888",
-                      label="all")  # fmt: skip
-            axes.plot(everywhere[held], stars[of][held], ".", color=SERIES_COLORS[5],
-                      label="held out")  # fmt: skip
+    # Columns of panels: instrumental magnitude, then position.
+    magnitude = -2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan))
+    coordinates = {"−2.5 log₁₀ flux": magnitude, "x (px)": stars["x"], "y (px)": stars["y"]}
+    for column, (axis_label, place) in enumerate(coordinates.items()):
+        for row, (label, name, error, error_label) in enumerate(rows):
+            above, below = grid[2 * row : 2 * row + 2, column]
+            above.plot(place[usable], stars[name][usable], ".", ms=2, color="#888888", label="all")
+            above.plot(place[held_out], stars[name][held_out], ".", color=SERIES_COLORS[5],
+                       label="held out")  # fmt: skip
             below.axhline(0.0, color="black", lw=0.8)
-            below.plot(where, residual, ".", ms=2, color=SERIES_COLORS[5])
+            below.plot(place[degraded_rows], error, ".", ms=2, color=SERIES_COLORS[5])
             if column == 0:
-                axes.set_ylabel(what)
-                below.set_ylabel(f"error of\n{off}")
-        grid[-1, column].set_xlabel(name)
+                above.set_ylabel(label)
+                below.set_ylabel(f"error of\n{error_label}")
+        grid[-1, column].set_xlabel(axis_label)
     grid[0, 0].legend()
     return figure
 
 
-def _magnitude(stars: dict[str, np.ndarray]) -> np.ndarray:
-    return np.asarray(-2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan)))
-
-
-ACROSS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
-    "−2.5 log₁₀ flux": _magnitude,
-    "x (px)": lambda stars: stars["x"],
-    "y (px)": lambda stars: stars["y"],
-}
-"""Axes against which sizes and shapes are drawn."""
-
-
 @styled
-def chi2_figure(q: Quality) -> Figure:
-    """χ² of all stars against S/N; those with a flag in grey, and those that were learnt from."""
-    stars, flagged = q.stars, q.stars["flags"] != 0
-    learnt = stars["part"] == "training"
-    shown = (stars["chi2"] > 0) & (stars["snr"] > 0)
+def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
+    """Draw χ² per pixel of all stars against S/N: flagged, used for training, and neither.
+
+    `stars` has the columns flags, part, chi2 and snr, shape (n,) each. χ² is 1 where the model and
+    the noise are right.
+    """
+    flagged, learnt = stars["flags"] != 0, stars["part"] == "training"
+    # Both axes are logarithmic.
+    positive = (stars["chi2"] > 0) & (stars["snr"] > 0)
     figure = new_figure(2.8, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="χ² per pixel")
-    for which, color, label in (
-        (flagged, "#aaaaaa", "flagged"),
-        (~flagged & learnt, SERIES_COLORS[5], "no flag, learnt from"),
-        (~flagged & ~learnt, SERIES_COLORS[0], "no flag"),
+    for selected, color, label in (
+        (positive & flagged, "#aaaaaa", "flagged"),
+        (positive & ~flagged & learnt, SERIES_COLORS[5], "no flag, learnt from"),
+        (positive & ~flagged & ~learnt, SERIES_COLORS[0], "no flag"),
     ):
-        axes.plot(stars["snr"][shown & which], stars["chi2"][shown & which], ".", ms=3, color=color,
-                  label=label)  # fmt: skip
+        axes.plot(
+            stars["snr"][selected], stars["chi2"][selected], ".", ms=3, color=color, label=label
+        )
     axes.axhline(1.0, color="black", lw=0.8)
     axes.grid(True)
     axes.legend()
     return figure
-
-
-def _left_out(q: Quality) -> str:
-    verdicts, flags = q.stars["verdict"], q.stars["flags"]
-    rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
-    marked = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
-    return (
-        html_table(("used for training, or why not", "stars"), rows)
-        + "<p>Flags of the model on all stars of the list:</p>"
-        + html_table(("flag", "stars"), [*marked, ("none", str(int((flags == 0).sum())))])
-    )

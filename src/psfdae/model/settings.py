@@ -1,7 +1,8 @@
-"""Settings of a model of one's own stars: defaults in classes, words of a command line, keywords.
+"""Settings of a model of an image: defaults, and values from a command line or from keywords.
 
-A word that chooses a file of a configuration, such as `train=onecycle` or `preset=smoke`, is for
-what the extra "paper" adds by an entry point of the group "psfdae.settings".
+A word of a command line is `group.key=value`. A word that chooses a file of a configuration, such
+as `train=onecycle` or `preset=smoke`, is read by the extra "paper", by its entry point of the group
+"psfdae.settings".
 """
 
 from __future__ import annotations
@@ -29,20 +30,41 @@ from psfdae.settings import (
     validate,
 )
 
-CHOSEN = "dataset=from_stars"
-"""The choice of the configuration's files with the same values."""
+DATASET_CHOICE = "dataset=from_stars"
+"""Word that chooses the files of the configuration with the same values as these defaults."""
+
+IMAGE_GROUPS = ("calibration_stars", "framing", "parts", "seed")
+"""Groups that determine which stars are used, and which images are made of them."""
 
 
 class Settings(Group):
-    """Settings of a training on the bright stars of an image, but for those of the methods."""
+    """Settings of a training on the bright stars of an image, without those of the methods.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of all random streams.
+    methods : list of str
+        Methods that are fitted; one of them becomes the model.
+    calibration_stars : CalibrationStars
+        Choice of the bright stars, and the S/N to which they are degraded.
+    framing : Stamp
+        Side of the stamps, and the jitter of their centres.
+    noise : Noise
+        Noise levels λ, their factor κ, and the sky.
+    parts : Parts
+        Numbers of training, validation and test images.
+    evaluation : Evaluation
+        Settings of metrics and of the linear algebra.
+    """
 
     seed: Seed = 20200611
-    # A network takes longer than the others together.
+    # Without a network, which takes longer than all of these together.
     methods: MethodNames = Field(["noisy", "lmmse", "gmm", "field"])
     calibration_stars: CalibrationStars = CalibrationStars()
     framing: Stamp = Stamp()
-    # κ = 1 makes a noise level the RMS of a pixel over the star's flux. The levels are replaced
-    # by those of the S/N asked for, and the sky by that of the image where its gain is known.
+    # With κ = 1 a noise level is the RMS of a pixel over the star's flux. The levels are replaced
+    # by those of the stated S/N, and the sky by that of the image where its gain is known.
     noise: Noise = Noise(name="from_stars", levels=[1e-2], kappa=1.0, background_photons=1e4)
     parts: Parts = Parts()
     evaluation: Evaluation = Evaluation()
@@ -50,7 +72,8 @@ class Settings(Group):
     @model_validator(mode="before")
     @classmethod
     def _stated_size(cls, tree: Any) -> Any:
-        """A size of stamps that is stated is taken as it is: no light asks for another one."""
+        """Keep a stated size of stamps: the light that they hold shall not change it."""
+        # What is no tree, or has a group that is none, is refused later with its key.
         if not isinstance(tree, Mapping) or not isinstance(tree.get("framing"), Mapping):
             return tree
         stars = tree.get("calibration_stars", {})
@@ -65,100 +88,94 @@ class Settings(Group):
 
 def _unpickled() -> Settings:
     """Return settings without values, which pickle fills in."""
-    kind = settings_model()
-    return kind.__new__(kind)
+    model = settings_model()
+    return model.__new__(model)
 
 
 @cache
 def settings_model() -> type[Settings]:
-    """The model of all settings, those of the methods of `config.yaml` included."""
+    """Return the class of all settings, those of all methods that are installed included."""
+    # A field of the class for each group of each method, by the name of the group.
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
-        for kind in known()
-        for name, group in kind.groups.items()
+        for method_class in known()
+        for name, group in method_class.groups.items()
     }
     return create_model("Settings", __base__=Settings, **groups)
 
 
 def from_words(words: Sequence[str] = ()) -> Settings:
-    """Settings from words `group.key=value`, the value as in YAML.
+    """Return settings from words `group.key=value`, the value as in YAML.
 
     Raises
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    fields = settings_model().model_fields
-    tree: dict[str, Any] = {}
+    import yaml
+
+    groups, tree = tuple(settings_model().model_fields), dict[str, Any]()
     for word in words:
         key, equals, text = word.lstrip("+").partition("=")
         group, _, name = key.partition(".")
-        plain = group in ("seed", "methods") and not name
-        if not equals or (group in fields and not (name or plain)) or group not in fields:
-            return of_config(_composed(tuple(fields), word, words))
-        value = _value(text, word)
-        tree |= {group: value} if plain else {group: {**tree.get(group, {}), name: value}}
+        # Seed and list of methods are groups of a single value.
+        is_group = group in ("seed", "methods") and not name
+        if not equals or group not in groups or not (name or is_group):
+            # The word chooses a file of a configuration, or is wrong. The extra "paper" reads the
+            # former, and its message on the latter is better.
+            if any(argument.lstrip("+").startswith("framing.stamp_px=") for argument in words):
+                words = ("++calibration_stars.light_min=0", *words)
+            for point in joined("settings"):
+                return of_config(point.load()(groups, (DATASET_CHOICE, *words)))
+            names = ", ".join(groups)
+            raise ConfigError(f"{word}: expected group.key=value, the group one of {names}")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ConfigError(f"{word}: {text!r} is no value") from None
+        tree[group] = value if is_group else {**tree.get(group, {}), name: value}
     return validate(settings_model(), tree)
 
 
-def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Group:
-    """Groups of settings where a word chooses a file, or is wrong, of which Hydra says more."""
-    if any(word.lstrip("+").startswith("framing.stamp_px=") for word in words):
-        words = ("++calibration_stars.light_min=0", *words)
-    for point in joined("settings"):
-        settings: Group = point.load()(groups, (CHOSEN, *words))
-        return settings
-    raise ConfigError(f"{word}: expected group.key=value, the group one of {', '.join(groups)}")
-
-
 @dataclass(frozen=True)
-class Words:
-    """Reads the settings of a command; see `psfdae.cli.Reader`."""
+class SettingsReader:
+    """Reader of the settings of a command; see `psfdae.cli.Reader`."""
 
     choice: tuple[str, ...] = ()
 
     def of(self, options: Mapping[str, object]) -> tuple[str, ...]:
-        """Names of the groups of settings."""
+        """Return the names of the groups of settings."""
         return tuple(settings_model().model_fields)
 
     def __call__(
         self, options: Mapping[str, object], file: Path | None, words: Sequence[str]
     ) -> Settings:
-        """The settings of words, or of a YAML file."""
+        """Return settings from words, or from a YAML file."""
         return of_config(read_yaml(file)) if file is not None else from_words(words)
 
 
 def of_config(config: Group | Mapping[str, Any]) -> Settings:
-    """The settings among those of a configuration, a model or a tree, which may have more.
+    """Return the settings of this module from a configuration, which may have more.
 
     Raises
     ------
     ConfigError
-        As `from_words`.
+        Names each wrong key with its value and the allowed range.
     """
+    # Groups, and their keys, that these settings do not have are left out.
     tree = config if isinstance(config, Mapping) else config.model_dump()
-    found = {}
+    settings = {}
     for name in settings_model().model_fields:
         if name in tree:
-            keys = _keys(name)
-            value = tree[name]
-            found[name] = {k: v for k, v in value.items() if k in keys} if keys else value
-    return validate(settings_model(), found)
-
-
-def _value(text: str, word: str) -> Any:
-    import yaml
-
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ConfigError(f"{word}: {text!r} is no value") from None
+            keys, value = _keys(name), tree[name]
+            settings[name] = {k: v for k, v in value.items() if k in keys} if keys else value
+    return validate(settings_model(), settings)
 
 
 def with_keywords(
     settings: Settings, groups: Sequence[str], keywords: Mapping[str, object]
 ) -> Settings:
-    """Settings with other values, given by the names of keys of some groups.
+    """Return settings with other values, given by the names of keys of some groups.
 
     A name that several of the groups have is that of the first one.
 
@@ -167,24 +184,20 @@ def with_keywords(
     ConfigError
         If no group has a name, or a value is out of its range.
     """
+    # Only what was stated: a default may depend on it.
     tree = settings.model_dump(exclude_unset=True)
+    # A group without keys, such as the seed, is itself a key.
+    group_keys = {group: _keys(group) or {group} for group in groups}
     for name, value in keywords.items():
-        owner = next((group for group in groups if _has(group, name)), None)
+        owner = next((group for group, keys in group_keys.items() if name in keys), None)
         if owner is None:
-            known = [key for group in groups for key in sorted(_keys(group) or (group,))]
-            raise ConfigError(f"{name}: unknown setting; there are {', '.join(known)}")
+            names = ", ".join(key for keys in group_keys.values() for key in sorted(keys))
+            raise ConfigError(f"{name}: unknown setting; there are {names}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
     return validate(settings_model(), tree)
 
 
-def _has(group: str, name: str) -> bool:
-    return name in _keys(group) or (group == name and not _keys(group))
-
-
 def _keys(group: str) -> set[str]:
+    """Return the keys of a group of settings; none if it is a single value such as the seed."""
     kind = settings_model().model_fields[group].annotation
     return {*kind.model_fields} if isinstance(kind, type) and issubclass(kind, Group) else set()
-
-
-IMAGE_GROUPS = ("calibration_stars", "framing", "parts", "seed")
-"""Groups that decide which stars are used, and which images are made of them."""

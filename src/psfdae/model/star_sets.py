@@ -1,8 +1,7 @@
-"""Sets of stars, products of the kind "stars": their parts, their noise, what methods learn."""
+"""Sets of stars, products of the kind "stars": split, noise, and training sets of methods."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,132 +17,169 @@ from psfdae.rng import stream
 from psfdae.settings import Config, OfFit, WithNoise
 from psfdae.splits import Split, held_out_split, random_split
 
-INNER = 10
-"""One of so many stars chooses the settings of a fit that has not seen the validation stars."""
-
 
 def read_stars(path: Path, *references: str) -> Product:
-    """Stars with their noise-free images, fields and the references asked for."""
-    names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
-    return read_product(path, "stars", names)
+    """Read stars with their noise-free images, fields and the given references."""
+    # The realisation, the noise-free image, is the first of the references.
+    names = dict.fromkeys(("realisation", *references, "field_index", "grid"))
+    return read_product(path, "stars", tuple(names))
 
 
 def of_image(stars: Product) -> bool:
-    """Whether the stars are those of an image, not of a simulation."""
+    """Return True if the stars are those of an image, not of a simulation."""
     return stars.config.get("source") == "stars"
 
 
 def field_positions(stars: Product) -> np.ndarray:
-    """Return the field position of each star, in steps of the field's grid, shape (n, 2).
+    """Return the field position of each image of a star.
 
-    Of an image in pixels, NaN where its list does not say it, with two more columns: magnitude and
-    colour of the bright star, which stay those of its noisy images.
+    Returns
+    -------
+    ndarray, shape (n, 2) or (n, 4)
+        Simulated stars: steps of the field's grid. Stars of an image: pixels, magnitude and colour
+        of the bright star, which stay those of its noisy images; NaN where the list lacks them.
     """
-    if not of_image(stars):
-        return np.asarray(stars["grid"][stars["field_index"]])
-    place = places(stars["position"], stars["flux"], stars["colour"])
-    return np.asarray(place[stars["field_index"]])
+    # Rows of fields, or of bright stars; each has several images.
+    position = stars["grid"]
+    if of_image(stars):
+        position = places(stars["position"], stars["flux"], stars["colour"])
+    return np.asarray(position[stars["field_index"]])
 
 
 def star_area(stars: Product, train: np.ndarray) -> float:
-    """Noise-equivalent area in pixels of the typical star, of which `train` are training images.
+    """Return the noise-equivalent area A of a typical star, in pixels.
 
-    Bright stars of an image have their own, A = (F / (σ S/N))², free of their noise.
+    Parameters
+    ----------
+    stars : product "stars"
+    train : ndarray of int
+        Numbers of the training images, whose mean area is that of simulated stars.
     """
+    # Bright stars of an image have a measured S/N = F / (σ √A), with σ / F as their noise.
     if of_image(stars):
         return float(np.median((stars["noise"] * stars["snr"]) ** -2.0))
     return noise_equivalent_px(stars["realisation"][train])
 
 
 def split_stars(stars: Product, kind: str, config: OfFit) -> Split:
-    """Training, validation and test stars of a split.
+    """Split stars into training, validation and test.
+
+    Parameters
+    ----------
+    stars : product "stars"
+    kind : str
+        "held_out" for whole field positions, else at random.
+    config : settings with the groups `parts` and `seed`
 
     Raises
     ------
     ProductError
         If the file holds fewer stars than the config's parts need.
     """
-    parts, count = config.parts, len(stars["field_index"])
+    parts, field_index = config.parts, stars["field_index"]
+    count, validation = len(field_index), parts.validation_fraction
     if kind == "held_out":
-        return held_out_split(
-            stars["field_index"], stars["grid"], parts.validation_fraction, config.seed
-        )
+        return held_out_split(field_index, stars["grid"], validation, config.seed)
+    # Training and test share no image; validation stars are a part of the training.
     if parts.train_stars + parts.test_stars > count:
         raise ProductError(
             f"{stars.path}: holds {count} stars, but parts.train_stars + parts.test_stars = "
             f"{parts.train_stars + parts.test_stars}"
         )
-    return random_split(
-        count, parts.train_stars, parts.test_stars, parts.validation_fraction, config.seed
-    )
+    return random_split(count, parts.train_stars, parts.test_stars, validation, config.seed)
 
 
 def noise_model(config: WithNoise) -> NoiseModel:
-    """The noise of a stage's config."""
+    """Return the noise model of a configuration."""
     return NoiseModel(config.noise.kappa, config.noise.background_photons)
 
 
 def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
-    """Noisy images of test stars, numbers `test` of a product "stars", at one λ.
+    """Return noisy images (n, d, d) of test stars at one noise level λ.
 
-    The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in
-    set or λ, so that their columns are independent; methods, references, bounds and splits
-    share it, so that what they make of a star is compared on one image.
+    The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in set or λ,
+    so that their columns are independent; methods, references, bounds and splits share it, so that
+    they are compared on the same images.
+
+    Parameters
+    ----------
+    config : settings with the groups `noise` and `seed`
+    stars : product "stars"
+    test : ndarray of int, shape (n,)
+        Numbers of the images in the product.
+    level : float
     """
-    of = stars.config.get("stars", {}).get("name", "own")
-    rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
+    set_name = stars.config.get("stars", {}).get("name", "own")
+    # Six digits of λ: the same level from two files may differ in the last bit.
+    rng = stream(config.seed, "noise", "test", set_name, f"{level:.6g}")
     return np.asarray(noise_model(config).draw(stars["realisation"], level, rng)[test])
 
 
 def own_noise(
     stars: Product, images: np.ndarray, background: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise that stars of a product "stars" have themselves, in images of flux 1.
-
-    Simulated stars have none.
+    """Return the noise of bright stars themselves, in images of flux 1; simulated stars have none.
 
     Parameters
     ----------
     stars : product "stars"
     images : ndarray, shape (n, d, d)
     background : float
-        Photons of the sky in a pixel.
+        Photons B of the sky in a pixel.
 
     Returns
     -------
     flux_error : ndarray, shape (n,)
-        Of the sum of the pixels, by which stars have the flux 1, above a sky that is the median of
-        the pixels around them.
-    noise : ndarray, shape (n, d, d)
-        σ of every pixel: of the sky's noise σ and the star's F = √B / σ photons.
+        Standard error of the sum of the pixels, which is set to 1, above a sky that is the median
+        of the pixels around the star.
+    sigma : ndarray, shape (n, d, d)
+        Standard error of each pixel, from the noise of the sky and the photons of the star.
     """
     if not of_image(stars):
         return np.zeros(len(images)), np.broadcast_to(np.float32(0.0), images.shape)
+    # A star of F = √B / σ photons has the variance σ² + x / F = σ² + x σ / √B in a pixel x.
     noise = stars["noise"][stars["field_index"]]
     sigma = noise[:, None, None]
-    square = sigma**2 + np.maximum(images, 0.0) * sigma / np.sqrt(background)
+    variance = sigma**2 + np.maximum(images, 0.0) * sigma / np.sqrt(background)
     # P pixels have the noise √P σ; the median of n pixels around them errs by √(π/2n) σ in each.
     pixels = images[0].size
-    around = max(stars["wide"][0].size - pixels, 1)
-    return noise * np.sqrt(pixels + np.pi / 2 * pixels**2 / around), np.sqrt(square)
+    sky_pixels = max(stars["wide"][0].size - pixels, 1)
+    return noise * np.sqrt(pixels + np.pi / 2 * pixels**2 / sky_pixels), np.sqrt(variance)
 
 
 def training_set(
-    config: OfFit,
-    kind: type[Method],
-    stars: Product,
-    split: str,
-    reference: str,
-    **more: Any,
+    config: OfFit, kind: type[Method], stars: Product, split: str, reference: str, **fields: Any
 ) -> TrainingSet:
-    """Return the training part of a split, with the noise of a configuration."""
+    """Return the training part of a split, with the noise of a configuration.
+
+    Parameters
+    ----------
+    config : settings with the groups `noise`, `parts` and `seed`
+    kind : type of Method
+        Method to be fitted.
+    stars : product "stars"
+    split : str
+        Kind of the split, as of `split_stars`.
+    reference : str
+        Array of the product that is the truth.
+    **fields
+        Further fields of `TrainingSet`.
+    """
+
+    def star_noise(images: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Return the noise of bright stars; its arrays are read if a method asks for it."""
+        star, background = stars["field_index"], config.noise.background_photons
+        return OwnNoise(stars["noise"][star], background, stars["phase"], star)(images, mean)
+
+    # Stars of an image have noise themselves, and some methods measure them in the image; simulated
+    # stars have a description of their simulation.
     parts = split_stars(stars, split, config)
     if of_image(stars):
-        more["own_noise"] = _own_noise(stars, config.noise.background_photons)
+        fields["own_noise"] = star_noise
         if issubclass(kind, MeasuresStars):
-            more |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
+            fields |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
     else:
-        more["simulation"] = stars.config
+        fields["simulation"] = stars.config
     return TrainingSet(
         images=stars["realisation"],
         references=stars[learnt(kind, reference)],
@@ -154,25 +190,22 @@ def training_set(
         seed=config.seed,
         reference=reference,
         positions=field_positions(stars),
-        **more,
+        **fields,
     )
 
 
 def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Config) -> Method:
-    """A fit that has learnt nothing from the validation stars, for methods that else do.
+    """Fit a method without the validation stars, for methods that otherwise learn from them.
 
-    Some stars of `fit` choose its settings instead; `star` says which images are of the same.
+    Parameters
+    ----------
+    kind : type of Method
+    data : TrainingSet
+    star : ndarray of int, shape (n,)
+        Number of the star of each image.
+    config : settings of the method
     """
-    inner = np.isin(star[data.fit], np.unique(star[data.fit])[::INNER])
-    some = replace(data, fit=data.fit[~inner], validation=data.fit[inner])
-    return kind.fit(some, **kind.settings(config))
-
-
-def _own_noise(stars: Product, background: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Noise of the bright stars of an image; its arrays are read if a method asks for it."""
-
-    def own_noise(images: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        star = stars["field_index"]
-        return OwnNoise(stars["noise"][star], background, stars["phase"], star)(images, mean)
-
-    return own_noise
+    # A tenth of the stars of the fit choose its settings in place of the validation stars.
+    is_judge = np.isin(star[data.fit], np.unique(star[data.fit])[::10])
+    data = replace(data, fit=data.fit[~is_judge], validation=data.fit[is_judge])
+    return kind.fit(data, **kind.settings(config))

@@ -1,4 +1,4 @@
-"""How good a model is on stars that no training saw: `validate`, and its `Report`."""
+"""Test of a model on stars that no training saw: `validate`, and its `Report`."""
 
 from __future__ import annotations
 
@@ -15,55 +15,45 @@ import numpy as np
 from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
 from psfdae.image.tables import shown_with_digits
-from psfdae.method import Method, facts_of
+from psfdae.method import Method
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
-from psfdae.model.psf_model import MARGIN_PX, PsfModel
+from psfdae.model.psf_model import PsfModel
 from psfdae.model.report import (
     MEAN_PSF,
-    SHOWN_STARS,
     Check,
-    Quality,
+    check_held_out,
     checks_html,
-    checks_of_held_out,
-    fitted_mean,
+    comparison_sentence,
+    fit_mean_psf,
+    nearest_snr,
     quality_page,
-    standing,
+    residual_strip,
 )
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
     own_noise,
-    split_stars,
     star_area,
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
 from psfdae.progress import steps
-from psfdae.splits import Split
 from psfdae.threads import fixed_threads
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from matplotlib.figure import Figure
 
-BESIDE = ("noisy", "lmmse")
-"""Methods that every model is compared with, beside one mean PSF."""
-
-STRIP_SNR = 10.0
-"""The figure of restored stars has the S/N nearest to this."""
-
-STRIP_STARS = 6
-
 
 def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None = None) -> Report:
-    """Errors of a model on the stars held out, degraded to the noise levels of their settings.
+    """Measure a model on the stars held out, degraded to the noise levels of their settings.
 
-    Beside it stand the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
+    It is compared with the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
 
     Parameters
     ----------
@@ -86,180 +76,239 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     True
     """
     _require_unseen(model, stars)
-    settings, own = stars.settings, model.info.method
-    known = {**(others or {}), own: model.engine.estimator}
-    names = [n for n in settings.methods if n in known or n in BESIDE]
-    names += [n for n in (own, *BESIDE) if n not in names]
+    settings, product = stars.settings, stars.product
+    fits = {**(others or {}), model.info.method: model.method}
+    # Every table has the noisy images and linear MMSE; both are quick to fit.
+    baselines = ("noisy", "lmmse")
+    names = [name for name in settings.methods if name in fits or name in baselines]
+    methods: dict[str, Method] = {}
     with fixed_threads(settings.evaluation.threads):
-        methods = {name: known.get(name) or _fitted_here(name, stars) for name in names}
-        return _measured(model, stars, methods)
+        for name in dict.fromkeys([*names, model.info.method, *baselines]):
+            if name not in fits:
+                method_class = method_of(name)
+                data = training_set(settings, method_class, product, SPLIT, REFERENCE)
+                fits[name] = method_class.fit(data, **method_class.settings(settings))
+            methods[name] = fits[name]
+        return _measure(model, stars, methods)
 
 
 def _require_unseen(model: PsfModel, stars: Stars) -> None:
-    """Refuse a model of other stars of the same image, and one of another camera."""
-    info, product, said = model.info, stars.product, stars.observation.path
-    model.check_scale(stars.observation.pixel_scale_arcsec, str(said))
+    """Refuse a model that may have learnt from the stars held out, and one of another camera.
+
+    Raises
+    ------
+    PredictionError
+        If pixels or stamps differ from those of the model, or if it was trained on other stars of
+        the same image.
+    """
+    info, product, path = model.info, stars.product, stars.observation.path
+    model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
         raise PredictionError(
-            f"{said}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
+            f"{path}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
             f"takes {info.stamp_px} px"
         )
-    train = split_stars(product, SPLIT, stars.settings).train
-    images = product["realisation"][train]
-    known = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
-    if not {*", ".join(known).split(", ")} & {*product.config["image_sha256"].split(", ")}:
+    # A model of another image has learnt from none of these stars. Several images are one text.
+    hashes = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
+    if not {*", ".join(hashes).split(", ")} & {*product.config["image_sha256"].split(", ")}:
         return
-    if info.training_sha256 != checksum(images, product[REFERENCE][train]):
+    # The training images of a model are those of these stars if their checksum is the same.
+    train = stars.split.train
+    if info.training_sha256 != checksum(product["realisation"][train], product[REFERENCE][train]):
         raise PredictionError(
-            f"{said}: the model {info.name!r} was trained on other stars of this image, among "
+            f"{path}: the model {info.name!r} was trained on other stars of this image, among "
             "which may be those held out here; fit a model to these stars"
         )
 
 
-def _fitted_here(name: str, stars: Stars) -> Method:
-    kind = method_of(name)
-    data = training_set(stars.settings, kind, stars.product, SPLIT, REFERENCE)
-    fitted: Method = kind.fit(data, **kind.settings(stars.settings))
-    return fitted
+def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
+    """Measure fitted methods, and photometry of the model, on held-out stars at every λ.
 
-
-def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
-    settings, product = stars.settings, stars.product
-    parts = split_stars(product, SPLIT, settings)
-    truth, field = product[REFERENCE][parts.test], product["field_index"][parts.test]
-    position = field_positions(product)[parts.test]
-    data_range = settings.evaluation.data_range
+    Parameters
+    ----------
+    model : PsfModel
+    stars : Stars
+    methods : mapping of str to Method
+        Fits by name, that of the model included.
+    """
+    settings, product, test = stars.settings, stars.product, stars.split.test
+    truth, star = product[REFERENCE][test], product["field_index"][test]
+    position, data_range = field_positions(product)[test], settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
-    rows, per_star, restored, degraded = [], [], {}, {}
+    rows, mean_rows, per_star, restored = [], [], [], {}
     for level in steps("stars held out", settings.noise.levels):
-        noisy = degraded[level] = noisy_test_images(settings, product, parts.test, level)
-        mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
+        noisy = noisy_test_images(settings, product, test, level)
+        # A pixel more than the jitter of the stamps: noise moves the brightest pixel.
+        mean = fit_mean_psf(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
-        beside = summarised(row, all_metrics(mean, truth, data_range), field)
+        mean_rows += summarised(row, all_metrics(mean, truth, data_range), star)
         for name, method in methods.items():
-            own = name == model.info.method
-            scale = settings.noise.kappa / model.info.kappa if own else 1.0
+            is_model = name == model.info.method
+            # The model may be of another image, whose noise level λ has another κ.
+            scale = settings.noise.kappa / model.info.kappa if is_model else 1.0
             estimate = method.estimate(noisy, scale * level, position)
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
-            rows += summarised(row, metrics, field)
-            per_star.append({**row, "star": parts.test, "field": field, **metrics})
-            if own:
+            rows += summarised(row, metrics, star)
+            per_star.append({**row, "star": test, "field": star, **metrics})
+            if is_model:
                 images = {"noisy": noisy, "truth": truth, "model": estimate.psf, MEAN_PSF: mean}
                 restored[level] = images
-        rows += beside
-    measured = [row for row in rows if row["method"] != MEAN_PSF]
-    table = _table(rows, stars, methods)
-    found = _found(model, stars, degraded)
     return Report(
-        model, stars, methods, table, _stacked(measured), _joined(per_star), found, restored
+        model,
+        stars,
+        methods,
+        _error_table([*rows, *mean_rows], stars, methods),
+        _stacked(rows),
+        _joined(per_star),
+        _measure_photometry(model, stars, restored),
+        restored,
     )
 
 
-def _found(model: PsfModel, stars: Stars, degraded: Mapping[float, np.ndarray]) -> Table:
-    """Predict held-out stars of flux 1 at each λ from their places alone.
+def _measure_photometry(
+    model: PsfModel, stars: Stars, restored: Mapping[float, Mapping[str, np.ndarray]]
+) -> Table:
+    """Predict held-out stars of flux 1 at each λ from their places alone (`Report.found`).
 
-    The bright star that is the truth has noise of its own, which counts in every error.
+    The bright star that is the truth has noise itself, which counts in every error.
+
+    Parameters
+    ----------
+    model : PsfModel
+    stars : Stars
+    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Degraded images (`noisy`) by noise level λ.
+
+    Returns
+    -------
+    Table
+        Rows by S/N, ascending.
     """
-    settings, product = stars.settings, stars.product
-    parts, background = split_stars(product, SPLIT, settings), settings.noise.background_photons
-    test, area = parts.test, star_area(product, parts.train)
+    product, test = stars.product, stars.split.test
+    kappa, background = stars.settings.noise.kappa, stars.settings.noise.background_photons
+    area = star_area(product, stars.split.train)
     star, truth = product["field_index"][test], product[REFERENCE][test]
-    own = own_noise(product, product[REFERENCE], background)
-    of_flux, of_pixels = (of_all[test] for of_all in own)
-    given = {"position": field_positions(product)[test]}
-    bright = model.predict(truth, flux=1.0, background=0.0, noise=product["noise"][star], **given)
+    # Errors of the truth: of its flux and pixels by its noise, of its centre by a fit.
+    truth_errors = own_noise(product, product[REFERENCE], background)
+    truth_flux_error, truth_sigma = (errors[test] for errors in truth_errors)
+    positions, noise = field_positions(product)[test], product["noise"][star]
+    bright = model.predict(truth, flux=1.0, background=0.0, noise=noise, position=positions)
     rows = []
-    for level in sorted(degraded, reverse=True):  # S/N ascending
-        noise = settings.noise.kappa * level
-        found = model.predict(degraded[level], gain=np.sqrt(background) / noise, **given)
-        usable = np.isfinite(found.psf).all(axis=(1, 2)) & (found.flux_error > 0)
-        row = {"snr": signal_to_noise(noise, area), "lost": float(1.0 - usable.mean())}
-        off = np.stack([getattr(found, c) - getattr(bright, c) for c in ("x_fit", "y_fit")])
-        errors = ("x_error", "y_error")
-        doubt = np.stack([np.hypot(getattr(found, c), getattr(bright, c)) for c in errors])
-        pull = np.abs(found.flux - 1.0) / np.hypot(found.flux_error, of_flux)
-        row["flux_bias"], row["flux_bias_stderr"] = _mean(found.flux - 1.0, star, usable)
-        row["flux_pull"] = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
-        row["centre_rms_px"] = _mean(np.square(off).sum(axis=0), star, usable)[0] ** 0.5
-        inside = np.abs(found.psf - truth) < np.hypot(found.uncertainty, of_pixels)
-        measured = np.isfinite(off).all(axis=0)
-        held = {
-            "flux": np.where(usable, pull < 1.0, np.nan),
-            "centre": np.where(measured, (np.abs(off) < doubt).mean(axis=0), np.nan),
-            "psf": inside.mean(axis=(1, 2)),
+    for level in sorted(restored, reverse=True):  # S/N ascending
+        # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
+        gain = np.sqrt(background) / (kappa * level)
+        estimate = model.predict(restored[level]["noisy"], gain=gain, position=positions)
+        usable = np.isfinite(estimate.psf).all(axis=(1, 2)) & (estimate.flux_error > 0)
+        # Offsets of the centre, and their standard errors, along x and y.
+        offset = np.stack([estimate.x_fit - bright.x_fit, estimate.y_fit - bright.y_fit])
+        offset_error = np.stack(
+            [np.hypot(estimate.x_error, bright.x_error), np.hypot(estimate.y_error, bright.y_error)]
+        )
+        # Pull of the flux: its error over the standard error, that of the truth included.
+        pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
+        flux_bias, flux_bias_stderr = _usable_mean(estimate.flux - 1.0, star, usable)
+        flux_pull = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
+        mean_square_px = _usable_mean(np.square(offset).sum(axis=0), star, usable)[0]
+        row = {
+            "snr": signal_to_noise(kappa * level, area),
+            "lost": float(1.0 - usable.mean()),
+            "flux_bias": flux_bias,
+            "flux_bias_stderr": flux_bias_stderr,
+            "flux_pull": flux_pull,
+            "centre_rms_px": mean_square_px**0.5,
         }
-        for name, part in held.items():
-            row[f"{name}_within"], row[f"{name}_within_stderr"] = _mean(part, star, usable)
+        # Coverage: fraction of errors within the stated ones.
+        pixel_error = np.hypot(estimate.uncertainty, truth_sigma)
+        has_centre = np.isfinite(offset).all(axis=0)
+        coverage = {
+            "flux": np.where(usable, pull < 1.0, np.nan),
+            "centre": np.where(has_centre, (np.abs(offset) < offset_error).mean(axis=0), np.nan),
+            "psf": (np.abs(estimate.psf - truth) < pixel_error).mean(axis=(1, 2)),
+        }
+        for name, fraction in coverage.items():
+            row[f"{name}_within"], row[f"{name}_within_stderr"] = _usable_mean(
+                fraction, star, usable
+            )
         rows.append(row)
     return _stacked(rows)
 
 
-def _mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
-    """Mean of some images (n,) and its standard error, clustered by star; NaN of none."""
-    if not usable.any():
-        return np.nan, np.nan
-    return clustered_mean(values[usable], star[usable])
+def _usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
+    """Return the mean of usable images and its standard error, clustered by star; NaN of none.
+
+    `values`, `star` and the mask `usable` have the shape (n,).
+    """
+    return clustered_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)
 
 
 def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
+    """Return a table of rows that have the same keys."""
     from astropy.table import Table
 
     return shown_with_digits(Table({name: [row[name] for row in rows] for name in rows[0]}))
 
 
-def _joined(parts: Sequence[Mapping[str, Any]]) -> Table:
-    """Rows of parts, NaN in columns that a part does not have."""
+def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
+    """Return one table of blocks of columns, NaN in the columns that a block does not have.
+
+    A block has the array `star` (n,); its other values are arrays as long, or constants.
+    """
     from astropy.table import Table
 
-    names = dict.fromkeys(name for part in parts for name in part)
+    # Methods differ in their metrics: columns stand in the order in which they first appear.
+    names = dict.fromkeys(name for block in blocks for name in block)
     columns = {
-        name: [np.broadcast_to(part.get(name, np.nan), part["star"].shape) for part in parts]
+        name: [np.broadcast_to(block.get(name, np.nan), block["star"].shape) for block in blocks]
         for name in names
     }
     return Table({name: np.concatenate(values) for name, values in columns.items()})
 
 
-def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str, Method]) -> Table:
-    """MSE and SSIM by S/N and method."""
-    settings, product = stars.settings, stars.product
-    parts = split_stars(product, SPLIT, settings)
-    area = star_area(product, parts.train)
-    of = {(row["noise_level"], row["method"], row["metric"]): row for row in rows}
-    shared = {
-        "images": parts.test.size,
-        "stars": int(stars.held_out.sum()),
-        "truth_mse": _own_mse(stars, parts),
-    }
-    found = []
+def _error_table(
+    statistics: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str, Method]
+) -> Table:
+    """Return MSE and SSIM by S/N and method, the table `Report.table`.
+
+    Parameters
+    ----------
+    statistics : sequence of mappings
+        Mean and standard error of each metric, by noise level and method.
+    stars : Stars
+    methods : mapping of str to Method
+        Methods in the order of the rows; one mean PSF comes last.
+    """
+    settings, product, split = stars.settings, stars.product, stars.split
+    area = star_area(product, split.train)
+    # Mean and standard error of each metric, by noise level and method.
+    cells = {(row["noise_level"], row["method"], row["metric"]): row for row in statistics}
+    # Noise of the bright images: the variance of their pixels is a part of every MSE.
+    sky_photons = settings.noise.background_photons
+    _, truth_sigma = own_noise(product, product[REFERENCE], sky_photons)
+    rows = []
     for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
         noise = settings.noise.kappa * level
         for name in (*methods, MEAN_PSF):
-            mse_of, ssim_of = (of[level, name, metric] for metric in ("mse", "ssim_peak"))
-            found.append(
+            mse_cell = cells[level, name, "mse"]
+            rows.append(
                 {
                     "snr": signal_to_noise(noise, area),
                     "noise": noise,
                     "method": name,
-                    "mse": mse_of["value"],
-                    "mse_stderr": mse_of["stderr"],
-                    "ssim": ssim_of["value"],
-                    **shared,
+                    "mse": mse_cell["value"],
+                    "mse_stderr": mse_cell["stderr"],
+                    "ssim": cells[level, name, "ssim_peak"]["value"],
+                    "images": split.test.size,
+                    "stars": int(stars.held_out.sum()),
+                    "truth_mse": float(np.square(truth_sigma[split.test]).mean()),
                 }
             )
-    return _stacked(found)
-
-
-def _own_mse(stars: Stars, parts: Split) -> float:
-    """Mean variance of the pixels of the stars held out: their own noise, in every MSE."""
-    product, sky = stars.product, stars.settings.noise.background_photons
-    _, noise = own_noise(product, product[REFERENCE], sky)
-    return float(np.square(noise[parts.test]).mean())
+    return _stacked(rows)
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Whether to trust a model: its errors on stars that no training saw.
+    """Errors of a model on stars that no training saw, which tell whether to trust it.
 
     Attributes
     ----------
@@ -272,12 +321,13 @@ class Report:
     evaluation : Table
         Every metric of every method at every noise level.
     per_star : Table
-        The same of every image.
+        Every metric of every image.
     found : Table
-        What `predict` makes of the held-out images where no flux, sky, noise and centre is given,
-        by S/N: bias of the flux over the flux, its pull (what 68.27 % of |error| over `flux_error`
-        are below: 1 if errors hold), RMS of the centre, and the parts of fluxes, centres and
-        pixels that are within their stated errors, with standard errors clustered by star.
+        Photometry by S/N: what `predict` makes of the held-out images where no flux, sky, noise
+        and centre is given. Bias of the flux over the flux, its pull (what 68.27 % of |error| over
+        `flux_error` are below: 1 if errors hold), RMS of the centre, and the parts of fluxes,
+        centres and pixels that are within their stated errors, with standard errors clustered by
+        star.
     restored : dict
         By noise level λ the held-out images (n, d, d): `noisy`, `truth`, `model`, and `mean_psf`.
 
@@ -299,137 +349,136 @@ class Report:
     restored: dict[float, dict[str, np.ndarray]]
 
     def __str__(self) -> str:
-        kind = type(self.model.engine.estimator)
-        return standing(self.table, kind.name, kind.look.label)
+        method_class = type(self.model.method)
+        return comparison_sentence(self.table, method_class.name, method_class.look.label)
 
     def __repr__(self) -> str:
         return f"Report({self.model.name!r}, {self})"
 
     def _repr_html_(self) -> str:
-        """A sentence on the model, and its checks on held-out stars, for a notebook."""
+        """Return the summary and the checks on held-out stars, for a notebook."""
         return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
 
     def checks(self) -> list[Check]:
-        """Checks of the model on the stars held out: question, answer, and whether it is passed."""
-        errors = self.table, self.found, self._coverage, self._faint
-        return checks_of_held_out(self.model.info.method, *errors)
+        """Check the model on the stars held out: question, answer, and True if it is passed."""
+        # Coverage was measured when the model was made, at S/N of its own.
+        rows = self.model.info.metrics
+        coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
+        method = self.model.info.method
+        return check_held_out(method, self.table, self.found, coverage, self.restored_by_snr)
 
     @property
-    def _faint(self) -> dict[float, dict[str, np.ndarray]]:
-        """The restored images by S/N."""
+    def restored_by_snr(self) -> dict[float, dict[str, np.ndarray]]:
+        """Restored images by S/N."""
         info = self.model.info
         return {
             signal_to_noise(info.kappa * level, info.noise_equivalent_px): images
             for level, images in self.restored.items()
         }
 
-    @property
-    def _coverage(self) -> dict[float, float]:
-        """Part of the errors within ± the stated 68 %, by S/N."""
-        rows = self.model.info.metrics
-        return {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
-
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other."""
         write_text(path, self.page())
 
     def strip(self) -> Figure:
-        """Held-out stars degraded to S/N 10, and what the methods make of them."""
-        settings, product = self.stars.settings, self.stars.product
-        parts = split_stars(product, SPLIT, settings)
-        area = star_area(product, parts.train)
-        levels = np.asarray(settings.noise.levels)
-        snr = 1.0 / (settings.noise.kappa * levels * np.sqrt(area))
-        level = float(levels[np.abs(np.log(snr / STRIP_SNR)).argmin()])
-        star, place = product["field_index"][parts.test], field_positions(product)[parts.test]
-        shown = _one_of_each(star, product["position"])
-        noisy, truth = (self.restored[level][kind][shown] for kind in ("noisy", "truth"))
+        """Draw held-out stars degraded to S/N 10, as each method restores them."""
+        product, test = self.stars.product, self.stars.split.test
+        kappa = self.stars.settings.noise.kappa
+        area = star_area(product, self.stars.split.train)
+        # The noise level whose S/N is the nearest to 10.
+        levels = {signal_to_noise(kappa * level, area): level for level in self.restored}
+        snr = nearest_snr(levels)
+        # Six stars that lie evenly over the field, one image of each.
+        star, place = product["field_index"][test], field_positions(product)[test]
+        tested, first = np.unique(star, return_index=True)
+        shown = first[_evenly_spread(product["position"][tested], 6)]
+        images = self.restored[levels[snr]]
+        noisy, truth = images["noisy"][shown], images["truth"][shown]
+        # A row of the bright stars, then one for each method that figures show.
         rows = [StripRow("bright\nstar", truth)]
         for method in self.methods.values():
             look = method.look
             if look.drawn:
-                stamps = method.restore(noisy, level, place[shown])
+                stamps = method.restore(noisy, levels[snr], place[shown])
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
-        found = signal_to_noise(settings.noise.kappa * level, area)
-        title = f"Bright stars that no training saw, degraded to S/N {found:.3g}"
+        title = f"Bright stars that no training saw, degraded to S/N {snr:.3g}"
         return restoration_strip(rows, columns, title)
 
     @cached_property
     def strip_png(self) -> bytes:
-        """The picture of `strip` as a file holds it."""
+        """Figure of `strip` as the bytes of a PNG file."""
         return as_png(self.strip())
 
     def page(self) -> str:
-        """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
-        model, stars = self.model, self.stars
-        info, selection = model.info, stars.candidates.columns(stars.held_out)
-        held = np.flatnonzero(selection["part"] == "held out")
-        where = stars.candidates.position[held]
-        shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
-        found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
-        columns = {name: selection[name] for name in ("verdict", "part")}
-        shown = shown[:SHOWN_STARS]
-        kind = type(model.engine.estimator)
-        product = stars.product
-        test = split_stars(product, SPLIT, stars.settings).test
-        row = product["row"][product["field_index"][test]]
-        return quality_page(
-            Quality(
-                name=info.name,
-                image=stars.observation.path.name,
-                method=kind.name,
-                label=kind.look.label,
-                notes=stars.notes,
-                errors=self.table,
-                found=self.found,
-                coverage=self._coverage,
-                faint=self._faint,
-                degraded={name: found[name][row] for name in ("x", "y", "flux")},
-                stars=found | columns,
-                residual=residual / found["noise"][shown, None, None],
-                bright=psf[shown] + residual,
-                strip=self.strip_png,
-                field=None if stars.observation.positions is None else _map(found, psf, stars),
-                facts=facts_of(model.engine.estimator),
-            )
-        )
+        """Return the HTML of the page; the PSFs of all stars of the image are predicted for it."""
+        model, stars, product = self.model, self.stars, self.stars.product
+        selection = stars.candidates.columns(stars.held_out)
+        # Eight held-out stars, evenly over the field, show their residuals.
+        held_out = np.flatnonzero(selection["part"] == "held out")
+        shown = held_out[_evenly_spread(stars.candidates.position[held_out], 8)]
+        columns, psf, residuals = _predict_all(model, stars, shown)
+        # Stamps without sky are the PSF plus its residual; σ is the noise of the sky.
+        residual_figure = None
+        if len(shown):
+            sigma = columns["noise"][shown, None, None]
+            residual_figure = residual_strip(psf[shown] + residuals, residuals / sigma)
+        # The map has the PSFs of bright stars whose stamps do not overlap.
+        field_map = None
+        if stars.observation.positions is not None:
+            names = FieldStars.__dataclass_fields__
+            field_stars = FieldStars(**{name: columns[name] for name in names})
+            field_psf = psf[field_stars.stamp_stars()]
+            field_map = psf_map(field_psf, field_stars, stars.observation.path.name)
+        columns |= {name: selection[name] for name in ("verdict", "part")}
+        # Row of the prediction for each held-out image; a star has several images.
+        degraded_rows = product["row"][product["field_index"][stars.split.test]]
+        return quality_page(self, columns, degraded_rows, field_map, residual_figure)
 
 
-def _one_of_each(star: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """An image each of stars that lie evenly over the field."""
-    stars, first = np.unique(star, return_index=True)
-    if not np.isfinite(position[stars]).all():
-        return first[:STRIP_STARS]
-    return np.asarray(first[spread_stars(position[stars], STRIP_STARS)])
+def _evenly_spread(position: np.ndarray, count: int) -> np.ndarray:
+    """Return indices of at most `count` stars, evenly over the field if positions (n, 2) are known.
+
+    Where one is NaN, they are the first stars.
+    """
+    if not np.isfinite(position).all():
+        return np.arange(min(count, len(position)))
+    return spread_stars(position, count)
 
 
-def _all_stars(
-    model: PsfModel, stars: Stars, kept: np.ndarray
+def _predict_all(
+    model: PsfModel, stars: Stars, shown: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Columns and PSFs of all stars of an image, and the residuals of those that are kept."""
+    """Predict all N stars of the images batch by batch, and keep the residuals of few.
+
+    Parameters
+    ----------
+    model : PsfModel
+    stars : Stars
+    shown : ndarray of int, shape (k,)
+        Numbers of the stars whose residuals are kept.
+
+    Returns
+    -------
+    columns : dict of str to ndarray, shape (N,)
+    psf : ndarray, shape (N, d, d)
+    residuals : ndarray, shape (k, d, d)
+    """
     columns: dict[str, list[np.ndarray]] = {}
-    psf, residual, done = [], [], 0
-    of_images = (
-        model.stream(part.observation.with_margin(MARGIN_PX), threads=1) for part in stars.each
+    psfs, residuals, count = [], [], 0
+    streams = (
+        model.stream(image.observation.with_margin(model.margin_px), threads=1)
+        for image in stars.images
     )
-    for _, found in itertools.chain.from_iterable(of_images):
-        for name, values in found.columns().items():
+    # Batches of a stream: columns and PSFs are joined, residuals are kept for few stars only.
+    for _, prediction in itertools.chain.from_iterable(streams):
+        for name, values in prediction.columns().items():
             columns.setdefault(name, []).append(values)
-        psf.append(found.psf)
-        inside = kept[(kept >= done) & (kept < done + len(found))] - done
-        residual.append((inside + done, found.residual[inside]))
-        done += len(found)
-    order = np.argsort(np.argsort(kept))
-    rows = np.concatenate([images for _, images in residual])[order]
+        psfs.append(prediction.psf)
+        in_batch = (shown >= count) & (shown < count + len(prediction))
+        residuals.append(prediction.residual[shown[in_batch] - count])
+        count += len(prediction)
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     joined["flags"] = joined["flags"].astype(int)
-    return joined, np.concatenate(psf), rows
-
-
-def _map(found: Mapping[str, np.ndarray], psf: np.ndarray, stars: Stars) -> Figure:
-    field = FieldStars(**{name: found[name] for name in FieldStars.__dataclass_fields__})
-    drawn, count = len(field.drawable()), len(field.x)
-    title = f"{stars.observation.path.name}: {drawn} of {count} stars"
-    return psf_map(psf[field.chosen()], field, title)
+    return joined, np.concatenate(psfs), np.concatenate(residuals)[np.argsort(np.argsort(shown))]

@@ -318,14 +318,16 @@ def wings_of(
     blocks = []
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
-    even_error = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
+    unit_sigma = float(error.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
+    even_error = uniform_filter(np.square(error / unit_sigma), stamp_px, mode="nearest")
+    even_error = unit_sigma * np.sqrt(even_error)
     for band, tented in tented_light(residual.shape, place, flux, outer, blank):
         used = ~bad[band]
         if earlier is not None:
             off = residual[band] - np.tensordot(earlier.profile, tented, 1)
             used &= np.abs(off) < CLIPPED_SIGMA * error[band]
-        weight = np.where(used, 1.0 / even_error[band], 0.0)
-        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
+        weight = np.where(used, 1.0 / even_error[band].astype(np.float64), 0.0)
+        design = np.concatenate([tented, np.full((1, *weight.shape), unit_sigma)]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
         normal, projection = normal + flat @ flat.T, projection + flat @ data
         square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
@@ -365,13 +367,13 @@ def block_sums(values: np.ndarray, side: int) -> np.ndarray:
     return values
 
 
-class Around(NamedTuple):
-    """Sky, light of wings (h, w), wings and σ of an image beside the models of its stars."""
+class StarSurroundings(NamedTuple):
+    """Sky, light of wings (h, w) and wings of an image beside the models of its stars."""
 
     sky: Sky
-    far: np.ndarray
+    wing_light: np.ndarray
     wings: Wings | None
-    doubt: np.ndarray  # σ of every pixel without models and wings, with what these may be off by
+    sigma: np.ndarray  # σ of every pixel without models and wings, with what these may be off by
 
 
 def around_stars(
@@ -384,7 +386,7 @@ def around_stars(
     outer: np.ndarray,
     stamp_px: int,
     earlier: Wings | None = None,
-) -> Around:
+) -> StarSurroundings:
     """Return wings and sky of an image (h, w), found by turns beside the models of its stars.
 
     A map of the sky takes wings that are wider than its meshes for sky, until these are known.
@@ -400,22 +402,25 @@ def around_stars(
     stamp_px : int
     earlier : Wings, optional
     """
-    sigma, without_stars, stars = (
-        np.hypot(error, FOLLOWED * star_light),
-        image - star_light,
-        (place, flux, outer),
-    )
+    sigma = np.hypot(error, FOLLOWED * star_light)
+    without_stars, stars = image - star_light, (place, flux, outer)
     wings = _wings_beside(without_stars, sky.level, sigma, sky.bad, *stars, stamp_px, earlier)
     light_of_wings = wing_light(image.shape, *stars, wings)
     mapped = np.isfinite(sky.noise_scale)
     sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if mapped else None)
     # The map has the most frequent value of the pixels, which is below the mean where noise is that
     # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
-    remainder = without_stars - sky.level - light_of_wings
-    weight = np.where(sky.bad | (np.abs(remainder) > CLIPPED_SIGMA * sigma), 0.0, sigma**-2.0)
-    even_light = float((weight * remainder).sum() / max(weight.sum(), np.finfo(float).tiny))
+    deviation = (without_stars - sky.level - light_of_wings) / sigma
+    clipped = sky.bad | (np.abs(deviation) > CLIPPED_SIGMA)
+    # Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
+    unit_sigma = float(sigma.mean(dtype=np.float64))
+    weight = np.where(clipped, 0.0, unit_sigma / sigma)
+    deviation *= weight
+    weight *= weight
+    total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
+    even_light = unit_sigma * float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
-    return Around(sky, light_of_wings, wings, np.hypot(sigma, ROUND * light_of_wings))
+    return StarSurroundings(sky, light_of_wings, wings, np.hypot(sigma, ROUND * light_of_wings))
 
 
 def _wings_beside(
@@ -435,8 +440,9 @@ def _wings_beside(
     for turn in range(ROUNDS):
         latest = wings
         if turn:
-            light_of_wings = wing_light(without_stars.shape, place, flux, outer, latest)
-            level = sky_level(np.where(bad, 0.0, without_stars - light_of_wings), bad).level
+            without_light = without_stars - wing_light(bad.shape, place, flux, outer, latest)
+            without_light[bad] = 0.0
+            level = sky_level(without_light, bad).level
         wings = wings_of(without_stars - level, doubt, bad, place, shown, outer, stamp_px, latest)
         if wings is None:
             break
@@ -496,7 +502,8 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     core = np.s_[side:-side, side:-side]
     light, gain = star_light[core], observation.gain
     middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
-    photons = np.maximum(light, 0.0) / gain if gain else 0.0
-    sigma = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
+    # σ² = sky noise² + photons of the stars + (3 % of their light)².
+    photon_sigma = np.sqrt(np.maximum(light, 0.0) / gain) if gain else 0.0
+    sigma = np.hypot(np.hypot(sky.noise, photon_sigma), FOLLOWED * light)
     without_stars = sky.flat + sky.level - light
     return _wings_beside(without_stars, sky.level, sigma, sky.bad, middle, flux, outer, side)

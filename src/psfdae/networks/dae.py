@@ -26,26 +26,11 @@ if TYPE_CHECKING:
     from psfdae.networks.settings import DaeSettings, Train
 
 
-LINEAR_STARS = 1500
-"""Number of training stars that give the start of a network that begins as a linear estimator."""
-
 LINEAR_PX = 24_000
-"""Number of random pixels of these stars to which the last layer of such a network is fitted."""
-
-LINEAR_BLOCK = 100
-"""Number of stars whose sums for this fit are computed at once, which limits the memory."""
-
-DRAWN = 0.1
-"""Part of the random draw in the inner layers of such a network."""
-
-RIDGE = 1e-6
-"""Ridge of this fit over the mean diagonal of its normal matrix: a channel may be all zero."""
+"""Number of random pixels to which the last layer of a network that begins linear is fitted."""
 
 BLOCK_PX = 4
-"""Side of the blocks of pixels that the last layer computes at once."""
-
-MOST_ZERO = 0.5
-"""Part of the validation stars without any output above which a network is dead."""
+"""Side of the blocks of pixels that a layer with one output channel computes at once."""
 
 
 class SingleChannelConv(nn.Conv2d):
@@ -60,8 +45,8 @@ class SingleChannelConv(nn.Conv2d):
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        found: torch.Tensor = _ToOneChannel.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
-        return found
+        output: torch.Tensor = _ToOneChannel.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
+        return output
 
 
 class _ToOneChannel(torch.autograd.Function):
@@ -73,24 +58,28 @@ class _ToOneChannel(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.save_for_backward(x, weight)
         (height, width), side = x.shape[-2:], weight.shape[-1]
-        wide = side + BLOCK_PX - 1
+        # All pixels of a block together see s + BLOCK_PX − 1 pixels along an axis. The kernel of
+        # one of them is the weight, shifted within a window of that side; elsewhere it is zero.
+        window_px = side + BLOCK_PX - 1
         padded = nn.functional.pad(weight[0], (BLOCK_PX - 1,) * 4)
         # Window i of the padded weight is that of pixel BLOCK_PX - 1 - i of a block.
-        kernels = padded.unfold(1, wide, 1).unfold(2, wide, 1).flip(1, 2).permute(1, 2, 0, 3, 4)
+        windows = padded.unfold(1, window_px, 1).unfold(2, window_px, 1).flip(1, 2)
+        kernels = windows.permute(1, 2, 0, 3, 4).flatten(0, 1)
+        # Zeros fill up the last blocks of an image whose side is no multiple of theirs.
         if width % BLOCK_PX or height % BLOCK_PX:
             x = nn.functional.pad(x, (0, -width % BLOCK_PX, 0, -height % BLOCK_PX))
-        found = nn.functional.conv2d(
-            x,
-            kernels.flatten(0, 1),
-            bias.expand(BLOCK_PX**2),
-            stride=BLOCK_PX,
-            padding=side // 2,
+        blocks = nn.functional.conv2d(
+            x, kernels, bias.expand(BLOCK_PX**2), stride=BLOCK_PX, padding=side // 2
         )
-        return nn.functional.pixel_shuffle(found, BLOCK_PX)[..., :height, :width]
+        # From BLOCK_PX² channels, one for each pixel of a block, to one channel.
+        return nn.functional.pixel_shuffle(blocks, BLOCK_PX)[..., :height, :width]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        # The adjoint of a correlation with an odd kernel is that with the flipped kernel. The
+        # gradient by the weight is the correlation of images and gradient; both are computed for
+        # exchanged channels, from one to many.
         x, weight = ctx.saved_tensors
         flipped, padding = weight.flip(2, 3).transpose(0, 1), weight.shape[-1] // 2
         by_image = nn.functional.conv2d(grad, flipped, padding=padding)
@@ -112,17 +101,15 @@ class Dae(nn.Module):
     def __init__(self, kernels: Sequence[int], widths: Sequence[int]) -> None:
         super().__init__()
         self.kernels, self.widths = tuple(kernels), tuple(widths)
-        channels = [1, *widths, 1]
-        self.layers = nn.ModuleList(
-            (nn.Conv2d if outer > 1 else SingleChannelConv)(
-                inner, outer, kernel, padding=kernel // 2
-            )
-            for (inner, outer), kernel in zip(pairwise(channels), kernels, strict=True)
-        )
+        self.layers = nn.ModuleList()
+        channels = pairwise([1, *widths, 1])
+        for (inputs, outputs), kernel in zip(channels, kernels, strict=True):
+            layer_class = nn.Conv2d if outputs > 1 else SingleChannelConv
+            self.layers.append(layer_class(inputs, outputs, kernel, padding=kernel // 2))
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
-        """The layers; torch's list holds modules of any kind."""
+        """Layers as convolutions; the type of torch's list is that of any modules."""
         return [layer for layer in self.layers if isinstance(layer, nn.Conv2d)]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -138,10 +125,22 @@ def build_dae(
     init: Literal["linear", "he", "default"],
     generator: torch.Generator,
 ) -> Dae:
-    """A fresh network whose weights come from `generator` alone.
+    """Return a fresh network whose weights come from `generator` alone.
 
-    `he` and `linear` draw N(0, 2/fan_in) with zero biases (He et al. 2015), `linear` for
-    `begin_linear` to go on; `default` is PyTorch's uniform ±1/√fan_in for weights and biases.
+    Parameters
+    ----------
+    kernels, widths : sequences of int
+        Kernel sizes and channels, as in `Dae`.
+    init : "linear", "he" or "default"
+        "he" and "linear" draw N(0, 2/fan_in) with zero biases (He et al. 2015, arXiv:1502.01852);
+        `begin_linear` then changes the latter. "default" is PyTorch's uniform distribution
+        between ±1/√fan_in for weights and biases.
+    generator : torch.Generator
+
+    Returns
+    -------
+    Dae
+        With the weights in the order in memory that makes convolutions fastest.
     """
     model = channels_last(Dae(kernels, widths))
     with torch.no_grad():
@@ -161,22 +160,24 @@ def build_dae(
 def begin_linear(
     model: Dae, noisy: np.ndarray, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
 ) -> None:
-    """Turn a freshly drawn network into a linear estimator, about the best of its kernels.
+    """Turn a freshly drawn network into about the best linear estimator that its kernels allow.
 
-    The first layer looks at the pixel itself and at the leading eigenpatches of the stars, each
-    with both signs, so that nothing is lost in the ReLU. Inner layers hand each channel on, with
-    a little of what they drew. The last layer is least squares from there to the references.
+    A training from there needs fewer epochs than one from random weights. The first layer projects
+    on the pixel itself and on the leading eigenpatches of the stars, each with both signs, because
+    the ReLU keeps the positive part alone: v = ReLU(v) − ReLU(−v). Inner layers copy each channel,
+    with a tenth of the random draw, so that their channels differ. The last layer is the least
+    squares solution from there to the references.
 
     Parameters
     ----------
     model : Dae
-        As `build_dae` gives it.
+        Network of `build_dae`; its weights are changed in place.
     noisy, references : ndarray, shape (n, d, d)
-        Images as the network sees them, and what is to come of them.
+        Images as the network sees them, and the noise-free images that it is to return.
     weight : ndarray, shape (n,)
-        Of each star in the sum of squares.
+        Weight of each star in the sum of squares.
     pixels : ndarray of int, shape (n, m)
-        Pixels of each star, counted along its rows, that the sum of squares takes.
+        Pixels of each star, counted along its rows, that enter the sum of squares.
 
     Raises
     ------
@@ -185,16 +186,22 @@ def begin_linear(
     """
     if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
         raise TrainingError("training stars that are not finite")
-    first, *inner, _ = model.convolutions
+    first, *inner_layers, _ = model.convolutions
     images = torch.from_numpy(noisy[:, None])
-    axes = _eigenpatches(images, first.kernel_size[0])
-    own = torch.zeros_like(axes[:, :1])
-    own[len(own) // 2] = 1.0
-    pairs = torch.cat([own, axes], dim=1).T[: len(first.weight) // 2]
-    seen = torch.stack([pairs, -pairs], dim=1).flatten(0, 1)
-    first.weight[: len(seen)] = seen.view(-1, 1, *first.kernel_size)
-    for layer in inner:
-        layer.weight *= DRAWN
+    # Eigenvectors of Σ p pᵀ over all patches p of the size of the kernel, the leading one first.
+    # The patches have no name, so that only one copy of them is in memory at a time.
+    side = first.kernel_size[0]
+    flat = nn.functional.unfold(images, side, padding=side // 2).transpose(1, 2).flatten(0, 1)
+    eigenpatches = torch.linalg.eigh(flat.T @ flat).eigenvectors.flip(1)
+    del flat
+    # Pairs of kernels with opposite signs: the pixel itself, then eigenpatches while channels last.
+    identity = torch.zeros_like(eigenpatches[:, :1])
+    identity[len(identity) // 2] = 1.0
+    patches = torch.cat([identity, eigenpatches], dim=1).T[: len(first.weight) // 2]
+    kernels = torch.stack([patches, -patches], dim=1).flatten(0, 1)
+    first.weight[: len(kernels)] = kernels.view(-1, 1, *first.kernel_size)
+    for layer in inner_layers:
+        layer.weight *= 0.1
         middle = layer.kernel_size[0] // 2
         for channel in range(min(layer.in_channels, layer.out_channels)):
             layer.weight[channel, channel, middle, middle] += 1.0
@@ -202,23 +209,38 @@ def begin_linear(
 
 
 def _fit_last_layer(
-    model: Dae,
-    images: torch.Tensor,
-    references: np.ndarray,
-    weight: np.ndarray,
-    pixels: np.ndarray,
+    model: Dae, images: torch.Tensor, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
 ) -> None:
-    """Least squares from what the last layer sees of images (n, 1, d, d) to references (n, d²)."""
-    *others, last = model.convolutions
-    (final, bias), side = last.parameters(), last.kernel_size[0]
-    size = final.numel() + 1
-    normal, right = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size).double()
+    """Fit the weights and the bias of the last layer to the references by least squares.
+
+    Minimises Σ w (aᵀ x − y)² over the chosen pixels of all stars: x are the values that the last
+    layer sees of a pixel and a 1 for the bias, y is the reference, w the weight of the star.
+
+    Parameters
+    ----------
+    model : Dae
+        Network whose other layers are set; the last one is changed in place.
+    images : torch.Tensor, shape (n, 1, d, d)
+        Images as the network sees them.
+    references : ndarray, shape (n, d²)
+        Noise-free images.
+    weight, pixels : ndarray
+        As in `begin_linear`.
+    """
+    *leading_layers, last = model.convolutions
+    (last_weight, bias), side = last.parameters(), last.kernel_size[0]
+    # Normal equations (Σ w x xᵀ) a = Σ w x y. Rows are multiplied by √w.
+    size = last_weight.numel() + 1
+    normal_matrix = torch.zeros(size, size, dtype=torch.float64)
+    normal_vector = torch.zeros(size).double()
     root = torch.from_numpy(np.sqrt(weight / weight.mean()).astype(np.float32))[:, None]
-    for start in range(0, len(images), LINEAR_BLOCK):
-        block = slice(start, start + LINEAR_BLOCK)
+    # In blocks of 100 stars, because patches take much memory.
+    for start in range(0, len(images), 100):
+        block = slice(start, start + 100)
         x = images[block].to(memory_format=torch.channels_last)
-        for layer in others:
+        for layer in leading_layers:
             x = torch.relu(layer(x))
+        # Patches about all pixels, then those of the chosen pixels, with 1 for the bias.
         x = nn.functional.pad(x, (side // 2,) * 4).unfold(2, side, 1).unfold(3, side, 1)
         row, column = np.divmod(pixels[block], x.shape[3])
         x = x[np.arange(len(x))[:, None], :, row, column].flatten(2)
@@ -226,38 +248,36 @@ def _fit_last_layer(
         x = x.flatten(0, 1)
         y = torch.from_numpy(np.take_along_axis(references[block], pixels[block], axis=1))
         y = y * root[block]
-        normal += (x.T @ x).double()
-        right += (x.T @ y.flatten()).double()
-    normal += RIDGE * normal.diagonal().mean() * torch.eye(size, dtype=torch.float64)
-    solved = torch.linalg.solve(normal, right).float()
-    final.copy_(solved[:-1].view_as(final))
-    bias.copy_(solved[-1:])
-
-
-def _eigenpatches(images: torch.Tensor, side: int) -> torch.Tensor:
-    """Eigenvectors, columns, of the products of what a kernel sees, the leading one first."""
-    # Without names, so that only one copy of the patches is there at the end.
-    flat = nn.functional.unfold(images, side, padding=side // 2).transpose(1, 2).flatten(0, 1)
-    axes: torch.Tensor = torch.linalg.eigh(flat.T @ flat).eigenvectors
-    return axes.flip(1)
+        normal_matrix += (x.T @ x).double()
+        normal_vector += (x.T @ y.flatten()).double()
+    # A small ridge, because the matrix is singular if a channel is zero for all stars.
+    ridge = 1e-6 * normal_matrix.diagonal().mean()
+    normal_matrix += ridge * torch.eye(size, dtype=torch.float64)
+    solution = torch.linalg.solve(normal_matrix, normal_vector).float()
+    last_weight.copy_(solution[:-1].view_as(last_weight))
+    bias.copy_(solution[-1:])
 
 
 def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
-    """Factor between flux-normalised images (sum 1) and what the network sees."""
+    """Return the factor from images of sum 1 to those that the network sees.
+
+    "mean" is d² for stamps of d × d pixels, which makes their mean 1; "none" is 1.
+    """
     return float(stamp_px**2) if scale == "mean" else 1.0
 
 
 def middle_px(stamp_px: int, part: float, reference: str) -> int:
-    """Side of the middle of stamps that a training sees, as even or odd as theirs.
+    """Return the side of the middle of stamps that a training sees, in px.
 
-    Most of a star's light is there, and all that a convolution has to learn but the border.
+    Most of a star's light is there, and all that a convolution has to learn but the border. The
+    side is even if that of the stamps is, and odd if that is odd, so that the middle stays.
 
     Parameters
     ----------
     stamp_px : int
         Side of the stamps.
     part : float
-        Number of the epoch, from 0, over that of the epochs that see the middle alone.
+        Index of the epoch, from 0, over the number of epochs that see the middle alone.
     reference : str
         "realisation": half of the side at first, then more and more, and whole stamps from 1 on. A
         "template" depends on more of the stamp: three quarters of the side, and whole stamps from
@@ -272,11 +292,12 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
 
 @torch.inference_mode()
 def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> np.ndarray:
-    """PSFs of noisy star images.
+    """Estimate the PSFs of noisy star images.
 
     Parameters
     ----------
     model : Dae
+        The network.
     noisy : ndarray, shape (n, d, d)
         Flux-normalised images.
     factor : float
@@ -287,15 +308,15 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
     Returns
     -------
     ndarray, shape (n, d, d), float32
-        Neither clipped nor renormalised.
+        PSFs of about sum 1, neither clipped nor renormalised.
     """
     model.eval()
-    out = np.empty(noisy.shape, dtype=np.float32)
+    psf = np.empty(noisy.shape, dtype=np.float32)
     for start in range(0, len(noisy), batch):
         images = torch.from_numpy(np.ascontiguousarray(noisy[start : start + batch], np.float32))
         scaled = (images[:, None] * factor).to(memory_format=torch.channels_last)
-        out[start : start + batch] = (model(scaled)[:, 0] / factor).numpy()
-    return out
+        psf[start : start + batch] = (model(scaled)[:, 0] / factor).numpy()
+    return psf
 
 
 class DaeTraining(Training):
@@ -303,6 +324,19 @@ class DaeTraining(Training):
 
     It may begin with the middle of the stamps, where an epoch takes less time. The history
     has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
+
+    Parameters
+    ----------
+    data : TrainingSet
+        Stars with their references, and the network to go on from if there is one.
+    dae : DaeSettings
+        Shape of the network and its initial weights.
+    settings : Train
+        Course of the training.
+    seed : int
+        Seed of all random streams.
+    attempt : int
+        Number of restarts after a dead network.
     """
 
     model: Dae
@@ -312,7 +346,8 @@ class DaeTraining(Training):
         self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
     ) -> None:
         self.data, self.seed = data, seed
-        torch.set_num_threads(settings.threads)  # of the linear start, too, and its last digits
+        # The last digits of the linear start depend on the number of threads, too.
+        torch.set_num_threads(settings.threads)
         self.factor = image_scale(dae.scale, data.images.shape[-1])
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
@@ -321,16 +356,18 @@ class DaeTraining(Training):
             start: Any = data.start  # a `psfdae.methods.dae.Dae`, of a layer above this one
             model.load_state_dict(start.network.state_dict())
         elif dae.init == "linear":
+            # 1500 noisy stars, and about LINEAR_PX random pixels of them, are enough for a start
+            # from which the training goes on.
             rng = stream(seed, "dae", "linear", attempt)
-            stars = rng.permutation(data.fit)[:LINEAR_STARS]
+            stars = rng.permutation(data.fit)[:1500]
             noisy, level = data.draw(stars, rng)
-            everywhere = np.tile(np.arange(noisy[0].size), (stars.size, 1))
+            pixels = np.tile(np.arange(noisy[0].size), (stars.size, 1))
             begin_linear(
                 model,
                 noisy * np.float32(self.factor),
                 data.references[stars] * np.float32(self.factor),
                 level**-settings.level_weight,
-                rng.permuted(everywhere, axis=1)[:, : -(-LINEAR_PX // stars.size)],
+                rng.permuted(pixels, axis=1)[:, : -(-LINEAR_PX // stars.size)],
             )
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
@@ -340,24 +377,40 @@ class DaeTraining(Training):
             self.fixed = data.draw(stars, stream(seed, "dae", "fixed noise"))
 
     def begin(self, lr: float) -> torch.optim.Optimizer:
-        """Muon for the weights of the inner layers, Adam for the others; or Adam for all."""
+        """Return the optimiser: Muon for the weights of the inner layers, Adam for the others.
+
+        With the setting "adam", all weights are Adam's. Muon is meant for the matrices between
+        hidden layers, not for the first and the last layer (K. Jordan et al. 2024).
+        """
         if self.settings.optimiser == "adam":
             return torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
-        inner = [layer.weight for layer in self.model.convolutions[1:-1]]
-        others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
-        groups: list[dict[str, Any]] = [{"params": others}, {"params": inner, "orthogonal": True}]
+        matrices = [layer.weight for layer in self.model.convolutions[1:-1]]
+        # By identity, as "in" would compare the values of tensors.
+        by_adam = [p for p in self.model.parameters() if all(p is not w for w in matrices)]
+        groups: list[dict[str, Any]] = [
+            {"params": by_adam},
+            {"params": matrices, "orthogonal": True},
+        ]
         return Muon(groups, lr=lr, fused=True)
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them.
+        """Yield the batches of an epoch, of B stars each.
 
-        The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
+        Yields
+        ------
+        noisy, reference : torch.Tensor, shape (B, 1, d, d)
+            Noisy and noise-free images in the scale of the network, or the middle of them.
+        weight : torch.Tensor, shape (B, 1, 1, 1)
+            Weight of each star's squared error, 1/λ^p of its noise level λ over the mean of this
+            over all levels.
         """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
+        # Pixels that are cut off along each edge of the stamps.
         side = self.data.images.shape[-1]
-        cropped = int(self.settings.crop_epochs * self.settings.epochs)
-        part = epoch / cropped if cropped else 1.0
+        crop_epochs = int(self.settings.crop_epochs * self.settings.epochs)
+        part = epoch / crop_epochs if crop_epochs else 1.0
         edge = (side - middle_px(side, part, self.data.reference)) // 2
+        # Every star once, in random order.
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
             stars = order[start : start + self.settings.batch]
@@ -372,12 +425,19 @@ class DaeTraining(Training):
             yield self._tensor(noisy, edge), self._tensor(references, edge), weighted
 
     def _tensor(self, images: np.ndarray, edge: int) -> torch.Tensor:
-        inner = slice(edge, images.shape[-1] - edge)
-        scaled = torch.from_numpy(images[:, inner, inner])[:, None] * self.factor
+        """Return images (B, d, d) without `edge` pixels on each side, in the network's scale."""
+        middle = slice(edge, images.shape[-1] - edge)
+        scaled = torch.from_numpy(images[:, middle, middle])[:, None] * self.factor
         return scaled.to(memory_format=torch.channels_last)
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Mean squared error, weighted by star."""
+        """Return the weighted mean squared error of a batch.
+
+        Raises
+        ------
+        DeadNetworkError
+            If all outputs are zero, which is looked for every `dead_check_steps` steps.
+        """
         noisy, target, weight = batch
         output: torch.Tensor = self.model(noisy)
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
@@ -385,15 +445,26 @@ class DaeTraining(Training):
         return (weight * (output - target) ** 2).mean()
 
     def validate(self, epoch: int) -> float:
-        """Mean squared error of the validation stars every few epochs and after the last."""
+        """Return the mean squared error of the validation stars, of sum 1.
+
+        It is computed every `validate_every` epochs and after the last one; NaN after others. The
+        noise is the same each time, so that errors of epochs can be compared.
+
+        Raises
+        ------
+        DeadNetworkError
+            If more than half of the outputs are zero.
+        TrainingError
+            If the error is not finite.
+        """
         if epoch % self.settings.validate_every and epoch != self.settings.epochs:
             return float("nan")
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = predict(self.model, noisy, self.factor)
-        zero = 1.0 - estimate.any(axis=(1, 2)).mean()
-        if zero > MOST_ZERO:
-            raise DeadNetworkError(f"{zero:.0%} of the outputs are zero after epoch {epoch}")
+        zero_part = 1.0 - estimate.any(axis=(1, 2)).mean()
+        if zero_part > 0.5:
+            raise DeadNetworkError(f"{zero_part:.0%} of the outputs are zero after epoch {epoch}")
         error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
         if not np.isfinite(error):
             raise TrainingError(
@@ -403,7 +474,7 @@ class DaeTraining(Training):
         return error
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
-        """Row of the history; the learning rate is that at the epoch's end."""
+        """Return a row of the history; the learning rate is that at the epoch's end."""
         return {
             "epoch": epoch,
             "step": epoch * self.steps,
@@ -415,9 +486,10 @@ class DaeTraining(Training):
         }
 
     def finished(self) -> bool:
-        """All epochs are done, or `patience` validations brought nothing better."""
+        """Return True if all epochs are done, or `patience` validations were not better."""
         scores = [row["validation_mse"] for row in self.history]
         scores = [score for score in scores if np.isfinite(score)]
+        # Number of validations since the one with the smallest error.
         stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
         return super().finished() or 0 < self.settings.patience <= stale
 
@@ -431,12 +503,14 @@ def train_dae(
     fingerprint: str,
     report: Callable[[Row], None] = lambda row: None,
 ) -> Training:
-    """A trained denoising autoencoder: `result`, `history`, `attempt` of the training.
+    """Train a denoising autoencoder, and return the training with its `result` and `history`.
 
-    Parameters and errors are those of `train`.
+    Parameters are those of `DaeTraining` and of `train`, which names the errors, too.
     """
-
-    def begin(attempt: int) -> Training:
-        return DaeTraining(data, dae, settings, seed, attempt)
-
-    return train(begin, checkpoint, fingerprint, report, settings.restarts)
+    return train(
+        lambda attempt: DaeTraining(data, dae, settings, seed, attempt),
+        checkpoint,
+        fingerprint,
+        report,
+        settings.restarts,
+    )

@@ -10,7 +10,7 @@ from psfdae.settings import CheckpointSeconds, Count, Group
 
 
 class DaeSettings(Group):
-    """The denoising autoencoder."""
+    """Settings of the denoising autoencoder: kernels, widths, initial weights, scale."""
 
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
         [9, 7, 5, 3, 1, 1, 3, 5, 7, 9],
@@ -30,6 +30,7 @@ class DaeSettings(Group):
 
     @model_validator(mode="after")
     def _shape(self) -> DaeSettings:
+        """Refuse kernels without a middle pixel, and widths that do not fit between kernels."""
         if any(k % 2 == 0 for k in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
         if len(self.widths) != len(self.kernels) - 1:
@@ -41,7 +42,7 @@ class DaeSettings(Group):
 
 
 class Train(Group):
-    """Optimisation of the denoising autoencoder."""
+    """Settings of the optimisation of the denoising autoencoder."""
 
     epochs: Count = Field(24, description="Passes over the training stars")
     batch: Count = Field(32, description="Stars per step")
@@ -49,7 +50,7 @@ class Train(Group):
         6.0e-3, description="Adam's learning rate (its maximum if one-cycle)"
     )
     optimiser: Literal["adam", "muon"] = Field(
-        "muon", description="Of the inner layers' weights; all else is Adam's"
+        "muon", description="Optimiser of the inner layers' weights; all else is Adam's"
     )
     level_weight: Annotated[float, Field(ge=0, le=2)] = Field(
         1.0, description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"

@@ -1,4 +1,4 @@
-"""The training loop of every network: resumable, watched, its best state kept.
+"""The training loop of every network, which can be interrupted and keeps the best state.
 
 An epoch draws its order, noise levels and noise from a stream of its own, so a training that
 resumes after epoch e continues with exactly the numbers of an uninterrupted one.
@@ -29,26 +29,25 @@ from psfdae.networks.weights import load_checkpoint, save_checkpoint
 from psfdae.progress import task
 
 Row = dict[str, float]
-"""An epoch in the history of a training."""
+"""Values of one epoch in the history of a training, by the names of their columns."""
 
-ERRORS = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
-"""Columns of a history that are shown while a training runs."""
+STATE_DICTS = ("model", "optimiser", "scheduler")
+"""Attributes of a training of which a checkpoint holds torch's `state_dict`."""
 
-LEARNING = ("model", "optimiser", "scheduler")
-REACHED = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
-"""Contents of a checkpoint: states of torch's own, and plain values."""
+PLAIN_FIELDS = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
+"""Attributes of a training that a checkpoint holds as they are."""
 
 
 class TrainingError(FitError):
-    """A training cannot go on; the message says why and what to change."""
+    """Failure of a training; the message says why and what to change."""
 
 
 class DeadNetworkError(Error, RuntimeError):
-    """All outputs of the network are zero, or most: no gradient will ever revive it."""
+    """Zero output for all stars, or most: such a network has no gradient that could revive it."""
 
 
 class Muon(torch.optim.Adam):
-    """Adam; matrices of groups marked `orthogonal` take steps along orthogonal matrices.
+    """Adam in which matrices of groups marked `orthogonal` take steps of orthogonal directions.
 
     The momentum of a matrix (out, in) is replaced by the nearest semi-orthogonal matrix, by
     five steps of a Newton–Schulz iteration (K. Jordan et al. 2024, "Muon"), scaled so that
@@ -57,17 +56,22 @@ class Muon(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One step; gradients of the matrices are None afterwards."""
+        """Make one step; gradients of the matrices are None afterwards."""
         for group in self.param_groups:
-            weights, beta = group["params"] if group.get("orthogonal") else (), group["betas"][0]
+            if not group.get("orthogonal"):
+                continue
+            weights, beta = group["params"], group["betas"][0]
             steps = []
             for weight in weights:
                 state = self.state[weight]
                 if not state:  # Adam wants a step in every state that it restores
                     state |= {"step": torch.tensor(0.0), "momentum": torch.zeros_like(weight)}
+                # Nesterov's momentum: m ← β m + (1 − β) g, and the step is along β m + (1 − β) g.
                 momentum = state["momentum"]
                 momentum.lerp_(weight.grad, 1 - beta)
                 steps.append(weight.grad.lerp(momentum, beta).flatten(1))
+            # A semi-orthogonal (m, n) matrix has elements of RMS 1/√max(m, n); Adam's steps have
+            # about 0.2.
             for weight, step in zip(weights, orthogonal(steps), strict=True):
                 scale = 0.2 * max(step.shape) ** 0.5
                 weight.add_(step.view_as(weight), alpha=-group["lr"] * scale)
@@ -76,27 +80,41 @@ class Muon(torch.optim.Adam):
 
 
 def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """About the semi-orthogonal factors of polar decompositions; singular values 0.7 … 1.2.
+    """Return about the semi-orthogonal factors of the polar decompositions of matrices.
 
-    A step multiplies a matrix by a polynomial of its Gram matrix, and that by its square: the
-    small Gram matrices are iterated, all together, and each matrix is multiplied once.
+    The singular values of the results are between 0.7 and 1.2.
+
+    Parameters
+    ----------
+    matrices : sequence of torch.Tensor
+        Matrices of any shapes.
+
+    Returns
+    -------
+    list of torch.Tensor
+        Matrices of the same shapes.
     """
     if not matrices:
         return []
-    wide = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
-    side = max(len(m) for m in wide)
-    gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in wide])
-    one = torch.eye(side).expand_as(gram)
-    product = one
+    # Rows are not more than columns, and singular values not above 1, where the iteration
+    # converges.
+    scaled = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
+    # A Newton–Schulz step is X ← f(G) X with f(G) = a + b G + c G² and the Gram matrix G = X Xᵀ,
+    # so that G ← f G f. Only the small Gram matrices are iterated, all together, padded to one
+    # size; the product of all f then multiplies each matrix once.
+    side = max(len(m) for m in scaled)
+    gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in scaled])
+    identity = torch.eye(side).expand_as(gram)
+    product = identity
     for _ in range(5):
-        factor = 3.4445 * one - 4.7750 * gram + 2.0315 * gram @ gram
+        factor = 3.4445 * identity - 4.7750 * gram + 2.0315 * gram @ gram
         product, gram = factor @ product, factor @ gram @ factor
-    parts = [p[: len(m), : len(m)] @ m for p, m in zip(product, wide, strict=True)]
-    return [p if p.shape == m.shape else p.T for p, m in zip(parts, matrices, strict=True)]
+    results = [p[: len(m), : len(m)] @ m for p, m in zip(product, scaled, strict=True)]
+    return [r if r.shape == m.shape else r.T for r, m in zip(results, matrices, strict=True)]
 
 
 class Course(Protocol):
-    """Settings of every training: learning rate and its schedule, passes, threads."""
+    """Settings that every training has: learning rate and its schedule, epochs, threads."""
 
     @property
     def lr(self) -> float: ...
@@ -111,15 +129,33 @@ class Course(Protocol):
 
 
 class Training(ABC):
-    """One training; a kind of network says what its batches, its loss and its history are.
+    """Training of one network; a subclass defines its batches, its loss and its history.
 
     Parameters
     ----------
-    model, settings
-    steps : batches per epoch
-    attempt : 0 at first; a restart after a dead network counts up
-    key : config group of the settings, for messages
-    rate : learning rate of an epoch, counted from 0, over `settings.lr`, where not one-cycle
+    model : torch.nn.Module
+        The network.
+    settings : Course
+        Learning rate, number of epochs, and so on.
+    steps : int
+        Batches per epoch.
+    attempt : int
+        Number of restarts after a dead network.
+    key : str
+        Config group of the settings, for messages.
+    rate : callable
+        Learning rate of an epoch, counted from 0, over `settings.lr`; one-cycle has its own.
+
+    Attributes
+    ----------
+    history : list of Row
+        A row for each epoch that is done.
+    seconds, cpu_seconds : float
+        Time of these epochs, and that of the processor.
+    best_mse : float
+        Smallest validation error, infinite before any.
+    best_state : dict of str to torch.Tensor
+        Weights of the network with this error.
     """
 
     grad_clip = float("inf")
@@ -138,7 +174,7 @@ class Training(ABC):
         self.optimiser = self.begin(settings.lr)
         self.scheduler: LRScheduler
         if settings.schedule == "onecycle":
-            total = max(settings.epochs * steps, 2)
+            total = max(settings.epochs * steps, 2)  # torch divides by the number less 1
             self.scheduler = OneCycleLR(
                 self.optimiser, settings.lr, total_steps=total, anneal_strategy="linear"
             )
@@ -150,48 +186,75 @@ class Training(ABC):
         self.best_state: dict[str, torch.Tensor] = {}
 
     def begin(self, lr: float) -> torch.optim.Optimizer:
-        """The optimiser."""
+        """Return the optimiser, Adam unless a subclass chooses another one."""
         return torch.optim.Adam(self.model.parameters(), lr=lr)
 
     @abstractmethod
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Batches of an epoch, counted from 0."""
+        """Yield the batches of an epoch, counted from 0."""
 
     @abstractmethod
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Loss of a batch; raises DeadNetworkError."""
+        """Return the loss of a batch; raise DeadNetworkError if all outputs are zero."""
 
     @abstractmethod
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
-        """Row of the history: rate at the epoch's start, mean loss, what `validate` gave."""
+        """Return a row of the history.
+
+        Parameters
+        ----------
+        epoch : int
+            Number of epochs that are done.
+        rate, loss, error : float
+            Learning rate at the epoch's start, mean loss, and result of `validate`.
+        """
 
     def validate(self, epoch: int) -> float:
-        """Mean squared error that chooses the best state; NaN where none is due."""
+        """Return the mean squared error that chooses the best state; NaN if none is due."""
         return float("nan")
 
     def finished(self) -> bool:
+        """Return True if all epochs are done."""
         return len(self.history) >= self.settings.epochs
 
     @property
     def rate(self) -> float:
-        """The present learning rate."""
+        """Learning rate of the next step."""
         return float(self.optimiser.param_groups[0]["lr"])
 
     @property
     def result(self) -> dict[str, torch.Tensor]:
-        """The best state of the network; the last one if nothing validates."""
+        """Weights with the smallest validation error; the last ones without any validation."""
         return self.best_state or self.model.state_dict()
 
     def run_epoch(self) -> Row:
-        """One pass over the training data; raises TrainingError and DeadNetworkError."""
+        """Train for one pass over the data, and return its row of the history.
+
+        Raises
+        ------
+        TrainingError
+            If the loss or its gradient is not finite.
+        DeadNetworkError
+            If the outputs of the network are zero.
+        """
         started, started_cpu = time.monotonic(), time.process_time()
         epoch, rate = len(self.history), self.rate
         losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
-            losses.append(self._step(batch, epoch * self.steps + len(losses)))
+            step = epoch * self.steps + len(losses)
+            loss = self.loss(batch, step)
+            losses.append(self._finite("loss", loss, step))
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            # Clipping returns the norm before it.
+            norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
+            self._finite("gradient's norm", norm, step)
+            self.optimiser.step()
+            self.scheduler.step()
         error = self.validate(epoch + 1)
         if error < self.best_mse:
+            # A copy, because the next steps change the weights in place.
             self.best_mse = error
             self.best_state = {
                 key: value.detach().clone(memory_format=torch.contiguous_format)
@@ -202,35 +265,26 @@ class Training(ABC):
         self.history.append(self.row(epoch + 1, rate, float(np.mean(losses)), error))
         return self.history[-1]
 
-    def _step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
-        loss = self.loss(batch, step)
-        value = self._finite("loss", loss.item(), step)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
-        self._finite("gradient's norm", norm.item(), step)
-        self.optimiser.step()
-        self.scheduler.step()
-        return value
-
-    def _finite(self, what: str, value: float, step: int) -> float:
+    def _finite(self, quantity: str, tensor: torch.Tensor, step: int) -> float:
+        """Return the value of a tensor of one element; raise TrainingError if it is not finite."""
+        value = tensor.item()
         if not np.isfinite(value):
             raise TrainingError(
-                f"the {what} is {value} at step {step} (epoch {len(self.history) + 1}): "
+                f"the {quantity} is {value} at step {step} (epoch {len(self.history) + 1}): "
                 f"lower {self.key}.lr = {self.settings.lr}"
             )
         return value
 
     def state(self) -> dict[str, Any]:
-        """Everything that `restore` needs, as tensors and plain values."""
-        state = {name: getattr(self, name).state_dict() for name in LEARNING}
-        return state | {name: getattr(self, name) for name in REACHED}
+        """Return all that `restore` needs, as tensors and plain values."""
+        state = {name: getattr(self, name).state_dict() for name in STATE_DICTS}
+        return state | {name: getattr(self, name) for name in PLAIN_FIELDS}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
-        for name in LEARNING:
+        """Continue from a result of `state`."""
+        for name in STATE_DICTS:
             getattr(self, name).load_state_dict(state[name])
-        for name in REACHED:
+        for name in PLAIN_FIELDS:
             setattr(self, name, state[name])
 
 
@@ -241,22 +295,32 @@ def train(
     report: Callable[[Row], None] = lambda row: None,
     restarts: int = 0,
 ) -> Training:
-    """Train, restart if the network dies, resume from a checkpoint if there is one.
+    """Train a network; restart if it dies, and resume from a checkpoint if there is one.
 
     Parameters
     ----------
     begin : callable
-        From the number of an attempt to its training.
+        Makes the training of an attempt from its number.
     checkpoint : Path
-        Where the state is kept; the caller removes it once the result is safe.
+        File of the state; the caller removes it when the result is written.
     fingerprint : str
-        Identifies configuration and data; a checkpoint of another one is ignored.
-    report : called with the history's row after each epoch
-    restarts : attempts after the first
+        Hash of configuration and data; a checkpoint with another one is ignored.
+    report : callable
+        Takes the row of the history after each epoch.
+    restarts : int
+        Attempts after the first.
 
-    Raises TrainingError if something is not finite, or if every attempt died.
+    Returns
+    -------
+    Training
+        The finished training.
+
+    Raises
+    ------
+    TrainingError
+        If something is not finite, or if every attempt died.
     """
-    saved, listening = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
+    saved, log_epoch = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
     for attempt in range(saved["attempt"] if saved else 0, restarts + 1):
         training = begin(attempt)
         torch.set_num_threads(training.settings.threads)
@@ -268,7 +332,7 @@ def train(
             while not training.finished():
                 row = training.run_epoch()
                 report(row)
-                listening(row)
+                log_epoch(row)
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
@@ -282,22 +346,22 @@ def train(
 
 
 def listener(checkpoint: Path) -> Callable[[Row], None]:
-    """Return what is called after each epoch beside the log, or a function that does nothing.
+    """Return a function that logs each epoch elsewhere, such as in MLflow, or that does nothing.
 
-    The environment variable PSFDAE_EPOCHS names it as "module:function": the function takes the
-    checkpoint of the training and returns what takes the row of the history.
+    The environment variable PSFDAE_EPOCHS names a function as "module:function". It takes the path
+    of the checkpoint, and returns the function that takes the row of the history of each epoch.
     """
     module, _, function = os.environ.get("PSFDAE_EPOCHS", "").partition(":")
     if not function:
         return lambda row: None
-    # By name: what listens decides no result, so it is no part of the code of a stage.
-    heard: Callable[[Row], None] = getattr(import_module(module), function)(checkpoint)
-    return heard
+    # By name, because a log decides no result: a change of its code must not repeat trainings.
+    log_epoch: Callable[[Row], None] = getattr(import_module(module), function)(checkpoint)
+    return log_epoch
 
 
-def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
-    """Hash of what a training sees, and of the settings that decide its result."""
-    digest = hashlib.sha256(json.dumps(deciding, sort_keys=True).encode())
+def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
+    """Return the SHA-256 of the data of a training and of the settings that decide its result."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -305,18 +369,25 @@ def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
 
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
-    """Give the function that a training calls after each epoch: a bar, in a log a line."""
-    terminal = sys.stderr.isatty()
+    """Provide the function that a training calls after each epoch.
+
+    It shows a progress bar in a terminal, and prints a line otherwise.
+    """
+    headings = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
+    is_terminal = sys.stderr.isatty()
 
     def report(row: Row) -> None:
-        # Not every epoch is validated.
-        known = {key: name for key, name in ERRORS.items() if np.isfinite(row.get(key, np.nan))}
-        errors = [f"{name} {row[key]:.3e}" for key, name in known.items()]
         advance(1)
-        if not terminal:
-            left = row["seconds"] * (epochs / row["epoch"] - 1)
-            time = f"{row['seconds']:.0f} s, about {left:.0f} s left"
-            print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, time, sep="  ", flush=True)
+        if not is_terminal:
+            # Not every epoch is validated, and networks have different losses.
+            errors = [
+                f"{heading} {row[key]:.3e}"
+                for key, heading in headings.items()
+                if np.isfinite(row.get(key, np.nan))
+            ]
+            remaining_s = row["seconds"] * (epochs / row["epoch"] - 1)
+            times = f"{row['seconds']:.0f} s, about {remaining_s:.0f} s left"
+            print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, times, sep="  ", flush=True)
 
     with task("training", epochs) as advance:
         yield report

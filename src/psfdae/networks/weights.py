@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 Network = TypeVar("Network", bound="Module")
 
-ABOUT = "psfdae"
-"""The one key of the metadata: safetensors would write several in random order."""
+METADATA_KEY = "psfdae"
+"""Only key of the metadata of a file of weights: safetensors writes several in random order."""
 
-MAGIC = b"psfdae checkpoint, sha256 "
-"""First bytes of a checkpoint; the checksum of all that follows it comes next."""
+CHECKPOINT_HEADER = b"psfdae checkpoint, sha256 "
+"""First bytes of a checkpoint; the checksum of the content and a line feed follow."""
 
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names, types, shapes and values of arrays, in the order of the names."""
+    """Return the SHA-256 of the names, types, shapes and values of arrays, sorted by name."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name])
@@ -41,51 +41,55 @@ def save_weights(path: Path, state: Mapping[str, Tensor], config: Mapping[str, A
 
     Parameters
     ----------
-    path : path of the safetensors file; replaced atomically
-    state : mapping of name to torch.Tensor
-    config : mapping that JSON can hold
+    path : Path
+        The safetensors file, which is replaced atomically.
+    state : mapping of str to torch.Tensor
+        Tensors by name.
+    config : mapping
+        Settings that decide the weights, as JSON can hold them.
     """
     from safetensors.numpy import save
 
     arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in state.items()}
-    about = json.dumps({"config": config, "sha256": digest_of(arrays)})
+    metadata = json.dumps({"config": config, "sha256": digest_of(arrays)})
     with atomic_path(path) as temporary:
-        # Written by us, so that the file gets the usual permissions.
-        temporary.write_bytes(save(arrays, {ABOUT: about}))
+        # safetensors' own function for files does not give them the usual permissions.
+        temporary.write_bytes(save(arrays, {METADATA_KEY: metadata}))
 
 
 def with_weights(build: Callable[[], Network], path: Path) -> Network:
-    """A network with weights from a file, ready to predict.
+    """Return a network with weights from a file, ready to predict.
 
     Parameters
     ----------
     build : callable
         Makes the network that the file's configuration describes.
     path : Path
+        File of the weights.
 
     Raises
     ------
     ProductError
-        As `load_weights`, and if the tensors are not those of the network. That is
-        found before the network is made, so that a wrong size does not fill the memory.
+        If `load_weights` refuses the file, or if the tensors are not those of the network.
     """
     import torch
 
     state = {name: torch.from_numpy(array) for name, array in load_weights(path).items()}
+    # On the device "meta", a network has shapes, but no memory: a wrong size in the configuration
+    # is refused before it fills the memory.
     try:
         with torch.device("meta"):
-            wanted = {name: value.shape for name, value in build().state_dict().items()}
+            needed = {name: value.shape for name, value in build().state_dict().items()}
     except (RuntimeError, ValueError, TypeError, OverflowError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: its config.yaml describes no network ({line})") from None
-    found = {name: value.shape for name, value in state.items()}
-    for name in sorted(wanted.keys() | found.keys()):
-        if wanted.get(name) != found.get(name):
-            has, needs = (
-                f"{tuple(each[name])}" if name in each else "none" for each in (found, wanted)
-            )
+    for name in sorted(needed.keys() | state.keys()):
+        shape = tuple(state[name].shape) if name in state else "none"
+        needed_shape = tuple(needed[name]) if name in needed else "none"
+        if shape != needed_shape:
             raise ProductError(
-                f"{path}: shape of {name} is {has}, but {needs} in the network of its config.yaml"
+                f"{path}: shape of {name} is {shape}, but {needed_shape} in the network of its "
+                "config.yaml"
             )
     model = channels_last(build())
     model.load_state_dict(state)
@@ -93,16 +97,16 @@ def with_weights(build: Callable[[], Network], path: Path) -> Network:
 
 
 def channels_last(network: Network) -> Network:
-    """The network with its weights in the order in memory in which convolutions are fastest."""
+    """Return the network with weights in the order in memory that makes convolutions fastest."""
     import torch
 
     # torch's own types know this argument of tensors only.
-    moved: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return moved
+    converted: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return converted
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a network by name.
+    """Return the arrays of a network by name.
 
     Raises
     ------
@@ -113,39 +117,52 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
 
     try:
         with safe_open(path, "numpy") as file:
-            about = dict(json.loads((file.metadata() or {}).get(ABOUT, "{}")))
+            metadata = dict(json.loads((file.metadata() or {}).get(METADATA_KEY, "{}")))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
     except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
     # Weights of another program have no checksum, and nothing to compare with.
-    if about.get("sha256", digest_of(arrays)) != digest_of(arrays):
+    if metadata.get("sha256", digest_of(arrays)) != digest_of(arrays):
         raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return arrays
 
 
 def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> None:
-    """Write tensors and plain values with their checksum and the hash of what the training sees."""
+    """Write the state of a training with its checksum and the hash of settings and data.
+
+    Parameters
+    ----------
+    path : Path
+        The checkpoint, which is replaced atomically.
+    fingerprint : str
+        Hash of the settings and the data of the training.
+    state : mapping
+        Tensors and plain values by name.
+    """
     import torch
 
     content = io.BytesIO()
     torch.save({"fingerprint": fingerprint, **state}, content)
     digest = hashlib.sha256(content.getbuffer()).hexdigest().encode()
-    # No product: it changes all the time, and guards itself.
+    # Without a digest beside the file: it changes all the time, and holds its own checksum.
     with atomic_path(path, digest=False) as temporary, temporary.open("wb") as file:
-        file.write(MAGIC + digest + b"\n")
+        file.write(CHECKPOINT_HEADER + digest + b"\n")
         file.write(content.getbuffer())
 
 
 def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The state of an interrupted training; a damaged or another one is ignored, and named."""
+    """Return the state of an interrupted training, or None.
+
+    A checkpoint that is damaged, or of other settings or data, is ignored with a printed line.
+    """
     import torch
 
     if not path.is_file():
         return None
     head, _, content = path.read_bytes().partition(b"\n")
-    if head != MAGIC + hashlib.sha256(content).hexdigest().encode():
+    if head != CHECKPOINT_HEADER + hashlib.sha256(content).hexdigest().encode():
         print(f"{path}: damaged checkpoint ignored (wrong checksum)", flush=True)
         return None
     try:

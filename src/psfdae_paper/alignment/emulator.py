@@ -1,4 +1,4 @@
-"""Stamps of any state, and their derivatives, from those of many states that are there already.
+"""Stamps of any state, and their derivatives, interpolated between those of many known states.
 
 Stamps are a Gaussian process of the state with unknown mean (ordinary kriging; Rasmussen and
 Williams 2006, sections 2.2 and 4.2.1): weighted sums of the stamps of the nearest states, whose
@@ -12,20 +12,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from psfdae_paper.alignment.fisher import CHUNK, stamps_and_slopes
+from psfdae_paper.alignment.fisher import STATES_AT_ONCE, stamps_and_slopes
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel, design_states, mirror_symmetries
 from psfdae_paper.configuration.alignment import Fit
 
-LENGTH = 3.0
-"""Length of the correlation in distances of the farthest neighbour."""
-
-NUGGET = 1e-8
-"""Variance of the rounding of stamps, in that of the process."""
-
 
 class StampEmulator:
-    """Stamps of states and their derivatives, at a small part of the cost of the optics.
+    """Interpolator of stamps and their derivatives, at a small part of the cost of the optics.
 
     Parameters
     ----------
@@ -33,10 +27,10 @@ class StampEmulator:
     operator : AlignmentStamps
         The optics that made the stamps.
     states : ndarray, shape (n, 4)
-        Within ±1 in units of the range. The first `settings.outer_states` are also stretched to
-        between there and `settings.limit`, because nothing can be extrapolated.
+        States within ±1 in units of the range. The first `settings.outer_states` are also stretched
+        to between there and `settings.limit`, because nothing can be extrapolated.
     stamps : ndarray, shape (n, F, d, d)
-        Of these states, noise-free.
+        Noise-free stamps of these states.
     settings : config group `fit`
     """
 
@@ -48,56 +42,81 @@ class StampEmulator:
         stamps: np.ndarray,
         settings: Fit,
     ) -> None:
-        outer = states[: settings.outer_states]
-        reach = np.linspace(1.0, settings.limit, len(outer))[:, None]
-        outer = outer * reach / np.abs(outer).max(axis=1, keepdims=True)
-        self.stamps = np.concatenate([stamps, operator(model(outer))[0]])
+        # States beyond the range: their largest number is stretched to 1 … limit.
+        stretched = states[: settings.outer_states]
+        reach = np.linspace(1.0, settings.limit, len(stretched))[:, None]
+        stretched = stretched * reach / np.abs(stretched).max(axis=1, keepdims=True)
+        self.stamps = np.concatenate([stamps, operator(model(stretched))[0]])
         self.mirrors = mirror_symmetries(stamps.shape[1] - 1)
-        states = np.concatenate([states, outer])
-        every = np.concatenate([mirror.states(states) for mirror in self.mirrors])
-        # States are the nearer the less their stamps differ.
+        states = np.concatenate([states, stretched])
+        mirrored = np.concatenate([mirror.states(states) for mirror in self.mirrors])
+        # States are the nearer the less their stamps differ: with L Lᵀ = Σ ∂p ∂pᵀ over the pixels
+        # of 25 states, the distance of two states is |(t − t')ᵀ L|.
         slopes = stamps_and_slopes(model, operator, design_states())[1]
         changes = np.moveaxis(slopes, 2, 0).reshape(4, -1).astype(np.float64)
         self._metric = np.linalg.cholesky(changes @ changes.T)
-        self._places = every @ self._metric
+        self._places = mirrored @ self._metric
         self._tree = KDTree(self._places)
-        self.neighbours = min(settings.neighbours, len(every))
+        self.neighbours = min(settings.neighbours, len(mirrored))
 
     def __call__(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps (n, F, d, d) of states (n, 4), and their derivatives, (n, F, 4, d, d)."""
+        """Interpolate stamps (n, F, d, d) of states (n, 4), and their derivatives.
+
+        Derivatives have the shape (n, F, 4, d, d).
+        """
         shape = self.stamps.shape[1:]
-        out = np.zeros((len(states), 5, *shape), np.float32)
-        for start in range(0, len(states), CHUNK):
-            chosen, weights = self._weights(states[start : start + CHUNK] @ self._metric)
-            for row, (near, weight) in enumerate(zip(chosen, weights, strict=True), start):
-                which, rows = np.divmod(near, len(self.stamps))
-                for index, mirror in enumerate(self.mirrors):
-                    own = which == index
-                    known = self.stamps[rows[own]].reshape(-1, np.prod(shape))
-                    out[row] += mirror.stamps((weight[:, own] @ known).reshape(5, *shape))
-        return out[:, 0], np.moveaxis(out[:, 1:], 1, 2)
+        sums = np.zeros((len(states), 5, *shape), np.float32)
+        for start in range(0, len(states), STATES_AT_ONCE):
+            places = states[start : start + STATES_AT_ONCE] @ self._metric
+            for row, (neighbour, weight) in enumerate(
+                zip(*self._weights(places), strict=True), start
+            ):
+                # Neighbours by mirror image: each image is mirrored once, as a weighted sum.
+                mirror_number, state_number = np.divmod(neighbour, len(self.stamps))
+                for number, mirror in enumerate(self.mirrors):
+                    in_mirror = mirror_number == number
+                    stamps = self.stamps[state_number[in_mirror]].reshape(-1, np.prod(shape))
+                    weighted_sum = (weight[:, in_mirror] @ stamps).reshape(5, *shape)
+                    sums[row] += mirror.stamps(weighted_sum)
+        return sums[:, 0], np.moveaxis(sums[:, 1:], 1, 2)
 
     def _weights(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Neighbours (n, k) of places (n, 4), their weights and their derivatives, (n, 5, k)."""
-        distance, chosen = self._tree.query(places, self.neighbours)
-        unit = LENGTH * distance[:, -1:, None]
-        away = (places[:, None] - self._places[chosen]) / unit
-        others = (away[:, :, None] - away[:, None]) ** 2
-        known, _ = matern(others.sum(axis=-1))
-        known += NUGGET * np.eye(self.neighbours)
+        """Return neighbours of places (n, 4), and their weights with derivatives by the state.
+
+        Returns
+        -------
+        neighbour : ndarray of int, shape (n, k)
+        weights : ndarray, shape (n, 5, k), float32
+            The weights, then their four derivatives.
+        """
+        distance, neighbour = self._tree.query(places, self.neighbours)
+        # Correlation length: three times the distance of the farthest neighbour.
+        unit = 3.0 * distance[:, -1:, None]
+        away = (places[:, None] - self._places[neighbour]) / unit
+        # Covariance K of the neighbours. The small variance 1e-8 is the rounding of stamps.
+        squares = (away[:, :, None] - away[:, None]) ** 2
+        covariance, _ = matern(squares.sum(axis=-1))
+        covariance += 1e-8 * np.eye(self.neighbours)
+        # Covariance k of place and neighbours, and its derivatives by the place.
         value, slope = matern((away**2).sum(axis=-1))
-        asked = np.stack([value, *np.moveaxis(slope[..., None] * away, 2, 0)], axis=2)
-        solved = np.linalg.solve(known, np.pad(asked, ((0, 0), (0, 0), (0, 1)), constant_values=1))
-        weights, even = solved[..., :5], solved[..., 5:]
-        # Weights sum to 1, their derivatives to 0.
+        to_place = np.stack([value, *np.moveaxis(slope[..., None] * away, 2, 0)], axis=2)
+        # K⁻¹ k, and K⁻¹ 1 in the last column.
+        with_ones = np.pad(to_place, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+        solved = np.linalg.solve(covariance, with_ones)
+        weights, of_ones = solved[..., :5], solved[..., 5:]
+        # The mean is unknown: weights must sum to 1, their derivatives to 0.
         missing = np.eye(5)[0] - weights.sum(axis=1, keepdims=True)
-        weights += even * missing / even.sum(axis=1, keepdims=True)
+        weights += of_ones * missing / of_ones.sum(axis=1, keepdims=True)
+        # From derivatives by the scaled place to those by the state.
         weights[..., 1:] = weights[..., 1:] / unit @ self._metric.T
-        return chosen, np.moveaxis(weights, 1, 2).astype(np.float32)
+        return neighbour, np.moveaxis(weights, 1, 2).astype(np.float32)
 
 
 def matern(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matérn correlation of ν = 5/2 of squared distances r², and its derivative by r²/2."""
+    """Return the Matérn correlation of ν = 5/2 of squared distances, and its derivative by r²/2.
+
+    With r = √5 × distance it is (1 + r + r²/3) e⁻ʳ (Rasmussen and Williams 2006, equation 4.17).
+    """
     r = np.sqrt(5.0 * squares)
-    fall = np.exp(-r)
-    return (1.0 + r + r**2 / 3.0) * fall, -5.0 / 3.0 * (1.0 + r) * fall
+    decay = np.exp(-r)
+    return (1.0 + r + r**2 / 3.0) * decay, -5.0 / 3.0 * (1.0 + r) * decay

@@ -1,8 +1,8 @@
 """Maximum-likelihood fit of a state to the noisy stamps of all fields.
 
-The climb is `psfdae.sensing.climbing`; with the Poisson likelihood of stamps. It knows stamps by a
-function: an emulator takes it most of the way, whose maximum is a part of a standard error
-off; the last step goes by stamps of the optics that made the data.
+Steps are those of `psfdae.sensing.climbing`, with the Poisson likelihood of stamps. Stamps come
+from a function: an emulator takes the fit most of the way, to a maximum that is a part of a
+standard error off; the last step uses stamps of the optics that made the data.
 """
 
 from __future__ import annotations
@@ -24,22 +24,11 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Poisson likelihood of stamps at one noise level λ, known to the fit."""
+    """Poisson likelihood of stamps at one noise level λ, which the fit knows."""
 
     stamps: Stamps
     noise: NoiseModel
     level: float
-
-    def evaluate(
-        self, images: np.ndarray, states: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Deviance (n,), score (n, K) and Fisher matrix (n, K, K) at states (n, K).
-
-        `images`, shape (n, F, d, d), are noisy and normalised by the true flux. K is 4,
-        or more with movable stamps (`psfdae_paper.alignment.fisher`).
-        """
-        stamps, slopes = self.stamps(states)
-        return deviance_and_information(self.noise, self.level, images, stamps, slopes)
 
 
 def fit_states(
@@ -57,14 +46,21 @@ def fit_states(
     images : ndarray, shape (n, F, d, d)
         Noisy stamps, normalised by the true flux.
     start : ndarray, shape (n, K)
-        In units of the range; limited to ± `settings.limit`, as are all parameters.
+        Parameters in units of the range, K = 4, or more with movable stamps
+        (`psfdae_paper.alignment.fisher`); limited to ± `settings.limit`.
     settings : config group `fit`
     """
 
-    def evaluate(some: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        deviance, score, fisher = likelihood.evaluate(images[some], states)
-        return -0.5 * deviance, score, fisher
+    def evaluate(
+        rows: np.ndarray, parameters: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        stamps, slopes = likelihood.stamps(parameters)
+        deviance, score, information = deviance_and_information(
+            likelihood.noise, likelihood.level, images[rows], stamps, slopes
+        )
+        return -0.5 * deviance, score, information
 
+    # A step of s standard errors raises the log-likelihood by s²/2.
     steps = Steps(
         max_steps=settings.iterations,
         min_gain=0.5 * settings.tolerance**2,
@@ -77,28 +73,31 @@ def fit_states(
 
 
 def refit_twins(
-    likelihood: Likelihood, images: np.ndarray, first: Peaks, twins: np.ndarray, settings: Fit
+    likelihood: Likelihood, images: np.ndarray, fit: Peaks, twins: np.ndarray, settings: Fit
 ) -> tuple[Peaks, np.ndarray]:
-    """Fit again from the twins that lie within the limit; keep what is more likely.
+    """Fit again from the twins that lie within the limit; take the more likely of both fits.
 
     Parameters
     ----------
-    likelihood, images, settings : see `fit_states`
-    first : Peaks
+    likelihood, images, settings : as for `fit_states`
+    fit : Peaks
+        Result of the first fit; left unchanged.
     twins : ndarray, shape (n, K)
-        Of their states.
+        Twins of its states.
 
     Returns
     -------
-    Peaks
+    improved : Peaks
         `evaluations` count both fits.
-    tried : ndarray of bool, shape (n,)
+    in_range : ndarray of bool, shape (n,)
+        True where the twin was a starting point.
     """
-    tried = (np.abs(twins) <= settings.limit).all(axis=1)
-    best = deepcopy(first)
-    if tried.any():
-        second = fit_states(likelihood, images[tried], twins[tried], settings)
-        better = second.height > first.height[tried] * (1.0 - ROUNDING)
-        best.overwrite(np.flatnonzero(tried)[better], second, better)
-        best.evaluations[tried] += second.evaluations
-    return best, tried
+    in_range = (np.abs(twins) <= settings.limit).all(axis=1)
+    improved = deepcopy(fit)
+    if in_range.any():
+        twin_fit = fit_states(likelihood, images[in_range], twins[in_range], settings)
+        # Heights are negative: the twin must be higher by more than rounding.
+        is_higher = twin_fit.height > fit.height[in_range] * (1.0 - ROUNDING)
+        improved.overwrite(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
+        improved.evaluations[in_range] += twin_fit.evaluations
+    return improved, in_range

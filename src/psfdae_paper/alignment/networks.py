@@ -1,18 +1,19 @@
-"""Networks from the stamps of all fields to a state: the paper's, and one of ours.
+"""Networks that estimate a state from the stamps of all fields: the paper's, and a faster one.
 
 The paper's (section 3.3) has five convolutions with batch normalisation and leaky ReLU
 after each, and one linear layer. The fields are the channels of the input. Widths, kernels
 and strides are not in the paper's text; the configuration names them.
 
-Ours is a perceptron behind the leading principal components of all stamps together: states
-have four numbers, so that a hundred components hold what the stamps say of them, and stamps
-that always stand at the same place need no convolution. It learns in a seventh of the time.
+The faster one is a perceptron behind the leading principal components of all stamps together:
+states have four numbers, so that a hundred components hold the information of the stamps about
+them, and stamps that are always centred need no convolution. It learns in a seventh of the time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -31,9 +32,6 @@ from psfdae_paper.configuration.alignment import Cnn, NetworkTrain, Perceptron
 PARAMETERS = 4
 """Numbers of a state: decentre x, y and tilt x, y in units of the range."""
 
-EXAMPLES = 1500
-"""States whose stamps, with their mirror images, tell the principal components."""
-
 
 class AlignmentCnn(nn.Module):
     """Regression of a state of misalignment from the stamps of all fields.
@@ -50,6 +48,7 @@ class AlignmentCnn(nn.Module):
 
     def __init__(self, config: Cnn, fields: int, stamp_px: int) -> None:
         super().__init__()
+        # Every stride s divides the side of the images by s, rounded up.
         layers: list[nn.Module] = []
         channels, side = fields, stamp_px
         for width, kernel, step in zip(config.widths, config.kernels, config.strides, strict=True):
@@ -70,13 +69,22 @@ class AlignmentCnn(nn.Module):
 
 
 class AlignmentPerceptron(nn.Module):
-    """The same behind principal components; parameters as for `AlignmentCnn`."""
+    """Regression of a state from principal components; parameters as for `AlignmentCnn`.
+
+    Attributes
+    ----------
+    mean : Tensor, shape (fields · d²,)
+        Mean of the scaled stamps.
+    axes : Tensor, shape (fields · d², K)
+        Principal axes, scaled so that components have variance 1.
+    """
 
     mean: torch.Tensor
     axes: torch.Tensor
 
     def __init__(self, config: Perceptron, fields: int, stamp_px: int) -> None:
         super().__init__()
+        # Buffers belong to the stored network, but no training changes them.
         pixels = fields * stamp_px**2
         self.register_buffer("mean", torch.zeros(pixels))
         self.register_buffer("axes", torch.zeros(pixels, config.components))
@@ -87,32 +95,41 @@ class AlignmentPerceptron(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
-        return self.state_of(self.components(x))
+        return self.states(self.components(x))
 
     def components(self, x: torch.Tensor) -> torch.Tensor:
-        """Principal components (B, K) of scaled stamps."""
+        """Return the principal components (B, K) of scaled stamps."""
         return (x.flatten(1) - self.mean) @ self.axes
 
-    def state_of(self, components: torch.Tensor) -> torch.Tensor:
-        """States (B, 4) of principal components."""
+    def states(self, components: torch.Tensor) -> torch.Tensor:
+        """Map principal components (B, K) to states (B, 4)."""
         states: torch.Tensor = self.linear(self.features(components))
         return states
 
-    def look_at(self, clean: torch.Tensor, seen: torch.Tensor) -> None:
-        """Take the components of noise-free stamps, scaled to variance 1 of those that are seen.
+    def fit_components(self, clean: torch.Tensor, noisy: torch.Tensor) -> None:
+        """Fit the principal axes to noise-free stamps.
 
-        Both are scaled, shape (n, fields, d, d).
+        Parameters
+        ----------
+        clean : Tensor, shape (n, fields, d, d)
+            Scaled stamps without noise.
+        noisy : Tensor, shape (n, fields, d, d)
+            Scaled stamps as the network receives them, whose components get variance 1.
         """
+        # Deviations from the mean stamps, all fields of a state in one row.
         flat = clean.flatten(1)
         self.mean.copy_(flat.mean(dim=0))
         flat = flat - self.mean
         count = self.axes.shape[1]
-        # In double precision: pixels that a DAE leaves empty make the matrix singular.
+        # Leading eigenvectors of the covariance. In double precision: pixels that a DAE leaves
+        # empty make the matrix singular.
         products, last = (flat.T @ flat).double().numpy(), flat.shape[1] - 1
         leading = eigh(products, subset_by_index=[last + 1 - count, last], overwrite_a=True)[1]
+        # The largest eigenvalues are last.
         axes = torch.from_numpy(leading[:, ::-1].astype(np.float32))
-        del flat, products  # seen takes as much memory
-        spread = ((seen.flatten(1) - self.mean) @ axes).std(dim=0)
+        del flat, products  # the noisy stamps take as much memory
+        # An axis divided by the standard deviation of its component gives it the variance 1.
+        spread = ((noisy.flatten(1) - self.mean) @ axes).std(dim=0)
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
 
@@ -120,7 +137,7 @@ Network = AlignmentCnn | AlignmentPerceptron
 
 
 def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Network:
-    """The network of a configuration, its weights still to come."""
+    """Make the network of a configuration, before it has its weights."""
     if isinstance(config, Cnn):
         return AlignmentCnn(config, fields, stamp_px)
     return AlignmentPerceptron(config, fields, stamp_px)
@@ -129,7 +146,7 @@ def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Netwo
 def build_network(
     config: Cnn | Perceptron, fields: int, stamp_px: int, generator: torch.Generator
 ) -> Network:
-    """A fresh network whose weights come from `generator` alone.
+    """Make a fresh network whose weights come from `generator` alone.
 
     Inner layers draw N(0, 2/fan_in) (He et al. 2015), the last one PyTorch's uniform
     ±1/√fan_in; its bias is 0, the middle of the range.
@@ -151,33 +168,46 @@ def build_network(
 
 
 def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: Path) -> Network:
-    """Network of a configuration with weights from a file; raises ProductError."""
+    """Load the network of a configuration with weights from a file; raises ProductError."""
     return with_weights(lambda: empty_network(config, fields, stamp_px), weights)
 
 
-def _scaled(stamps: np.ndarray) -> torch.Tensor:
-    """Flux-normalised stamps as the network sees them, with a mean of 1."""
+def scale_stamps(stamps: np.ndarray) -> torch.Tensor:
+    """Scale flux-normalised stamps to a mean of 1, as the networks receive them."""
     images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32))
-    own = images.to(memory_format=torch.channels_last, copy=True)
-    return own.mul_(float(stamps.shape[-1] ** 2))
+    # A copy: it is scaled in place.
+    images = images.to(memory_format=torch.channels_last, copy=True)
+    return images.mul_(float(stamps.shape[-1] ** 2))
 
 
 @torch.inference_mode()
 def predict_states(
     model: nn.Module, stamps: np.ndarray, batch: int = 256, mirrors: Sequence[Mirror] = ()
 ) -> np.ndarray:
-    """States of flux-normalised stamps (n, fields, d, d), shape (n, 4), float64.
+    """Estimate the states of flux-normalised stamps.
 
-    With mirrors the mean of the estimates from all mirror images of the stamps.
+    Parameters
+    ----------
+    model : Module
+    stamps : ndarray, shape (n, fields, d, d)
+    batch : int
+        States that are estimated together.
+    mirrors : sequence of Mirror
+        If any are given, the mean of the estimates from all these mirror images is returned.
+
+    Returns
+    -------
+    ndarray, shape (n, 4), float64
     """
     model.eval()
     if mirrors:
         # The inverse of an orthogonal matrix is its transpose.
-        each = [predict_states(model, m.stamps(stamps), batch) @ m.state for m in mirrors]
-        mean: np.ndarray = np.mean(each, axis=0)
-        return mean
+        estimates = [
+            predict_states(model, m.stamps(stamps), batch) @ m.state_matrix for m in mirrors
+        ]
+        return np.asarray(np.mean(estimates, axis=0))
     parts = [
-        model(_scaled(stamps[start : start + batch])).numpy()
+        model(scale_stamps(stamps[start : start + batch])).numpy()
         for start in range(0, len(stamps), batch)
     ]
     return np.concatenate(parts).astype(np.float64)
@@ -185,27 +215,27 @@ def predict_states(
 
 @dataclass(frozen=True)
 class MixedNoise:
-    """Noise of random levels λ of a band, by the faster law."""
+    """Noise of random levels λ of a band, drawn from a normal distribution, which is faster."""
 
     noise: NoiseModel
     levels: np.ndarray
 
     def __call__(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Noisy stamps of states, of one level each."""
+        """Draw noisy stamps of states, each state at one level."""
         return self.noise.draw_gaussian(stamps, mixed_levels(self.levels, len(stamps), rng), rng)
 
 
 @dataclass(frozen=True)
 class TrainingStates:
-    """States that a network is trained on.
+    """States on which a network is trained.
 
     Attributes
     ----------
     states : ndarray, shape (n, 4)
     stamps : ndarray, shape (n, F, d, d) or (D, n, F, d, d)
-        Of D draws of a noise, every field shows one at random.
+        Stamps, or D draws of their noise, of which every field shows one at random.
     noise : MixedNoise, optional
-        Is drawn anew for every batch.
+        Noise that is drawn anew for every batch.
     """
 
     states: np.ndarray
@@ -224,7 +254,7 @@ class NetworkTraining(Training):
     network, settings : config groups
     seed : int
     name : str
-        Of the network; part of the address of its random streams.
+        Name of the network; part of the address of its random streams.
     """
 
     settings: NetworkTrain
@@ -240,65 +270,70 @@ class NetworkTraining(Training):
         self.data, self.seed, self.name = data, seed, name
         fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
         self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
+        # First weights, and principal components, from streams of the network's name.
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
         model = build_network(network, fields, side, generator)
         if isinstance(model, AlignmentPerceptron):
-            model.look_at(*self._examples())
-        # A remainder of one state, of which batch normalisation could make nothing, is left out.
-        whole, rest = divmod(len(data.states), settings.batch)
+            model.fit_components(*self._examples())
+        # A last batch of one state, with which batch normalisation could do nothing, is left out.
+        full_batches, remainder = divmod(len(data.states), settings.batch)
         super().__init__(
             model,
             settings,
-            whole + (rest > 1),
+            full_batches + (remainder > 1),
             key=f"train_{name}",
             rate=lambda epoch: settings.decay ** (epoch // settings.decay_epochs),
         )
 
-    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Stamps (B, fields, d, d) and states (B, 4)."""
-        data = self.data
-        rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
-        order = rng.permutation(len(data.states))
+    def _shuffled(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
+        """Yield the numbers of the states of every batch of an epoch."""
+        order = rng.permutation(len(self.data.states))
         for start in range(0, order.size, self.settings.batch)[: self.steps]:
-            chosen = order[start : start + self.settings.batch]
-            images, truth = self._shown(chosen, rng), data.states[chosen]
-            if data.noise is not None:
-                images = data.noise(images, rng)
+            yield order[start : start + self.settings.batch]
+
+    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Yield stamps (B, fields, d, d) and states (B, 4) of every batch of an epoch."""
+        rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
+        for numbers in self._shuffled(rng):
+            # Noise, then a mirror image: all states of a batch are mirrored alike.
+            images, truth = self._draw_stamps(numbers, rng), self.data.states[numbers]
+            if self.data.noise is not None:
+                images = self.data.noise(images, rng)
             if self.mirrors:
                 mirror = self.mirrors[rng.integers(len(self.mirrors))]
                 images, truth = mirror.stamps(images), mirror.states(truth)
-            yield _scaled(images), torch.from_numpy(truth.astype(np.float32))
+            yield scale_stamps(images), torch.from_numpy(truth.astype(np.float32))
 
-    def _shown(self, chosen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Stamps of chosen states, in one of the draws if there are several."""
+    def _draw_stamps(self, numbers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return stamps of the states with these numbers, of a random draw if there are several."""
         stamps = self.data.stamps
-        if stamps.ndim == 5:
-            fields = np.arange(stamps.shape[2])
-            draw = rng.integers(len(stamps), size=(chosen.size, fields.size))
-            shown: np.ndarray = stamps[draw, chosen[:, None], fields]
-        else:
-            shown = stamps[chosen]
-        return shown
+        if stamps.ndim == 4:
+            return np.asarray(stamps[numbers])
+        # Every field of every state has a draw of its own.
+        fields = np.arange(stamps.shape[2])
+        draw = rng.integers(len(stamps), size=(numbers.size, fields.size))
+        return np.asarray(stamps[draw, numbers[:, None], fields])
 
     def _examples(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Stamps in all mirror images, as they are and as the network sees them."""
+        """Return scaled stamps in all mirror images, without noise and as the network sees them."""
         rng = stream(self.seed, "cnn", "examples", self.name)
-        clean = self._shown(rng.permutation(len(self.data.states))[:EXAMPLES], rng)
+        # 1500 states are enough to find the principal components.
+        clean = self._draw_stamps(rng.permutation(len(self.data.states))[:1500], rng)
         if self.mirrors:
             clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
-        scaled = _scaled(clean)
+        scaled = scale_stamps(clean)
         if self.data.noise is None:
             return scaled, scaled
-        return scaled, _scaled(self.data.noise(clean, rng))
+        return scaled, scale_stamps(self.data.noise(clean, rng))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Mean squared error."""
+        """Return the mean squared error of a batch."""
         stamps, states = batch
         return nn.functional.mse_loss(self.model(stamps), states)
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
-        """Row of the history; the learning rate is that at the epoch's start."""
+        """Return a row of the history; the learning rate is that at the epoch's start."""
         return {"epoch": epoch, "lr": rate, "loss": loss, "seconds": round(self.seconds, 3)}
 
 
@@ -312,82 +347,85 @@ class PerceptronTraining(NetworkTraining):
 
     model: AlignmentPerceptron
 
-    def __init__(
-        self,
-        data: TrainingStates,
-        network: Cnn | Perceptron,
-        settings: NetworkTrain,
-        seed: int,
-        name: str,
-    ) -> None:
-        super().__init__(data, network, settings, seed, name)
-        self.parts = self._parts()
-        fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
-        axes = self.model.axes.numpy()
-        stamps = axes.T.reshape(-1, fields, side, side)
-        # (P x)·a = x·(Pᵀ a): of A T = Pᵀ A the same as P A T = A.
-        self.mirrored = [
-            np.linalg.lstsq(mirror.stamps(stamps).reshape(len(stamps), -1).T, axes)[0]
-            for mirror in self.mirrors
-        ]
-        self.roots = self._roots()
+    @cached_property
+    def parts(self) -> np.ndarray:
+        """Part of each field in the components, by draw of its noise, shape (D, n, F, K).
 
-    def _parts(self) -> np.ndarray:
-        """Return the part of each field in the components by draw of its noise, (D, n, F, K)."""
+        Components are sums over all fields: with one draw, F = 1 and the sum is taken once.
+        """
         stamps = self.data.stamps[(None,) * (5 - self.data.stamps.ndim)]
         draws, count, fields, side, _ = stamps.shape
         mean, axes = (
-            a.numpy().reshape(fields, side**2, *a.shape[1:])
-            for a in (self.model.mean, self.model.axes)
+            buffer.numpy().reshape(fields, side**2, *buffer.shape[1:])
+            for buffer in (self.model.mean, self.model.axes)
         )
+        # (x_f − mean_f)·axes_f of every field f; the sum over fields are the components.
         parts = np.empty((draws, count, fields, axes.shape[-1]), np.float32)
         for draw, field in np.ndindex(draws, fields):
-            seen = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
-            parts[draw, :, field] = (seen - mean[field]) @ axes[field]
-        # Of one draw, all fields are always seen together.
+            scaled = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
+            parts[draw, :, field] = (scaled - mean[field]) @ axes[field]
         return parts if draws > 1 else parts.sum(axis=2, keepdims=True)
 
-    def _roots(self) -> list[np.ndarray]:
+    @cached_property
+    def mirrored(self) -> list[np.ndarray]:
+        """Matrix T of each mirror, shape (K, K), from components to those of mirrored stamps.
+
+        With a mirror P of stamps x and axes A, (P x)·A = x·(Pᵀ A). T solves Pᵀ A = A T, which is
+        the same as A = P A T.
+        """
+        fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
+        axes = self.model.axes.numpy()
+        stamps = axes.T.reshape(-1, fields, side, side)
+        return [
+            np.linalg.lstsq(mirror.stamps(stamps).reshape(len(stamps), -1).T, axes)[0]
+            for mirror in self.mirrors
+        ]
+
+    @cached_property
+    def roots(self) -> list[np.ndarray]:
         """R of each λ, shape (K, K), for which RᵀR is the covariance of noise in components."""
         if self.data.noise is None:
             return []
+        # Standard deviation of every pixel of the mean stamps, in their scale of mean 1.
         law, to_mean = self.data.noise.noise, self.data.stamps.shape[-1] ** 2
         mean, axes = (a.double().numpy() for a in (self.model.mean, self.model.axes))
         psf = np.maximum(mean / to_mean, 0.0)
         sigma = [to_mean * np.sqrt(law.variance(psf, level)) for level in self.data.noise.levels]
-        # One array in this mode, which numpy's annotations do not know.
+        # With σ A = Q R the covariance is Aᵀ σ² A = RᵀR. One array in this mode, which numpy's
+        # annotations do not know.
         roots = (np.asarray(np.linalg.qr(s[:, None] * axes, mode="r")) for s in sigma)
         return [root.astype(np.float32) for root in roots]
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Components (B, K) and states (B, 4)."""
+        """Yield components (B, K) and states (B, 4) of every batch of an epoch."""
         draws, _, fields, _ = self.parts.shape
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
-        order = rng.permutation(len(self.data.states))
-        for start in range(0, order.size, self.settings.batch)[: self.steps]:
-            chosen = order[start : start + self.settings.batch]
-            draw = rng.integers(draws, size=(chosen.size, fields))
-            seen = self.parts[draw, chosen[:, None], np.arange(fields)].sum(axis=1)
-            truth = self.data.states[chosen]
+        for numbers in self._shuffled(rng):
+            # As in the base class: a draw for every field, then a mirror image of the batch.
+            draw = rng.integers(draws, size=(numbers.size, fields))
+            components = self.parts[draw, numbers[:, None], np.arange(fields)].sum(axis=1)
+            truth = self.data.states[numbers]
             if self.mirrors:
                 mirror = rng.integers(len(self.mirrors))
-                seen, truth = seen @ self.mirrored[mirror], self.mirrors[mirror].states(truth)
+                components = components @ self.mirrored[mirror]
+                truth = self.mirrors[mirror].states(truth)
+            # Every state has the noise of one λ: white numbers times the root of its covariance.
             if self.roots:
-                white = rng.standard_normal(seen.shape, dtype=np.float32)
-                level = rng.integers(len(self.roots), size=chosen.size)
-                for own, root in enumerate(self.roots):
-                    seen[level == own] += white[level == own] @ root
-            yield torch.from_numpy(seen), torch.from_numpy(truth.astype(np.float32))
+                white = rng.standard_normal(components.shape, dtype=np.float32)
+                level = rng.integers(len(self.roots), size=numbers.size)
+                for number, root in enumerate(self.roots):
+                    components[level == number] += white[level == number] @ root
+            yield torch.from_numpy(components), torch.from_numpy(truth.astype(np.float32))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Mean squared error."""
+        """Return the mean squared error of a batch."""
         components, states = batch
-        return nn.functional.mse_loss(self.model.state_of(components), states)
+        return nn.functional.mse_loss(self.model.states(components), states)
 
 
 def training_of(
     network: Cnn | Perceptron, data: TrainingStates, settings: NetworkTrain, seed: int, name: str
 ) -> NetworkTraining:
-    """The training of a kind of network; arguments as those of `NetworkTraining`."""
+    """Make the training of a kind of network; arguments as those of `NetworkTraining`."""
     kind = NetworkTraining if isinstance(network, Cnn) else PerceptronTraining
     return kind(data, network, settings, seed, name)

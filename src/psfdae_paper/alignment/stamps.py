@@ -34,24 +34,27 @@ class EnergyError(Error, ValueError):
 
 
 def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
-    """Mean gradient (x, y) of Noll polynomial j over an annulus, per pupil radius.
+    """Return the mean gradient (x, y) of Noll polynomial j over an annulus, per pupil radius.
 
-    By the divergence theorem it is an integral along the two rims; only terms
-    with one cycle per turn have one.
+    By the divergence theorem it is an integral along the two rims, which vanishes but for terms
+    with one cycle per turn, |m| = 1.
     """
     n, m = noll_to_nm(j)
     if abs(m) != 1:
         return 0.0, 0.0
-    rim = radial_polynomial(n, m, np.float64(obscuration))  # type: ignore[arg-type]  # at one radius
-    inner = obscuration * float(rim)
-    slope = float(np.sqrt(2.0 * (n + 1.0)) * (1.0 - inner) / (1.0 - obscuration**2))
+    # With Z = √(2(n + 1)) R(r) cos θ, ∮ Z cos θ dl = π √(2(n + 1)) r R(r) along a rim of radius r.
+    # The mean over the annulus of area π (1 − ε²) is the difference of the rims at 1, where R = 1,
+    # and at ε.
+    radial = radial_polynomial(n, m, np.float64(obscuration))  # type: ignore[arg-type]  # one radius
+    inner_rim = obscuration * float(radial)
+    slope = float(np.sqrt(2.0 * (n + 1.0)) * (1.0 - inner_rim) / (1.0 - obscuration**2))
     return (slope, 0.0) if m > 0 else (0.0, slope)
 
 
 def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """OPD in waves of unit Zernike coefficients with their centring tilts, (highest − 3, ...).
+    """Return the OPD of unit Zernike coefficients with their centring tilts, (highest − 3, ...).
 
-    The sign turns the lead of a wavefront, which coefficients count, into an
+    The OPD is in waves. Its sign turns the lead of a wavefront, which coefficients count, into an
     OPD. Stamps are then seen as the detector shows them: columns run along +x
     and rows along +y, the directions of the field angles.
 
@@ -66,13 +69,14 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
     """
     modes = []
     for j in range(FIRST_NOLL, highest + 1):
+        # A wavefront Z moves the centroid by its mean slope s: −Z + s·(x, y) leaves it.
         slope_x, slope_y = mean_slope(j, obscuration)
         modes.append(slope_x * x + slope_y * y - zernike(j, x, y))
     return np.stack(modes)
 
 
 class AlignmentStamps:
-    """Operator from Zernike coefficients to centred stamps and their derivatives.
+    """Operator that turns Zernike coefficients into centred stamps and their derivatives.
 
     Each wavefront uses the smallest grid size that its slopes allow.
     Batches run in `optics.threads` threads; results do not depend on their number.
@@ -97,11 +101,13 @@ class AlignmentStamps:
         self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
         self.movable = movable
+        # Pupil modes whose sum is the OPD of a centred stamp.
         self._modes: PupilModes = partial(
             centred_modes, alignment.highest_zernike, telescope.obscuration
         )
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
+        # Stamps are nearly as wide as the period of the image, which is transformed whole.
         self.propagation = SampledStamps(
             telescope.obscuration,
             self._modes,
@@ -115,12 +121,12 @@ class AlignmentStamps:
         )
 
     def __call__(self, zernikes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flux-normalised stamps.
+        """Propagate flux-normalised stamps.
 
         Parameters
         ----------
         zernikes : ndarray, shape (..., J)
-            Noll 4 … 3 + J in waves.
+            Coefficients Noll 4 … 3 + J in waves.
 
         Returns
         -------
@@ -145,12 +151,12 @@ class AlignmentStamps:
     def derivatives(
         self, zernikes: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Flux-normalised stamps and their derivatives.
+        """Propagate flux-normalised stamps and their derivatives.
 
         Parameters
         ----------
         zernikes : ndarray, shape (..., J)
-            In waves.
+            Coefficients in waves.
         directions : ndarray, shape (..., K, J)
             Changes of the coefficients per unit parameter, such as those of
             `QuadraticModel.jacobian`.
@@ -160,19 +166,24 @@ class AlignmentStamps:
         stamps : ndarray, shape (..., d, d)
             Each sums to 1.
         derivatives : ndarray, shape (..., K, d, d)
-            Per unit parameter; each sums to 0. If stamps are movable, two more follow, by the
-            place of the star along x and y in pixels.
+            Derivatives per unit parameter; each sums to 0. If stamps are movable, two more follow,
+            by the place of the star along x and y in pixels.
 
         Raises
         ------
-        SamplingError, EnergyError
-            As for stamps.
+        SamplingError
+            If the largest grid size is below what a wavefront needs.
+        EnergyError
+            If a stamp holds less than `alignment.least_energy`.
         """
         shape = zernikes.shape[:-1]
+        # An emulator may give all derivatives.
         if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
+        # One list of wavefronts, whatever the leading axes are.
         zernikes, directions = (
-            a.reshape(prod(shape), *a.shape[len(shape) :]) for a in (zernikes, directions)
+            array.reshape(prod(shape), *array.shape[len(shape) :])
+            for array in (zernikes, directions)
         )
         raw = self.propagation.derivatives(zernikes, directions, by_position=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)
@@ -180,12 +191,13 @@ class AlignmentStamps:
         return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])
 
     def _check_energy(self, energy: np.ndarray) -> None:
-        least = self.alignment.least_energy
-        if not energy.min() >= least:
-            worst = int(energy.argmin())
+        """Raise EnergyError if a stamp holds too small a fraction of the light."""
+        minimum = self.alignment.least_energy
+        if not energy.min() >= minimum:
+            darkest = int(energy.argmin())
             raise EnergyError(
-                f"stamp {worst} holds {energy[worst]:.4g} of the light "
-                f"(alignment.least_energy = {least:g}); {int((energy < least).sum())} of "
+                f"stamp {darkest} holds {energy[darkest]:.4g} of the light "
+                f"(alignment.least_energy = {minimum:g}); {int((energy < minimum).sum())} of "
                 f"{energy.size} stamps hold too little: alignment.stamp_px = "
                 f"{self.alignment.stamp_px} is too small for these states"
             )

@@ -33,9 +33,10 @@ DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))
-"""Degrees of freedom of the ten products, in their order."""
+"""Pairs of degrees of freedom whose products are terms of the quadratic model, in their order."""
 
 TERMS = 1 + 4 + len(PAIRS)
+"""Terms of the quadratic model: 1, the four numbers of a state, their ten products."""
 
 
 class ModelError(Error, RuntimeError):
@@ -43,9 +44,9 @@ class ModelError(Error, RuntimeError):
 
 
 def field_points(radius_deg: float, points: int) -> np.ndarray:
-    """The centre of the field and points on a circle, the first on the x axis.
+    """Return the centre of the field and points on a circle, the first on the x axis.
 
-    Field angles (x, y) in radians, shape (1 + points, 2).
+    They are field angles (x, y) in radians, shape (1 + points, 2).
     """
     angle = 2.0 * np.pi * np.arange(points) / points
     circle = np.deg2rad(radius_deg) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -53,17 +54,17 @@ def field_points(radius_deg: float, points: int) -> np.ndarray:
 
 
 def grid_states(levels: int) -> np.ndarray:
-    """All combinations of equidistant levels from −1 to 1, shape (levels⁴, 4)."""
+    """List all combinations of equidistant levels from −1 to 1, shape (levels⁴, 4)."""
     return np.array(list(product(np.linspace(-1.0, 1.0, levels), repeat=4)))
 
 
 def uniform_states(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Random states, uniform within the range, shape (count, 4)."""
+    """Draw random states, uniform within the range, shape (count, 4)."""
     return rng.uniform(-1.0, 1.0, size=(count, 4))
 
 
 def design_states() -> np.ndarray:
-    """States for the fit, a central composite design: corners, axes, centre; shape (25, 4)."""
+    """List the states of a central composite design: centre, axes and corners, shape (25, 4)."""
     return np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4), grid_states(2)])
 
 
@@ -121,52 +122,55 @@ class Mirror:
     Attributes
     ----------
     symmetry : Symmetry
-        Of a stamp, whose rows run along y.
-    state : ndarray, shape (4, 4)
+        Symmetry of a stamp, whose rows run along y.
+    state_matrix : ndarray, shape (4, 4)
         Signed permutation of the four numbers of a state.
     fields : ndarray of int, shape (F,)
         The mirrored telescope's stamp at field k is that of field `fields[k]`.
     """
 
     symmetry: Symmetry
-    state: np.ndarray
+    state_matrix: np.ndarray
     fields: np.ndarray
 
     def states(self, states: np.ndarray) -> np.ndarray:
-        """Mirrored states, shape (n, 4)."""
-        mirrored: np.ndarray = states @ self.state.T
-        return mirrored
+        """Mirror states, shape (n, 4)."""
+        return np.asarray(states @ self.state_matrix.T)
 
     def stamps(self, stamps: np.ndarray) -> np.ndarray:
-        """Stamps of the mirrored states, shape (n, F, d, d)."""
+        """Return the stamps of the mirrored states, shape (n, F, d, d)."""
         return self.symmetry.image(stamps[:, self.fields])
 
 
 def mirror_symmetries(points: int) -> list[Mirror]:
-    """The identity and the other symmetries that map `field_points` on themselves.
+    """List the symmetries that map `field_points` on themselves, the identity first.
 
-    Eight, fewer if the number of points on the circle is not a multiple of 4.
+    They are eight, fewer if the number of points on the circle is not a multiple of 4.
     """
+    # Any radius will do: symmetries depend on the angles of the points alone.
     fields, mirrors = field_points(45.0, points), []
     for symmetry in SYMMETRIES:
         matrix = symmetry.matrix
         # The mirrored telescope shows at p what the telescope shows at matrix⁻¹ p.
         distance = np.linalg.norm((fields @ matrix)[:, None] - fields, axis=2)
         if distance.min(axis=1).max() < 1e-9:  # no field point maps between two
-            state = np.zeros((4, 4))
-            state[:2, :2], state[2:, 2:] = matrix, np.round(np.linalg.det(matrix)) * matrix
-            mirrors.append(Mirror(symmetry, state, distance.argmin(axis=1)))
+            # A decentre moves as a vector, a tilt as an axial vector: with the determinant ±1.
+            state_matrix = np.zeros((4, 4))
+            state_matrix[:2, :2] = matrix
+            state_matrix[2:, 2:] = np.round(np.linalg.det(matrix)) * matrix
+            mirrors.append(Mirror(symmetry, state_matrix, distance.argmin(axis=1)))
     return mirrors
 
 
 def quadratic_terms(states: np.ndarray) -> np.ndarray:
-    """1, the four numbers of states (n, 4) and their ten products, shape (n, 15)."""
+    """Return 1, the four numbers of states (n, 4) and their ten products, shape (n, 15)."""
     products = [states[:, a] * states[:, b] for a, b in PAIRS]
     return np.column_stack([np.ones(len(states)), states, *products])
 
 
 def term_slopes(states: np.ndarray) -> np.ndarray:
-    """Derivatives of `quadratic_terms` by the four numbers, shape (n, 4, 15)."""
+    """Return the derivatives of `quadratic_terms` by the four numbers, shape (n, 4, 15)."""
+    # ∂t_k/∂t_a = 1 for k = a, and ∂(t_a t_b) = t_b ∂t_a + t_a ∂t_b, which is 2 t_a for a = b.
     slopes = np.zeros((len(states), 4, TERMS))
     for axis in range(4):
         slopes[:, axis, 1 + axis] = 1.0
@@ -178,35 +182,34 @@ def term_slopes(states: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class QuadraticModel:
-    """Zernike coefficients at a set of fields.
+    """Zernike coefficients at F fields as quadratic functions of a state.
 
     Attributes
     ----------
     coefficients : ndarray, shape (F, 15, J)
-        In waves, for states in units of the range.
+        Coefficients of the terms in waves, for states in units of the range.
     """
 
     coefficients: np.ndarray
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """Zernike coefficients of states, (n, 4) to (n, F, J), in waves."""
-        zernikes: np.ndarray = np.einsum("nt,ftj->nfj", quadratic_terms(states), self.coefficients)
-        return zernikes
+        """Return the Zernike coefficients of states, (n, 4) to (n, F, J), in waves."""
+        return np.asarray(np.einsum("nt,ftj->nfj", quadratic_terms(states), self.coefficients))
 
     def jacobian(self, states: np.ndarray) -> np.ndarray:
-        """Derivatives by the four numbers of a state, shape (n, F, 4, J), in waves per range."""
-        slopes: np.ndarray = np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients)
-        return slopes
+        """Return derivatives by the four numbers of a state, (n, F, 4, J), in waves per range."""
+        return np.asarray(np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients))
 
 
 def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
-    """Least-squares fit of the model to states (n, 4) with coefficients (n, F, J) in waves.
+    """Fit the model by least squares to states (n, 4) with coefficients (n, F, J) in waves.
 
     Raises
     ------
     ModelError
         If the states do not determine all 15 terms.
     """
+    # Zernike coefficient j at field f: z_fj(t) = Σ_k terms_k(t) c_fkj, linear in c.
     count, fields, modes = zernikes.shape
     terms = quadratic_terms(states)
     fit, _, rank, _ = np.linalg.lstsq(terms, zernikes.reshape(count, -1), rcond=None)
@@ -218,19 +221,21 @@ def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
 def verify(
     model: QuadraticModel, states: np.ndarray, zernikes: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """RMS difference of a model from coefficients (n, F, J), shape (n, F), in waves.
+    """Return the RMS difference of a model from coefficients (n, F, J), shape (n, F), in waves.
 
     Raises
     ------
     ModelError
-        If it exceeds `tolerance` anywhere; names the state, the field and the RMS.
+        If it exceeds `tolerance` anywhere; the message names the state, the field and the RMS.
     """
-    residual: np.ndarray = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
+    # Zernike polynomials are orthonormal: the RMS over the pupil is the norm of the coefficients.
+    residual = np.asarray(np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1)))
+    # Written so that NaN fails, too.
     if not residual.max() <= tolerance:
         state, field = np.unravel_index(residual.argmax(), residual.shape)
         raise ModelError(
             f"quadratic model: {residual.max():.3g} waves RMS from ray tracing in state "
             f"{states[state].tolist()}, field {field} (at most {tolerance:.3g}); "
-            "a smaller range of misalignment would do"
+            "choose a smaller range of misalignment"
         )
     return residual

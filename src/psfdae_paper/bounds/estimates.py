@@ -18,13 +18,23 @@ from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     PosteriorSums,
-    companions,
+    groups_by_field,
     jittered_templates,
     nested_means,
     posterior_sums,
-    segments,
 )
-from psfdae_paper.bounds.sampling import TRUTH, Modes, Sampled, StampModel, sample
+from psfdae_paper.bounds.sampling import (
+    Knowledge,
+    Modes,
+    SampledPosterior,
+    Search,
+    StampModel,
+    StarPosteriors,
+    climb,
+    sample_posterior,
+    search,
+    separate,
+)
 from psfdae_paper.bounds.tight import Evidence
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, relative_field
@@ -32,21 +42,18 @@ from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import aberration_columns, star_wavefronts, template_wavefronts
 
 SPLIT = "random"
-"""The split that is bounded: its test stars lie in all fields."""
-
-HOPELESS_ESS = 2.0
-"""A quarter of the bank with a smaller median effective sample size is not extended."""
+"""Split whose errors are bounded: its test stars lie in all fields."""
 
 ENOUGH_ESS = 50.0
 """Effective sample size below which a star gets importance samples of its own.
 
-The error of a mean over so many is 2 % above that of the exact mean.
+The error of a mean over so many samples is 2 % above that of the exact mean.
 """
 
 
 @dataclass(frozen=True)
 class BoundedStars:
-    """The test stars that are bounded.
+    """Test stars whose errors are bounded.
 
     Attributes
     ----------
@@ -64,126 +71,136 @@ class BoundedStars:
     noisy: dict[float, np.ndarray]
 
     def take(self, stars: np.ndarray) -> BoundedStars:
-        """Some of the stars, in the order given."""
+        """Return the stars with these numbers, in the order given."""
         truth = {name: images[stars] for name, images in self.truth.items()}
         noisy = {level: images[stars] for level, images in self.noisy.items()}
         return BoundedStars(self.star[stars], self.field[stars], truth, noisy)
 
 
 def bounded_stars(config: Config, product: Product) -> BoundedStars:
-    """The first test stars of a product "stars", with the noise of their datasets."""
-    test = split_stars(product, SPLIT, config).test
-    kept = test[: config.bounds.test_stars]
+    """Read the first test stars of a product "stars", with the noise of their datasets."""
+    star = split_stars(product, SPLIT, config).test[: config.bounds.test_stars]
     return BoundedStars(
-        star=kept,
-        field=product["field_index"][kept],
-        truth={name: product[name][kept] for name in ("realisation", "template")},
-        noisy={lvl: noisy_test_images(config, product, kept, lvl) for lvl in config.noise.levels},
+        star=star,
+        field=product["field_index"][star],
+        truth={name: product[name][star] for name in ("realisation", "template")},
+        noisy={lvl: noisy_test_images(config, product, star, lvl) for lvl in config.noise.levels},
     )
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """`measures_of`, shape (5, n), of one posterior mean.
+    """Errors and variances of one posterior mean; rows are those of `star_measures`.
 
     Attributes
     ----------
     full, quarter : ndarray, shape (5, n)
-        Of all samples, and of a quarter of them.
-    helped : ndarray, shape (5, n)
-        Of all samples and those around modes that only the truth leads to.
+        Measures of the mean over all samples, and of those over a quarter of them.
+    with_truth : ndarray, shape (5, n)
+        Measures of the mean over all samples and those around modes that only the truth leads to.
     """
 
     full: np.ndarray
     quarter: np.ndarray
-    helped: np.ndarray
+    with_truth: np.ndarray
 
     @classmethod
-    def over_bank(cls, sizes: dict[int, np.ndarray]) -> Estimates:
-        """Return estimates of `measures_of` by number of draws, each twice that before."""
-        nested = list(sizes.values())
+    def over_bank(cls, measures: dict[int, np.ndarray]) -> Estimates:
+        """Return the estimates of `weigh_bank`, whose numbers of draws double."""
+        # A quarter is two doublings before the last; a bank has no modes from the truth.
+        nested = list(measures.values())
         quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
         return cls(nested[-1], quarter, nested[-1])
 
     @classmethod
-    def oversampled(
-        cls,
-        parts: list[PosteriorSums],
-        helped: PosteriorSums,
-        static: np.ndarray,
-        stars: BoundedStars,
+    def over_samples(
+        cls, samples: SampledPosterior, static: np.ndarray, stars: BoundedStars
     ) -> Estimates:
-        """Return estimates of importance samples in four parts, and with the truth's modes."""
-        measure = partial(measures_of, static=static, stars=stars)
-        quarter, _, full = nested_means(parts, measure).values()
-        return cls(full, quarter, measure(helped))
+        """Return the estimates of importance samples, which are in four parts."""
+        measure = partial(star_measures, static=static, stars=stars)
+        quarter, _, full = nested_means(samples.parts, measure).values()
+        return cls(full, quarter, measure(samples.with_truth))
 
     @property
     def ess(self) -> np.ndarray:
         """Effective sample size of every star."""
-        size: np.ndarray = self.full[-1]
-        return size
+        return np.asarray(self.full[-1])
 
-    def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
-        """Take another estimate of the stars `few` where it has more samples; and for how many."""
-        if other is None:
+    def improved(self, stars: np.ndarray, samples: Estimates | None) -> tuple[Estimates, int]:
+        """Replace estimates over a bank by those over importance samples where these are larger.
+
+        Parameters
+        ----------
+        stars : ndarray of int
+            Numbers of the stars that have importance samples.
+        samples : Estimates, optional
+            Their estimates.
+
+        Returns
+        -------
+        estimates : Estimates
+        replaced : int
+            Number of stars with another estimate.
+        """
+        if samples is None:
             return self, 0
-        better = (self.ess[few] < ENOUGH_ESS) & (other.ess > self.ess[few])
-        changed = {name: values.copy() for name, values in vars(self).items()}
-        for name, values in changed.items():
-            values[:, few[better]] = getattr(other, name)[:, better]
-        return Estimates(**changed), int(better.sum())
+        # Only where the bank is too thin, and never by fewer samples than it has.
+        is_better = (self.ess[stars] < ENOUGH_ESS) & (samples.ess > self.ess[stars])
+        measures = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in measures.items():
+            values[:, stars[is_better]] = getattr(samples, name)[:, is_better]
+        return Estimates(**measures), int(is_better.sum())
 
     def values(self, number: int) -> dict[str, np.ndarray]:
-        """Error and variance of every star by one reference, and the effective sample size."""
+        """Return error and variance of every star by one reference, and the effective size."""
         return {"mse": self.full[number], "variance": self.full[2 + number], "ess": self.ess}
 
     def evidence(self, number: int, field: np.ndarray) -> Evidence:
-        """Whether the mean of one reference is near the exact one."""
+        """Collect the evidence that the mean by one reference is near the exact one."""
         return Evidence.of(
             **self.values(number),
             field=field,
-            last_change=abs(_change(self.quarter[number], self.full[number])),
-            undetected=-_change(self.helped[number], self.full[number]),
+            last_change=abs(_relative_change(self.quarter[number], self.full[number])),
+            undetected=-_relative_change(self.with_truth[number], self.full[number]),
         )
 
 
-def _change(errors: np.ndarray, full: np.ndarray) -> float:
-    """Relative difference of mean errors, over the stars that have both."""
-    known = np.isfinite(errors) & np.isfinite(full)
-    return float(errors[known].mean() / full[known].mean() - 1.0) if known.any() else np.nan
-
-
-FINE_SAMPLES = (158, 190)
-"""Pupil samples that a bank may use besides `optics.pupil_samples`.
-
-The sampling guard decides as it does for stars. Such stamps of scene 1 differ from
-those of N = 222 by an MSE of 4e-11 at most, below any noise of the datasets, and
-take half the time.
-"""
+def _relative_change(errors: np.ndarray, full: np.ndarray) -> float:
+    """Return the relative difference of mean errors, over the stars that have both."""
+    has_both = np.isfinite(errors) & np.isfinite(full)
+    if not has_both.any():
+        return float("nan")
+    return float(errors[has_both].mean() / full[has_both].mean() - 1.0)
 
 
 def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> dict[str, Column]:
-    """Columns of stars that no product "stars" has, framed so that they can be mirrored.
+    """Simulate stars that no product "stars" has, framed so that they can be mirrored.
 
     Parameters
     ----------
     config : config with the groups of `consistency.SIMULATION`
     suffix : str
-        Other ones give other stars.
+        Name of the set of stars; each name gives other stars.
     count, threads : int
+
+    Returns
+    -------
+    dict of Column
+        Framed images, fields, brightest pixels, aberrations and pupil samples of the stars.
     """
     # Another name gives other random streams: no training or test star is among them.
-    named = {"name": f"{config.stars.name}_{suffix}", "count": count}
-    stars = config.stars.model_copy(update=named)
-    drawn = config.model_copy(update={"stars": stars})
-    rng = stream(drawn.seed, "field", stars.name)
-    star_field = assign_fields(count, drawn.grid.points**2, rng)
-    source = star_wavefronts(drawn, star_field)
-    grid_sizes = sorted({*FINE_SAMPLES, *drawn.optics.pupil_samples})
-    optics = drawn.optics.model_copy(update={"pupil_samples": grid_sizes, "threads": threads})
-    framing = drawn.framing
-    propagation = Propagation(source, drawn.telescope, optics, framing, stars.search_px)
+    changes = {"name": f"{config.stars.name}_{suffix}", "count": count}
+    config = config.model_copy(update={"stars": config.stars.model_copy(update=changes)})
+    rng = stream(config.seed, "field", config.stars.name)
+    star_field = assign_fields(count, config.grid.points**2, rng)
+    source = star_wavefronts(config, star_field)
+    # Smaller pupil grids than for training stars where the sampling guard allows them: stamps of
+    # scene 1 differ from those of N = 222 by an MSE of 4e-11 at most, below any noise of the
+    # datasets, and take half the time.
+    grid_sizes = sorted({158, 190, *config.optics.pupil_samples})
+    optics = config.optics.model_copy(update={"pupil_samples": grid_sizes, "threads": threads})
+    framing = config.framing
+    propagation = Propagation(source, config.telescope, optics, framing, config.stars.search_px)
     framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
     return {
         "framed": Column(
@@ -197,7 +214,7 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
 
 
 def static_psfs(config: Config) -> np.ndarray:
-    """Static PSFs of all fields at all centring errors, shape (F, J, d, d), as in "templates"."""
+    """Propagate static PSFs of all fields at all centring errors, (F, J, d, d), as "templates"."""
     framing = config.framing
     propagation = Propagation(
         template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
@@ -207,7 +224,7 @@ def static_psfs(config: Config) -> np.ndarray:
 
 
 def stamp_model(config: Config) -> StampModel:
-    """Stamps of a dataset's stars as functions of their coefficients.
+    """Make the model of a dataset's stamps as functions of their Seidel coefficients.
 
     Raises
     ------
@@ -216,81 +233,120 @@ def stamp_model(config: Config) -> StampModel:
     """
     if not isinstance(config.wavefront, Seidel):
         raise ConfigError(f"wavefront.kind = {config.wavefront.kind}: must be seidel")
+    # The standard deviation of each coefficient is a fraction of its mean.
     mean = config.wavefront.coefficients
-    spread = config.stars.aberration_fraction * np.abs(mean)
+    sd = config.stars.aberration_fraction * np.abs(mean)
     field = relative_field(config.grid)
-    return StampModel(mean, spread, field, config.telescope, config.optics, config.framing)
+    return StampModel(mean, sd, field, config.telescope, config.optics, config.framing)
 
 
-def sampled(
+def true_modes(model: StampModel, product: Product, stars: BoundedStars) -> Modes:
+    """Return the places at which the stars of a product were simulated."""
+    count = stars.star.size
+    return Modes.at(
+        np.arange(count),
+        stars.field,
+        product["peak"][stars.star] - product["jitter"][stars.star],
+        np.full(count, Knowledge.TRUTH),
+        model.standardised(product["seidel"][stars.star]),
+    )
+
+
+def sample_stars(
     config: Config,
     bank: Bank,
-    seidel: np.ndarray,
     product: Product,
     stars: BoundedStars,
     level: float,
     likelihood: Likelihood,
-) -> Sampled:
-    """Importance samples around the best matches of every star, from a stream of its own."""
-    model = stamp_model(config)
+) -> tuple[SampledPosterior, SampledPosterior]:
+    """Draw importance samples around the modes of every star, from a stream of its own.
+
+    They are returned for an unknown and for a known field.
+    """
+    model, noisy = stamp_model(config), stars.noisy[level]
+    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
+    # Bounds need every mode: more starts than a method takes, and more for doubtful stars.
+    effort = Search(fields=16, offsets=16, misfit_sigma=2.0)
+    modes, _ = search(bank, noisy, likelihood, model, stars.field, effort=effort)
+    modes = separate(modes + climb(true_modes(model, product, stars), posteriors))
+    # A star's draws do not depend on the other stars: each has a stream by its number.
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
-    noisy, draws = stars.noisy[level], config.bounds.star_draws
-    count = stars.star.size
-    truth = Modes.at(
-        np.arange(count),
-        stars.field,
-        product["peak"][stars.star] - product["jitter"][stars.star],
-        np.full(count, TRUTH),
-        model.standardised(product["seidel"][stars.star]),
-    )
-    return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
+    return sample_posterior(modes, posteriors, stars.field, config.bounds.star_draws, rngs)
 
 
-def weighed(
-    bank: Bank, given: bool, static: np.ndarray, stars: BoundedStars, level: float, like: Likelihood
+def weigh_bank(
+    bank: Bank,
+    field_is_known: bool,
+    static: np.ndarray,
+    stars: BoundedStars,
+    level: float,
+    likelihood: Likelihood,
 ) -> dict[int, np.ndarray]:
-    """`measures_of` of the posterior mean over a bank, with the field given or not, by its size.
+    """Measure the posterior mean over a bank, and over halves, quarters … of it.
 
-    Every part of the bank has as many draws of every group, and those that are counted are
-    the draws in all fields. A bank in which far too few stars are similar at its noise level is
-    left after a quarter.
+    Parameters
+    ----------
+    bank : Bank
+    field_is_known : bool
+        True for the posterior given the star's field.
+    static : ndarray, shape (F, J, d, d)
+        Static PSFs at all centring errors.
+    stars : BoundedStars
+    level : float
+        Noise level λ.
+    likelihood : Likelihood
+        Likelihood at that level.
+
+    Returns
+    -------
+    dict of int to ndarray, shape (5, n)
+        `star_measures` by number of draws, ascending. Every part of the bank has as many draws of
+        every group of fields; counted are the draws in all fields.
     """
-    groups = companions(stars.field.size, stars.field if given else None, bank)
-    pieces = segments(min(draws.size for _, draws in groups))
+    groups = groups_by_field(stars.star.size, stars.field if field_is_known else None, bank)
+    # Equal parts of the bank: the largest power of two up to 16 and the size of a group.
+    pieces = 1 << (min(16, *(members.size for _, members in groups)).bit_length() - 1)
     quarter = max(1, pieces // 4)
-    several = [(stars.take(group), np.array_split(draws, pieces)) for group, draws in groups]
+    subsets = [(stars.take(group), np.array_split(members, pieces)) for group, members in groups]
 
-    def weigh(first: int, end: int) -> list[list[PosteriorSums]]:
+    def weigh(subset: BoundedStars, cuts: list[np.ndarray]) -> list[PosteriorSums]:
+        field = subset.field if field_is_known else None
         return [
-            [
-                posterior_sums(
-                    *(bank.take(cut), few.noisy[level], like),
-                    own_field=few.field if given else None,
-                )
-                for cut in cuts[first:end]
-            ]
-            for few, cuts in several
+            posterior_sums(bank.take(cut), subset.noisy[level], likelihood, star_field=field)
+            for cut in cuts
         ]
 
-    parts = weigh(0, quarter)
+    # A quarter first. Where it has an effective sample size below 2 in the median, the rest of the
+    # bank would not be enough either.
+    parts = [weigh(subset, cuts[:quarter]) for subset, cuts in subsets]
     sizes = [nested_means(part, lambda sums: sums.effective_size)[quarter] for part in parts]
-    if np.median(np.concatenate(sizes)) >= HOPELESS_ESS:
-        parts = [old + new for old, new in zip(parts, weigh(quarter, pieces), strict=True)]
-    means: dict[int, np.ndarray] = {}
-    for (group, _), (few, _), part in zip(groups, several, parts, strict=True):
-        measure = partial(measures_of, static=static, stars=few)
+    if np.median(np.concatenate(sizes)) >= 2.0:
+        for part, (subset, cuts) in zip(parts, subsets, strict=True):
+            part.extend(weigh(subset, cuts[quarter:]))
+    # Each group has the columns of its stars.
+    measures: dict[int, np.ndarray] = {}
+    for (group, _), (subset, _), part in zip(groups, subsets, parts, strict=True):
+        measure = partial(star_measures, static=static, stars=subset)
         for size, values in nested_means(part, measure).items():
-            total = means.setdefault(size, np.empty((len(values), stars.field.size)))
-            total[:, group] = values
-    return {round(len(bank) / pieces * size): values for size, values in means.items()}
+            draws = round(len(bank) / pieces * size)
+            measures.setdefault(draws, np.empty((len(values), stars.star.size)))[:, group] = values
+    return measures
 
 
-def measures_of(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
-    """MSE against realisation and template, variances of both, effective sample size, (5, n)."""
+def star_measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
+    """Measure posterior means of stars against the truth.
+
+    Returns
+    -------
+    ndarray, shape (5, n)
+        MSE against realisation and template, posterior variances of both, effective sample size.
+    """
+    # The posterior has the mean of the noise-free image, and that of the static PSF.
     shape = stars.truth["realisation"].shape
-    template, spread = sums.template(static)
+    template, template_variance = sums.template(static)
     means = {"realisation": sums.mean_image, "template": template}
     errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
-    spreads = [sums.variance.mean(axis=1), spread.mean(axis=1)]
-    return np.stack([*errors, *spreads, sums.effective_size])
+    variances = [sums.variance.mean(axis=1), template_variance.mean(axis=1)]
+    return np.stack([*errors, *variances, sums.effective_size])

@@ -18,7 +18,7 @@ from psfdae.metrics import clustered_mean
 
 
 def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """tr[J (JᵀΣ⁻¹J + P⁻¹)⁻¹ Jᵀ] / N_pix of every star.
+    """Compute tr[J (JᵀΣ⁻¹J + P⁻¹)⁻¹ Jᵀ] / N_pix of every star.
 
     Coefficients are counted in their prior standard deviations, P = 1, so that a
     term that cannot vary drops out instead of dividing by zero.
@@ -37,24 +37,18 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     ndarray, shape (n,)
         Mean squared error per pixel.
     """
-    terms = derivatives.shape[1]
     jacobian = derivatives * prior_sd[:, None]
+    # Inverse of the posterior covariance, JᵀΣ⁻¹J + 1.
     weighted = jacobian / variance[:, None]
-    information = weighted @ jacobian.swapaxes(1, 2) + np.eye(terms)
-    spread = jacobian @ jacobian.swapaxes(1, 2)
-    trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)
-    floor: np.ndarray = trace / jacobian.shape[-1]
-    return floor
+    information = weighted @ jacobian.swapaxes(1, 2) + np.eye(len(prior_sd))
+    # The trace does not change if its factors rotate: tr[(JᵀΣ⁻¹J + 1)⁻¹ JᵀJ].
+    square = jacobian @ jacobian.swapaxes(1, 2)
+    trace = np.trace(np.linalg.solve(information, square), axis1=1, axis2=2)
+    return np.asarray(trace / jacobian.shape[-1])
 
 
-TOLERANCE = 0.05
+RELATIVE_TOLERANCE = 0.05
 """Part of a bound by which an estimator may lie below it: its approximation and its noise."""
-
-FLOOR_TOLERANCE = 0.2
-"""The same part of a local floor, which the posterior mean itself may undercut by 15 %."""
-
-STANDARD_ERRORS = 2.0
-"""Standard errors of the paired difference by which it may lie below it besides."""
 
 
 @dataclass(frozen=True)
@@ -75,21 +69,24 @@ class Comparison:
     bound: float
     difference: float
     stderr: float
-    tolerance: float = TOLERANCE
+    tolerance: float = RELATIVE_TOLERANCE
 
     @property
     def efficiency(self) -> float:
-        """Bound divided by MSE; NaN where the bound is 0."""
+        """Bound divided by MSE; NaN where either is 0."""
         return self.bound / self.mse if self.bound > 0 and self.mse > 0 else float("nan")
 
     @property
     def beaten(self) -> bool:
-        """Whether the estimator is below the bound by more than the tolerance."""
-        return self.difference < -(STANDARD_ERRORS * self.stderr + self.tolerance * self.bound)
+        """True if the estimator is below the bound by more than tolerance and two errors."""
+        return self.difference < -(2.0 * self.stderr + self.tolerance * self.bound)
 
 
 def compare(
-    errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = TOLERANCE
+    errors: np.ndarray,
+    bounds: np.ndarray,
+    field: np.ndarray,
+    tolerance: float = RELATIVE_TOLERANCE,
 ) -> Comparison:
     """Compare an estimator with a bound.
 
@@ -100,7 +97,7 @@ def compare(
     field : ndarray of int, shape (n,)
         Field of every star.
     tolerance : float
-        As in `Comparison`.
+        Part of the bound by which the estimator may lie below it.
     """
     difference, stderr = clustered_mean(errors - bounds, field)
     return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)

@@ -1,16 +1,24 @@
-"""A bank of simulated stars: the prior of the test stars, as a sample."""
+"""Posterior mean of test stars over a bank of simulated stars, a sample of their prior.
+
+A bank holds noise-free stars with random aberrations. Each of them stands for 8 · (2j + 1)² images:
+it is mirrored by the symmetries of a square and moved by all centring errors of up to j pixels.
+With p_k the image k, and w_k ∝ prior × Poisson likelihood of the counts under it, the posterior
+mean of a star's noise-free image is Σ w_k p_k / Σ w_k.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Self
 
 import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
-from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry, orbit
+from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
 
 MIRROR_MARGIN = 1
 """Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`)."""
@@ -18,7 +26,7 @@ MIRROR_MARGIN = 1
 
 @dataclass(frozen=True)
 class Bank:
-    """Propagated stars from which those at other jitters and mirrored fields are cut.
+    """Propagated stars from which stamps at all jitters and mirrored fields are cut.
 
     Attributes
     ----------
@@ -28,6 +36,8 @@ class Bank:
         Field of every star, ix + P·iy.
     peak : ndarray of int, shape (M, 2)
         Brightest pixel (row, column) from the chief ray.
+    seidel : ndarray, shape (M, 5)
+        Seidel coefficients in waves.
     points : int
         Field points P along a side.
     jitter_px : int
@@ -37,8 +47,15 @@ class Bank:
     framed: np.ndarray
     field: np.ndarray
     peak: np.ndarray
+    seidel: np.ndarray
     points: int
     jitter_px: int
+
+    @classmethod
+    def of(cls, columns: Mapping[str, np.ndarray], points: int, jitter_px: int) -> Self:
+        """Make a bank from the columns of `estimates.fresh_stars`."""
+        framed, field, peak = (columns[name] for name in ("framed", "field_index", "peak"))
+        return cls(framed, field, peak, columns["seidel"], points, jitter_px)
 
     def __len__(self) -> int:
         return len(self.framed)
@@ -49,27 +66,21 @@ class Bank:
         return self.jitter_px + MIRROR_MARGIN
 
     def take(self, stars: np.ndarray) -> Bank:
-        """Some of the stars, in the order given."""
-        part = (self.framed[stars], self.field[stars], self.peak[stars])
+        """Return the bank of the stars with these numbers, in the order given."""
+        part = (self.framed[stars], self.field[stars], self.peak[stars], self.seidel[stars])
         return Bank(*part, self.points, self.jitter_px)
 
     def stamps(self, window: tuple[int, int]) -> np.ndarray:
-        """Stamps cut at a window (first row, first column), sum 1, shape (M, d, d), float64."""
+        """Cut stamps at a window (first row, first column), sum 1, shape (M, d, d), float64."""
         row, column = window
         side = self.framed.shape[-1] - 2 * self.margin
-        # A slice: the same place in all stars needs no list of pixels for each.
+        # A slice: the same window in all stars needs no list of pixels for each.
         cut = self.framed[:, row : row + side, column : column + side]
         return normalise_flux(cut.astype(np.float64))[0]
 
-    def log_weights(self) -> np.ndarray:
-        """Logarithm of `weights`, −∞ for zero, shape (M, 8)."""
-        with np.errstate(divide="ignore"):
-            logs: np.ndarray = np.log(weights(self.field, self.peak, self.points))
-            return logs
 
-
-def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
-    """How often each symmetry of each star counts so that all fields stay equally likely.
+def symmetry_weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
+    """Count how often each symmetry of each star is used, so that all fields stay equally likely.
 
     At a field point on a mirror axis two symmetries (in the centre all eight) lead
     to the same star, with its equal maxima exchanged. Only the one that frames the
@@ -89,38 +100,33 @@ def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
     ndarray of int, shape (M, 8)
         Zero, or the number of symmetries that lead to the same field; rows sum to 8.
     """
-    target = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
+    # Field and framed pixel of every star after every symmetry.
+    mirrored_field = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
     pixel = np.stack([s.pixel(peak) for s in SYMMETRIES], axis=1)
+    # One number that rises with row, then column, then number of the symmetry.
     reach = 2 * int(np.abs(peak).max()) + 3
     order = (pixel[..., 0] * reach + pixel[..., 1]) * len(SYMMETRIES) + np.arange(len(SYMMETRIES))
-    same = target[:, :, None] == target[:, None, :]
-    first = np.where(same, order[:, None, :], np.iinfo(order.dtype).max).min(axis=2)
-    return np.where(order == first, same.sum(axis=2), 0)
+    # Among symmetries that lead to the same field, the first in that order has all the weight.
+    is_same_field = mirrored_field[:, :, None] == mirrored_field[:, None, :]
+    first = np.where(is_same_field, order[:, None, :], np.iinfo(order.dtype).max).min(axis=2)
+    return np.where(order == first, is_same_field.sum(axis=2), 0)
 
 
 def jitters(jitter_px: int) -> list[tuple[int, int]]:
-    """All centring errors (row, column) of up to `jitter_px` pixels per axis."""
+    """List all centring errors (row, column) of up to `jitter_px` pixels per axis."""
     shifts = range(-jitter_px, jitter_px + 1)
     return list(product(shifts, shifts))
 
 
-def windows(jitter_px: int) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """Return the stamps that share a window: (row, column) → list of (symmetry, jitter) numbers."""
-    margin = jitter_px + MIRROR_MARGIN
-    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for s, symmetry in enumerate(SYMMETRIES):
-        for j, jitter in enumerate(jitters(jitter_px)):
-            found.setdefault(symmetry.window(jitter, margin), []).append((s, j))
-    return found
-
-
 def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
-    """Static PSFs at all centring errors, as the stage `stars` cuts them.
+    """Cut static PSFs at all centring errors, as the stage `stars` cuts them.
 
     Parameters
     ----------
     framed : ndarray, shape (F, d + 2·jitter_px, d + 2·jitter_px)
         Array `psf` of the product "templates".
+    jitter_px : int
+        Largest centring error in pixels per axis.
 
     Returns
     -------
@@ -132,222 +138,86 @@ def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
     return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1).astype(np.float32)
 
 
-DEPTH = 30.0
-"""Images whose log-likelihood is this far below a star's best are left out.
-
-Millions of them together weigh less than 1e-6 of the best one.
-"""
-
-CHUNK = 512
+BANK_CHUNK = 512
 """Stars of the bank per matrix product; scores of 420 test stars then fit the cache."""
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Poisson likelihood of stars of one noise level.
+    """Poisson likelihood of stars of one noise level, n ~ Poisson(F p + B) in every pixel.
 
     Attributes
     ----------
     flux, background : float
         Photons F in the stamp and B per pixel.
-    centre : ndarray, shape (P,)
-        Mean image that is taken out. It must not change under the symmetries of
-        the square, because counts and images are compared mirrored, too.
+    mean_image : ndarray, shape (P,)
+        Image p̄ that is subtracted, so that sums in single precision stay exact enough. It must
+        not change under the symmetries of the square: counts and images are compared mirrored, too.
     """
 
     flux: float
     background: float
-    centre: np.ndarray
+    mean_image: np.ndarray
 
     @classmethod
     def of(cls, noise: NoiseModel, level: float, images: np.ndarray) -> Likelihood:
-        """Likelihood at noise level λ, centred on images of shape (n, d, d)."""
+        """Make the likelihood at noise level λ, around the mean of images of shape (n, d, d)."""
+        # The mean over its eight mirror images does not change under any symmetry.
         mean = images.mean(axis=0, dtype=np.float64)
         symmetric = np.mean([symmetry.image(mean) for symmetry in SYMMETRIES], axis=0)
         return cls(float(noise.flux(level)), noise.background, symmetric.ravel())
 
     def residuals(self, noisy: np.ndarray) -> np.ndarray:
-        """Counts n − n̄ of images (n, d, d) that `NoiseModel.draw` gives, (n, P), float64.
-
-        Counts are whole numbers, so rounding undoes the loss of single precision.
-        """
-        return self.counts(noisy) - self.background - self.flux * self.centre
+        """Return counts n − n̄, n̄ = F p̄ + B, of images (n, d, d), shape (n, P), float64."""
+        return self.counts(noisy) - self.background - self.flux * self.mean_image
 
     def counts(self, noisy: np.ndarray) -> np.ndarray:
-        """Photons of the images, sky included, shape (n, P), float64."""
+        """Return the photons of images (n, d, d), sky included, shape (n, P), float64.
+
+        `NoiseModel.draw` gives images in single precision, without sky. Counts are whole numbers,
+        so rounding undoes the loss.
+        """
         signal = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
         return signal + self.background
 
-    def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factor of the residuals and the constant of the product, for stamps (K, P).
+    def expected(self, stamps: np.ndarray) -> np.ndarray:
+        """Return the mean counts F p + B of noise-free stamps."""
+        return np.asarray(self.flux * stamps + self.background)
 
-        That is ℓ − ℓ̄, shape (K, P), and n̄·ℓ − F Σp, shape (K,), in float64.
+    def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Split the log-likelihood of stamps p (K, P) into a product with residuals and a constant.
+
+        Up to terms of the counts alone it is Σ n ℓ − F Σ p with ℓ = ln(1 + F p / B), which is
+        Σ (n − n̄)(ℓ − ℓ̄) + Σ n̄ ℓ − F Σ p.
+
+        Returns
+        -------
+        ratio : ndarray, shape (K, P), float64
+            ℓ − ℓ̄, the factor of the residuals.
+        offset : ndarray, shape (K,), float64
+            n̄·ℓ − F Σ p.
         """
+        # ℓ̄ is ℓ of the mean image. Residuals and ℓ − ℓ̄ are small, and so is the error of their
+        # product in single precision.
         scale = self.flux / self.background
         ratio = np.log1p(scale * stamps)
-        expected = self.background + self.flux * self.centre
-        offset = ratio @ expected - self.flux * stamps.sum(axis=1)
-        ratio -= np.log1p(scale * self.centre)
+        offset = ratio @ self.expected(self.mean_image) - self.flux * stamps.sum(axis=1)
+        ratio -= np.log1p(scale * self.mean_image)
         return ratio, offset
 
 
-@dataclass
-class PosteriorSums:
-    """Weighted sums over a part of the bank, weights relative to exp(`peak`).
-
-    Attributes
-    ----------
-    peak : ndarray, shape (n,)
-        Largest log-likelihood of every test star.
-    total, square : ndarray, shape (n,)
-        Σw and Σw².
-    image, power : ndarray, shape (n, P)
-        Σw p and Σw p², p the bank's images.
-    share : ndarray, shape (n, F, J)
-        Σw by field and jitter.
-    """
-
-    peak: np.ndarray
-    total: np.ndarray
-    square: np.ndarray
-    image: np.ndarray
-    power: np.ndarray
-    share: np.ndarray
-
-    @classmethod
-    def empty(cls, stars: int, pixels: int, fields: int, shifts: int) -> PosteriorSums:
-        """Sums over nothing."""
-        shapes = ((), (), (pixels,), (pixels,), (fields, shifts))
-        zeros = (np.zeros((stars, *shape)) for shape in shapes)
-        return cls(np.full(stars, -np.inf), *zeros)
-
-    @classmethod
-    def stack(cls, parts: Sequence[PosteriorSums]) -> PosteriorSums:
-        """Sums of several groups of test stars, one after the other."""
-        return cls(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
-
-    def take(self, stars: np.ndarray) -> PosteriorSums:
-        """Those of some stars, in the order given."""
-        return PosteriorSums(*(values[stars] for values in vars(self).values()))
-
-    def put(self, stars: np.ndarray, others: PosteriorSums) -> None:
-        """Put others in place of those of some stars."""
-        for name, values in vars(others).items():
-            getattr(self, name)[stars] = values
-
-    @property
-    def mean_image(self) -> np.ndarray:
-        """Posterior mean of the noise-free image, shape (n, P); NaN where none was possible."""
-        with np.errstate(invalid="ignore"):
-            mean: np.ndarray = self.image / self.total[:, None]
-            return mean
-
-    @property
-    def effective_size(self) -> np.ndarray:
-        """Effective sample size 1/Σw² of the normalised weights, shape (n,)."""
-        size: np.ndarray = self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
-        return size
-
-    @property
-    def variance(self) -> np.ndarray:
-        """Posterior variance of every pixel of the noise-free image, (n, P); NaN as above."""
-        with np.errstate(invalid="ignore"):
-            # Rounding makes none of it negative.
-            variance: np.ndarray = np.maximum(
-                self.power / self.total[:, None] - self.mean_image**2, 0.0
-            )
-        return variance
-
-    def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior mean and variance of the static PSF, (n, P) both; NaN as `mean_image`.
-
-        Parameters
-        ----------
-        templates : ndarray, shape (F, J, d, d)
-        """
-        with np.errstate(invalid="ignore"):
-            weight = self.share.reshape(len(self.share), -1) / self.total[:, None]
-        return mixture(weight, templates.reshape(weight.shape[1], -1).astype(np.float64))
-
-    def add(
-        self,
-        scores: np.ndarray,
-        images: np.ndarray,
-        symmetry: Symmetry,
-        field: np.ndarray,
-        jitter: int,
-    ) -> None:
-        """Add images of one symmetry and jitter.
-
-        Parameters
-        ----------
-        scores : ndarray, shape (n, K), float64
-            Log-likelihood plus log-prior.
-        images : ndarray, shape (K, P), float32
-            Images before `symmetry`.
-        field : ndarray of int, shape (K,)
-            Field after `symmetry`; equal values lie side by side.
-        """
-        peak = np.maximum(self.peak, scores.max(axis=1))
-        used = np.flatnonzero((scores > (peak - DEPTH)[:, None]).any(axis=0))
-        if not used.size:
-            return
-        changed = np.flatnonzero(peak != self.peak)
-        # A star without any image so far has peak −∞ and sums of zero.
-        scale = np.exp(self.peak[changed] - peak[changed])
-        self.total[changed] *= scale
-        self.square[changed] *= scale**2
-        self.image[changed] *= scale[:, None]
-        self.power[changed] *= scale[:, None]
-        self.share[changed] *= scale[:, None, None]
-        self.peak = peak
-        # A star of which no image is possible so far keeps weights of zero.
-        above = scores[:, used] - np.maximum(peak, np.finfo(float).min)[:, None]
-        weight = np.exp(above.astype(np.float32))
-        self.total += weight.sum(axis=1, dtype=np.float64)
-        self.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
-        side = int(np.sqrt(images.shape[1]))
-        for whole, values in ((self.image, images[used]), (self.power, images[used] ** 2)):
-            part = symmetry.image((weight @ values).reshape(-1, side, side))
-            np.add(whole, part.reshape(whole.shape), out=whole)
-        start = np.flatnonzero(np.diff(field[used], prepend=-1))
-        self.share[:, field[used][start], jitter] += np.add.reduceat(weight, start, axis=1)
-
-
-def mixture(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance, (n, P) both, of images (K, P) by weights (n, K)."""
-    mean = weight @ images
-    return mean, np.maximum(weight @ images**2 - mean**2, 0.0)
-
-
-def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
-    """Sums over several parts of the bank; the parts stay as they are."""
-    first = parts[0]
-    whole = PosteriorSums.empty(first.total.size, first.image.shape[1], *first.share.shape[1:])
-    whole.peak = np.max([part.peak for part in parts], axis=0)
-    for part in parts:
-        # Where no image was possible in any part, the sums stay zero.
-        scale = np.exp(part.peak - np.maximum(whole.peak, np.finfo(float).min))
-        whole.total += scale * part.total
-        whole.square += scale**2 * part.square
-        whole.image += scale[:, None] * part.image
-        whole.power += scale[:, None] * part.power
-        whole.share += scale[:, None, None] * part.share
-    return whole
-
-
 @dataclass(frozen=True)
-class Scored:
-    """Stars of a bank at one symmetry and jitter, weighed by noisy images.
+class ScoredStars:
+    """Log-weights of stars of a bank at one symmetry and jitter, given noisy images.
 
     Attributes
     ----------
     star, field : ndarray of int, shape (K,)
-        Their places in the bank and their fields after `symmetry`; equal fields lie side by side.
+        Their numbers in the bank and their fields after `symmetry`; equal fields are adjacent.
     symmetry, jitter : int
         Numbers in `SYMMETRIES` and `jitters`.
     images : ndarray, shape (K, P), float32
-        Before `symmetry`.
+        Noise-free images before `symmetry`.
     scores : ndarray, shape (n, K), float64
         Log-likelihood plus log-prior.
     """
@@ -360,53 +230,218 @@ class Scored:
     scores: np.ndarray
 
 
-def scored(
-    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, chunk: int = CHUNK
-) -> Iterator[Scored]:
-    """All stars of a bank at all jitters and symmetries; parameters as in `posterior_sums`."""
+@dataclass
+class PosteriorSums:
+    """Weighted sums over samples of the posterior of n test stars.
+
+    Attributes
+    ----------
+    log_scale : ndarray, shape (n,)
+        Largest log-weight of every test star; weights w are relative to exp(`log_scale`).
+    weight_sum, weight_square_sum : ndarray, shape (n,)
+        Σw and Σw².
+    image_sum, image_square_sum : ndarray, shape (n, P)
+        Σw p and Σw p², p the noise-free images.
+    template_weight : ndarray, shape (n, F, J)
+        Σw by field and jitter, that is by static PSF.
+    """
+
+    log_scale: np.ndarray
+    weight_sum: np.ndarray
+    weight_square_sum: np.ndarray
+    image_sum: np.ndarray
+    image_square_sum: np.ndarray
+    template_weight: np.ndarray
+
+    @classmethod
+    def empty(cls, stars: int, pixels: int, fields: int, shifts: int) -> PosteriorSums:
+        """Return sums over no sample."""
+        shapes = ((), (), (pixels,), (pixels,), (fields, shifts))
+        zeros = (np.zeros((stars, *shape)) for shape in shapes)
+        return cls(np.full(stars, -np.inf), *zeros)
+
+    @classmethod
+    def stack(cls, parts: Sequence[PosteriorSums]) -> PosteriorSums:
+        """Join the sums of groups of test stars, one after the other."""
+        return cls(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
+
+    def take(self, stars: np.ndarray) -> PosteriorSums:
+        """Return the sums of the stars with these numbers, in the order given."""
+        return PosteriorSums(*(values[stars] for values in vars(self).values()))
+
+    def put(self, stars: np.ndarray, replacement: PosteriorSums) -> None:
+        """Replace the sums of the stars with these numbers."""
+        for name, values in vars(replacement).items():
+            getattr(self, name)[stars] = values
+
+    def rescaled(self, log_scale: np.ndarray) -> PosteriorSums:
+        """Return the same sums with weights relative to exp(`log_scale`), shape (n,)."""
+        # A star without any possible image has scale 0 and keeps sums of zero.
+        scale = np.exp(self.log_scale - np.maximum(log_scale, np.finfo(float).min))
+        return PosteriorSums(
+            log_scale,
+            scale * self.weight_sum,
+            scale**2 * self.weight_square_sum,
+            scale[:, None] * self.image_sum,
+            scale[:, None] * self.image_square_sum,
+            scale[:, None, None] * self.template_weight,
+        )
+
+    @property
+    def mean_image(self) -> np.ndarray:
+        """Posterior mean of the noise-free image, shape (n, P); NaN where none was possible."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.image_sum / self.weight_sum[:, None])
+
+    @property
+    def effective_size(self) -> np.ndarray:
+        """Effective sample size (Σw)²/Σw², shape (n,)."""
+        # 0 for a star without any possible image.
+        square = np.maximum(self.weight_square_sum, np.finfo(float).tiny)
+        return np.asarray(self.weight_sum**2 / square)
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Posterior variance of every pixel of the noise-free image, (n, P); NaN as above."""
+        with np.errstate(invalid="ignore"):
+            mean_square = self.image_square_sum / self.weight_sum[:, None]
+            # Rounding must not make it negative.
+            return np.asarray(np.maximum(mean_square - self.mean_image**2, 0.0))
+
+    def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return posterior mean and variance of the static PSF, (n, P) both; NaN as `mean_image`.
+
+        Parameters
+        ----------
+        templates : ndarray, shape (F, J, d, d)
+        """
+        # Posterior probability of every static PSF; their mixture has mean and variance.
+        weight = self.template_weight.reshape(len(self.template_weight), -1)
+        with np.errstate(invalid="ignore"):
+            weight = weight / self.weight_sum[:, None]
+        return mixture_moments(weight, templates.reshape(weight.shape[1], -1).astype(np.float64))
+
+    def add(self, part: ScoredStars) -> None:
+        """Add images of one symmetry and jitter."""
+        log_scale = np.maximum(self.log_scale, part.scores.max(axis=1))
+        # Images with a log-weight more than 30 below a star's best are left out: millions of them
+        # together weigh less than 1e-6 of the best one.
+        used = np.flatnonzero((part.scores > (log_scale - 30.0)[:, None]).any(axis=0))
+        if not used.size:
+            return
+        # Sums of stars that have a new best image go over to its scale.
+        changed = np.flatnonzero(log_scale != self.log_scale)
+        self.put(changed, self.take(changed).rescaled(log_scale[changed]))
+        # A star of which no image is possible so far keeps weights of zero.
+        log_weight = part.scores[:, used] - np.maximum(log_scale, np.finfo(float).min)[:, None]
+        weight = np.exp(log_weight.astype(np.float32))
+        self.weight_sum += weight.sum(axis=1, dtype=np.float64)
+        self.weight_square_sum += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
+        # The symmetry moves the sum over images, instead of every image.
+        images, symmetry = part.images[used], SYMMETRIES[part.symmetry]
+        side = int(np.sqrt(images.shape[1]))
+        for image_sum, values in ((self.image_sum, images), (self.image_square_sum, images**2)):
+            moved_sum = symmetry.image((weight @ values).reshape(-1, side, side))
+            np.add(image_sum, moved_sum.reshape(image_sum.shape), out=image_sum)
+        # Images of the same field are adjacent: one sum for each run.
+        field = part.field[used]
+        start = np.flatnonzero(np.diff(field, prepend=-1))
+        by_field = np.add.reduceat(weight, start, axis=1)
+        self.template_weight[:, field[start], part.jitter] += by_field
+
+
+def mixture_moments(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance, (n, P) both, of images (K, P) with weights (n, K) of sum 1."""
+    # E[p] and E[p²] − E[p]²; rounding must not make the variance negative.
+    mean = weight @ images
+    return mean, np.maximum(weight @ images**2 - mean**2, 0.0)
+
+
+def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
+    """Return the sums over several sets of samples of the same stars; the parts stay unchanged."""
+    # All sums at the largest scale of every star, then added.
+    log_scale = np.max([part.log_scale for part in parts], axis=0)
+    total = parts[0].rescaled(log_scale)
+    for part in parts[1:]:
+        for name, values in vars(part.rescaled(log_scale)).items():
+            if name != "log_scale":
+                setattr(total, name, getattr(total, name) + values)
+    return total
+
+
+def score_bank(
+    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, chunk: int = BANK_CHUNK
+) -> Iterator[ScoredStars]:
+    """Weigh all stars of a bank at all jitters and symmetries; parameters as `posterior_sums`."""
     residuals = likelihood.residuals(noisy).reshape(noisy.shape)
     # Instead of mirroring every image of the bank, the test stars are mirrored back.
     mirrored = [
         symmetry.undo(residuals).reshape(len(noisy), -1).astype(np.float32)
         for symmetry in SYMMETRIES
     ]
-    order = np.argsort(bank.field, kind="stable")  # stars of a field side by side
+    # Symmetries and jitters that need the same pixels of a framed star share its stamp.
+    by_window = defaultdict(list)
+    for s, symmetry in enumerate(SYMMETRIES):
+        for j, jitter in enumerate(jitters(bank.jitter_px)):
+            by_window[symmetry.window(jitter, bank.margin)].append((s, j))
+    order = np.argsort(bank.field, kind="stable")  # stars of a field are adjacent
     for start in range(0, order.size, chunk):
         stars = order[start : start + chunk]
         part = bank.take(stars)
-        log_weights = part.log_weights()
-        for window, members in windows(bank.jitter_px).items():
+        with np.errstate(divide="ignore"):  # −∞ where a symmetry does not count
+            log_prior = np.log(symmetry_weights(part.field, part.peak, part.points))
+        for window, members in by_window.items():
+            # Factors in double precision, their product with the residuals in single.
             stamps = part.stamps(window).reshape(len(part), -1)
             ratio, offset = likelihood.factors(stamps)
             images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
-            for s, jitter in members:
-                scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
+            for s, j in members:
+                # ln prior + Σ (n − n̄)(ℓ − ℓ̄) + offset
+                scores = mirrored[s] @ ratio_t + (offset + log_prior[:, s])
                 field = SYMMETRIES[s].field(part.field, bank.points)
-                yield Scored(stars, field, s, jitter, images, scores)
+                yield ScoredStars(stars, field, s, j, images, scores)
 
 
-def companions(
-    count: int, own: np.ndarray | None, bank: Bank
+def groups_by_field(
+    count: int, star_field: np.ndarray | None, bank: Bank
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Groups of noisy images, by their numbers, and the stars of a bank that may explain each.
+    """Group test stars with the stars of a bank that may explain them.
 
-    All with all; if the images' fields are given, `own` (n,), with stars that symmetries take
-    there. Fields that are mirror images of each other share theirs.
+    Without fields, all test stars are one group with the whole bank. With fields, only stars of
+    the bank count that a symmetry takes to the field of the test star; fields that are mirror
+    images of each other share a group.
+
+    Parameters
+    ----------
+    count : int
+        Number n of test stars.
+    star_field : ndarray of int, shape (n,), optional
+        Field of every test star.
+    bank : Bank
+
+    Returns
+    -------
+    list of pairs of ndarray of int
+        Numbers of the group's test stars, and of its stars of the bank.
     """
-    if own is None:
+    if star_field is None:
         return [(np.arange(count), np.arange(len(bank)))]
-    ours, theirs = orbit(own, bank.points), orbit(bank.field, bank.points)
-    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+    # An orbit is the set of fields to which symmetries take a field; its name is the lowest one.
+    star_orbit, bank_orbit = orbit(star_field, bank.points), orbit(bank.field, bank.points)
+    return [
+        (np.flatnonzero(star_orbit == name), np.flatnonzero(bank_orbit == name))
+        for name in np.unique(star_orbit)
+    ]
 
 
 def posterior_sums(
     bank: Bank,
     noisy: np.ndarray,
     likelihood: Likelihood,
-    chunk: int = CHUNK,
-    own_field: np.ndarray | None = None,
+    chunk: int = BANK_CHUNK,
+    star_field: np.ndarray | None = None,
 ) -> PosteriorSums:
-    """Weigh all stars of a bank, at all jitters and symmetries, by noisy images.
+    """Sum over all stars of a bank, at all jitters and symmetries, weighed by noisy images.
 
     Parameters
     ----------
@@ -414,20 +449,20 @@ def posterior_sums(
     noisy : ndarray, shape (n, d, d)
         Noisy images of one noise level.
     likelihood : Likelihood
-        Of that noise level.
+        Likelihood at that noise level.
     chunk : int
         Stars of the bank per matrix product; does not change the result.
-    own_field : ndarray of int, shape (n,), optional
+    star_field : ndarray of int, shape (n,), optional
         Field of every noisy image: only stars that a symmetry takes there count. Each star
         of the bank must have one that does.
     """
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
-    for part in scored(bank, noisy, likelihood, chunk):
-        if own_field is not None:
-            part.scores[own_field[:, None] != part.field] = -np.inf
-        symmetry = SYMMETRIES[part.symmetry]
-        sums.add(part.scores, part.images, symmetry, part.field, part.jitter)
+    for part in score_bank(bank, noisy, likelihood, chunk):
+        # Images in other fields are impossible if the field is known.
+        if star_field is not None:
+            part.scores[star_field[:, None] != part.field] = -np.inf
+        sums.add(part)
     return sums
 
 
@@ -435,20 +470,21 @@ def exact_posterior(
     noisy: np.ndarray,
     templates: np.ndarray,
     likelihood: Likelihood,
-    own_field: np.ndarray | None = None,
+    star_field: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Posterior mean, variance and probability of the templates, centring errors summed out.
+    """Compute posterior mean, variance and probability of templates, summed over centring errors.
 
-    All templates and all centring errors are equally likely beforehand.
+    All templates and all centring errors have the same prior probability.
 
     Parameters
     ----------
     noisy : ndarray, shape (n, d, d)
+        Noisy images of one noise level.
     templates : ndarray, shape (F, J, d, d)
         Every template at every centring error.
     likelihood : Likelihood
-        Of the images' noise level.
-    own_field : ndarray of int, shape (n,), optional
+        Likelihood at that noise level.
+    star_field : ndarray of int, shape (n,), optional
         Field of every noisy image: only its template counts.
 
     Returns
@@ -462,59 +498,49 @@ def exact_posterior(
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(noisy) @ ratio.T + offset
-    if own_field is not None:
-        scores[own_field[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
+    # Templates of other fields are impossible if the field is known.
+    if star_field is not None:
+        scores[star_field[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
+    # Bayes' rule with a flat prior; the largest score is subtracted against overflow.
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
-    mean, variance = mixture(weight, images)
-    share = weight.reshape(-1, fields, shifts).sum(axis=2)
-    return mean.reshape(noisy.shape), variance.mean(axis=1), share
-
-
-FITTED_POINTS = 4
-"""Least number of bank sizes to which three parameters are fitted."""
-
-
-def segments(count: int, largest: int = 16) -> int:
-    """Number of equal parts of a bank: the largest power of two up to `largest` and `count`."""
-    return 1 << (min(largest, count).bit_length() - 1)
+    mean, variance = mixture_moments(weight, images)
+    probability = weight.reshape(-1, fields, shifts).sum(axis=2)
+    return mean.reshape(noisy.shape), variance.mean(axis=1), probability
 
 
 def nested_means(
     parts: Sequence[PosteriorSums], measure: Callable[[PosteriorSums], np.ndarray]
 ) -> dict[int, np.ndarray]:
-    """A per-star quantity for banks of one, two, four … parts.
+    """Measure a quantity of every star for banks of one, two, four … parts.
 
-    A bank of k parts can be had several times from the same parts; the mean over
-    those disjoint banks is taken, which steadies the small sizes.
+    Several disjoint banks of k parts can be made from the same parts; the mean over
+    them is taken, which steadies the small sizes.
 
     Parameters
     ----------
     parts : sequence of PosteriorSums
         Sums over equally large disjoint parts; their number is a power of two.
     measure : function
-        From the sums over a bank to an array; its mean is returned by number of parts.
+        Function from the sums over a bank to an array.
+
+    Returns
+    -------
+    dict of int to ndarray
+        Mean of the array by number of parts, ascending.
     """
     means: dict[int, np.ndarray] = {}
-    level = list(parts)
-    size = 1
+    banks = list(parts)
     while True:
-        means[size] = np.mean([measure(sums) for sums in level], axis=0)
-        if len(level) == 1:
+        means[len(parts) // len(banks)] = np.mean([measure(sums) for sums in banks], axis=0)
+        if len(banks) == 1:
             return means
-        level = [merge(level[i : i + 2]) for i in range(0, len(level), 2)]
-        size *= 2
-
-
-def last_change(errors: Sequence[float] | np.ndarray) -> float:
-    """|error(M/4)/error(M) − 1| of banks that double in size; NaN for fewer than three."""
-    if len(errors) < 3:
-        return float("nan")
-    return float(abs(errors[-3] / errors[-1] - 1.0))
+        # Pairs of neighbours make banks of twice the size.
+        banks = [merge(banks[i : i + 2]) for i in range(0, len(banks), 2)]
 
 
 def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, float]:
-    """Fit error(M) = a + b M^−c and return a, c and the RMS of the relative residuals.
+    """Fit error(M) = a + b M^−c to the errors of posterior means over banks of M stars.
 
     Parameters
     ----------
@@ -526,22 +552,23 @@ def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, fl
     Returns
     -------
     limit, exponent, residual : float
-        NaN if there are fewer than four sizes. The limit lies between 0 and the
-        smallest error: the fit extrapolates, it proves nothing.
+        a, c and the RMS of the relative residuals; NaN for fewer than four sizes. The limit lies
+        between 0 and the smallest error: the fit extrapolates, it proves nothing.
     """
     from scipy.optimize import least_squares
 
-    if len(draws) < FITTED_POINTS:
+    if len(draws) < 4:  # three parameters need one size more, or the residual says nothing
         return (float("nan"),) * 3
+    # Sizes in units of the largest, errors in units of the smallest: all parameters are near 1.
     size = np.asarray(draws, float) / draws[-1]
     scale = float(np.min(errors))
     ratio = np.asarray(errors) / scale
 
     def misfit(parameters: np.ndarray) -> np.ndarray:
         limit, excess, exponent = parameters
-        relative: np.ndarray = (limit + excess * size**-exponent) / ratio - 1.0
-        return relative
+        return np.asarray((limit + excess * size**-exponent) / ratio - 1.0)
 
+    # Least squares of relative residuals: small errors of large banks count as much as large ones.
     start = (0.9, max(ratio[-1] - 0.9, 1e-3), 0.7)
     fit = least_squares(misfit, start, bounds=((0.0, 0.0, 0.05), (1.0, np.inf, 3.0)), xtol=1e-12)
     return scale * fit.x[0], float(fit.x[2]), float(np.sqrt(np.mean(fit.fun**2)))

@@ -1,4 +1,4 @@
-"""When a posterior mean over samples is taken for the exact one."""
+"""Evidence by which a posterior mean over samples counts as the exact one."""
 
 from __future__ import annotations
 
@@ -8,17 +8,8 @@ import numpy as np
 
 from psfdae.metrics import clustered_mean
 
-CHANGE = 0.05
-"""Largest relative change of the error by the last fourfold growth of the samples."""
-
-UNDETECTED = 0.05
-"""Largest relative change of the error by modes that only the truth leads to."""
-
-LEAST_ESS, FEW = 10.0, 0.01
-"""Least effective sample size, and the fraction of the stars that may have less or no estimate."""
-
-STANDARD_ERRORS = 2.0
-"""Standard errors by which mean squared error and posterior variance may differ."""
+MAX_SPARSE_FRACTION = 0.01
+"""Largest fraction of the stars that may have fewer samples than needed, or no estimate."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +19,7 @@ class Evidence:
     Attributes
     ----------
     ess_low : float
-        Effective sample size that all but `FEW` of the stars have at least.
+        Effective sample size that all but `MAX_SPARSE_FRACTION` of the stars have at least.
     calibration : float
         Mean squared error minus mean posterior variance in standard errors of this
         difference. For the exact posterior of stars drawn from the prior the two are equal:
@@ -54,28 +45,32 @@ class Evidence:
         last_change: float,
         undetected: float,
     ) -> Evidence:
-        """Evidence from squared errors, posterior variances, sizes and fields of stars (n,).
+        """Make evidence from errors, posterior variances, effective sizes and fields of n stars.
 
-        Stars without an estimate have an `mse` of NaN.
+        Stars without an estimate have an `mse` of NaN, and count as stars without samples.
         """
-        known = np.isfinite(mse)
-        low = float(np.sort(np.where(known, ess, 0.0))[int(FEW * ess.size)])
-        deviation = calibration(mse[known], variance[known], field[known])
-        return cls(low, deviation, last_change, undetected)
+        has_estimate = np.isfinite(mse)
+        ascending_ess = np.sort(np.where(has_estimate, ess, 0.0))
+        ess_low = float(ascending_ess[int(MAX_SPARSE_FRACTION * ess.size)])
+        score = calibration(mse[has_estimate], variance[has_estimate], field[has_estimate])
+        return cls(ess_low, score, last_change, undetected)
 
     @property
     def tight(self) -> bool:
-        """Whether all of it says so."""
+        """True if all of the evidence says that the mean is near the exact one."""
         return (
-            self.ess_low >= LEAST_ESS
-            and abs(self.calibration) <= STANDARD_ERRORS
-            and self.last_change <= CHANGE
-            and abs(self.undetected) <= UNDETECTED
+            self.ess_low >= 10.0
+            and abs(self.calibration) <= 2.0  # standard errors
+            and self.last_change <= 0.05
+            and abs(self.undetected) <= 0.05
         )
 
 
 def calibration(error: np.ndarray, variance: np.ndarray, field: np.ndarray) -> float:
-    """Mean of error − variance over its standard error, clustered by field; 0 if all agree."""
+    """Return the mean of error − variance over its standard error, clustered by field.
+
+    It is 0 if all variances are equal to the errors, and ±∞ without scatter.
+    """
     difference = error - variance
     if not difference.any():
         return 0.0

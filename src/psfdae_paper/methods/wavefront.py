@@ -41,8 +41,6 @@ class Wavefront(Method):
     ----------
     bank : Bank
         Simulated stars with random aberrations.
-    seidel : ndarray, shape (M, 5)
-        Coefficients of the bank's stars in waves.
     model : StampModel
         Stamps as a function of coefficients, field and position.
     static : ndarray, shape (F, J, d, d)
@@ -58,7 +56,6 @@ class Wavefront(Method):
     fallback: ClassVar = GaussianMixture
 
     bank: Bank
-    seidel: np.ndarray
     model: StampModel
     static: np.ndarray
     data: TrainingSet
@@ -92,9 +89,8 @@ class Wavefront(Method):
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
 
-        framed, field, peak = (bank_columns[name] for name in ("framed", "field_index", "peak"))
-        bank = Bank(framed, field, peak, config.grid.points, config.framing.jitter_px)
-        return cls(bank, bank_columns["seidel"], stamp_model(config), static_psfs(config), data)
+        bank = Bank.of(bank_columns, config.grid.points, config.framing.jitter_px)
+        return cls(bank, stamp_model(config), static_psfs(config), data)
 
     @cached_property
     def mixture(self) -> GaussianMixture:
@@ -162,8 +158,8 @@ class Wavefront(Method):
         from psfdae_paper.bounds.sampling import search
 
         star_field = self._fields(position)
-        problem = (self.bank, self.seidel, noisy, self.likelihood(level), self.model)
-        return search(*problem, star_field, anywhere=star_field is None)
+        likelihood, in_all_fields = self.likelihood(level), star_field is None
+        return search(self.bank, noisy, likelihood, self.model, star_field, in_all_fields)
 
     def likelihood(self, level: float) -> Likelihood:
         """Return the likelihood of photon counts at a noise level λ."""
@@ -192,25 +188,26 @@ class Wavefront(Method):
             True where a sample of positive weight and, if it was searched, a mode exists.
         """
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
-        from psfdae_paper.bounds.sampling import PROPOSALS, SEARCH, sampled_sums
+        from psfdae_paper.bounds.sampling import StarPosteriors, sample_posterior
 
         sums = self._sums_over_bank(noisy, level, self._fields(position))
         explained = np.ones(len(noisy), bool)
         # Stars whose effective number of similar bank stars is too small.
         unresolved = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
-        rounds = [round(share * DRAWS_PER_STAR) for share in PROPOSALS.rounds]
-        for start in range(0, len(unresolved), SEARCH.stars_at_once):
-            block = unresolved[start : start + SEARCH.stars_at_once]
+        likelihood = self.likelihood(level)
+        for start in range(0, len(unresolved), 256):  # stars whose matches fit in memory
+            block = unresolved[start : start + 256]
             fields = None if position is None else position[block]
             modes, unexplained = self.modes(noisy[block], level, fields)
             # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
-            problem = (modes, noisy[block], np.full(len(block), -1), self.likelihood(level))
-            samples = sampled_sums(*problem, self.model, rounds, rngs).free_helped
-            sums.put(block, samples)
+            posteriors = StarPosteriors(likelihood.counts(noisy[block]), likelihood, self.model)
+            no_field = np.full(len(block), -1)
+            samples, _ = sample_posterior(modes, posteriors, no_field, DRAWS_PER_STAR, rngs)
+            sums.put(block, samples.with_truth)
             explained[block[unexplained]] = False
-        return sums, explained & (sums.total > 0)
+        return sums, explained & (sums.weight_sum > 0)
 
     def _fields(self, position: np.ndarray | None) -> np.ndarray | None:
         """Return the numbers of the stars' fields, (n,), if the method is given them."""
@@ -235,7 +232,7 @@ class Wavefront(Method):
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
         from psfdae_paper.bounds.posterior import (
             PosteriorSums,
-            companions,
+            groups_by_field,
             merge,
             posterior_sums,
         )
@@ -246,9 +243,9 @@ class Wavefront(Method):
         def weigh(stars: np.ndarray, bank_stars: np.ndarray) -> PosteriorSums:
             field = None if star_field is None else star_field[stars]
             bank = self.bank.take(bank_stars)
-            return posterior_sums(bank, noisy[stars], likelihood, own_field=field)
+            return posterior_sums(bank, noisy[stars], likelihood, star_field=field)
 
-        for stars, bank_stars in companions(len(noisy), star_field, self.bank):
+        for stars, bank_stars in groups_by_field(len(noisy), star_field, self.bank):
             eighth = len(bank_stars) // 8
             first_sums = weigh(stars, bank_stars[:eighth])
             sums.put(stars, first_sums)

@@ -1,4 +1,4 @@
-"""Stages of scene 3: the quadratic model, sets of states with their stamps, key figures.
+"""Stages of scene 3: quadratic model of the wavefront, states with their stamps, key figures.
 
 Products have noise-free stamps; noise is drawn by the stages that need it. The stamps of the grid
 are the training set of the networks; with other noise they are one of the two test sets. The other
@@ -47,11 +47,12 @@ def model(
 ) -> None:
     """Fit the quadratic model to few ray-traced states, verify it on the grid."""
     limit_threads(1)
+    # 25 states of a central composite design determine all terms of the model.
     tracer, design = _tracer(config), design_states()
     quadratic = fit_quadratic(design, tracer(design))
+    # The grid, with other states, tests it: no wavefront may differ by more than the tolerance.
     grid = grid_states(config.alignment.grid_levels)
-    tolerance = config.alignment.model_tolerance_waves
-    residual = verify(quadratic, grid, tracer(grid), tolerance)
+    residual = verify(quadratic, grid, tracer(grid), config.alignment.model_tolerance_waves)
     columns = {
         "coefficients": Column(
             quadratic.coefficients,
@@ -87,11 +88,7 @@ def read_model(
     return QuadraticModel(product["coefficients"])
 
 
-@command(
-    "alignment states",
-    reads=STATE_GROUPS,
-    choice=CHOICE,
-)
+@command("alignment states", reads=STATE_GROUPS, choice=CHOICE)
 def states(
     config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
@@ -105,6 +102,7 @@ def states(
     limit_threads(1)  # optics.threads batches run in parallel
     alignment = config.alignment
     quadratic = None if model is None else read_model(model, config)
+    # The grid is fixed; other states are random, from a stream of the set's name.
     if kind == "grid":
         state_set = grid_states(alignment.grid_levels)
     else:
@@ -133,7 +131,11 @@ def _tracer(config: Config) -> StateTracer:
 
 
 def _geometry(config: Config) -> dict[str, Column]:
-    """Return the columns that explain the axes of arrays: fields, Noll indices and ranges."""
+    """Return the columns that explain the axes of arrays.
+
+    They are field angles in radians, Noll indices of the Zernike coefficients, and the range of
+    the four numbers of a state in metres and radians.
+    """
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
@@ -160,6 +162,7 @@ def telescope(
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
+    # All products must be those of the configured telescope.
     require(model, quadratic.config, WAVEFRONT_KEYS, config)
     for product in sets.values():
         require(product.path, product.config, STAMP_KEYS, config)
@@ -180,6 +183,7 @@ def telescope(
         ("defocus_edge", defocus[1:].mean(), "wave"),
         ("sensitivity_condition", np.linalg.cond(sensitivity), "1"),
     ]
+    # Light inside the stamps, and their brightest pixels, both as fractions of the light.
     for name, product in sets.items():
         energy, peak = product["energy"], product["stamps"].max(axis=(2, 3))
         rows += [

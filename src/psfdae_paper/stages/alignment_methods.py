@@ -1,4 +1,4 @@
-"""Stages of scene 3 that train its networks, estimate the states of test sets, bound the errors.
+"""Stages of scene 3 that train networks, estimate the states of test sets and bound their errors.
 
 The networks differ in their training set. The paper's CNN is trained on noise-free stamps of the
 grid (it is used as "original" and as "dae"). Those that are not in the paper are trained on noisy
@@ -51,12 +51,7 @@ from psfdae_paper.configuration.aligners import (
     Aligner,
     methods_of_set,
 )
-from psfdae_paper.configuration.alignment import (
-    CHOICE,
-    NETWORKS,
-    STAMP_KEYS,
-    NetworkTrain,
-)
+from psfdae_paper.configuration.alignment import CHOICE, NETWORKS, STAMP_KEYS, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
@@ -98,6 +93,7 @@ def train_dae(
         read_product(path, "alignment_states", ("states", "stamps")) for path in (grid, train)
     )
     require(train, large_product.config, STAMP_KEYS, grid_product.config, grid)
+    # The DAE restores stamps one by one, whatever their state and field.
     # 100 states of the large set choose the best epoch; the DAE is not trained on them.
     training = _single_stamps(grid_product["stamps"])
     validation = _single_stamps(large_product["stamps"][:100])
@@ -149,12 +145,14 @@ def train_network(
         training_of,
     )
 
+    # Settings and training data of this kind of network.
     if ALIGNERS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_product(states, "alignment_states", ("states", "stamps"))
     if dae:
         require_origin(dae, STAMP_KEYS, product)
+    # Stamps without noise, with noise that is drawn anew in every epoch, or the DAE's output.
     data = TrainingStates(product["states"], product["stamps"])
     if ALIGNERS[kind].noisy:
         data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
@@ -168,9 +166,11 @@ def train_network(
     described |= {"network": settings.network, "mirrors": settings.mirrors}
 
     def begin(attempt: int) -> NetworkTraining:
+        """Start the training; every attempt starts alike."""
         network = getattr(config, settings.network)
         return training_of(network, data, settings, config.seed, kind)
 
+    # A checkpoint is resumed only if settings and stamps are the same.
     with progress(settings.epochs) as report:
         identity = fingerprint(described | deciding(config), data.stamps)
         training = train(begin, checkpoint, identity, report)
@@ -184,11 +184,24 @@ def train_network(
 def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> TrainingStates:
     """Return states with the DAE's output for a few draws of their noise.
 
-    Each state has one noise level. The stamps of the result have the shape (draws, n, F, d, d).
+    Parameters
+    ----------
+    data : TrainingStates
+        n states with noise-free stamps, and the noise to draw.
+    dae : Dae
+    config : Config
+    kind : str
+        Name of the network, for its settings and its random stream.
+
+    Returns
+    -------
+    TrainingStates
+        States without noise, with stamps of shape (draws, n, F, d, d).
     """
     assert data.noise is not None
     rng = stream(config.seed, "cnn", "noise", kind)
     count = getattr(config, f"train_{kind}").noise_draws
+    # Each state has one noise level, which is the same in all draws.
     level = mixed_levels(data.noise.levels, len(data.states), rng)
     denoised = np.empty((count, *data.stamps.shape), np.float32)
     for draw in denoised:
@@ -222,7 +235,9 @@ def noisy_test_states(
 
 
 def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np.ndarray]:
-    """Load the trained network of a folder, from stamps (n, F, d, d) to states (n, 4).
+    """Load the trained network of a folder, a function from stamps (n, F, d, d) to states (n, 4).
+
+    It estimates the mean over the mirror images of the stamps if the network was trained so.
 
     Raises
     ------
@@ -236,6 +251,7 @@ def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np
     from psfdae_paper.alignment.telescope import mirror_symmetries
 
     torch.set_num_threads(config.evaluation.threads)
+    # The configuration beside the weights describes the network; every value is checked.
     path = folder / CONFIG
     described = read_yaml(path)
     fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
@@ -261,7 +277,13 @@ def _size(value: object) -> int:
 
 
 def require_network(folder: Path, states: Product, name: str | None = None) -> None:
-    """Raise ProductError if a network has been trained for other stamps, or has another name."""
+    """Refuse a network that has been trained for other stamps, or has another name.
+
+    Raises
+    ------
+    ProductError
+        With the values that differ.
+    """
     _, fields, _, side = states["stamps"].shape
     described, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
     require(folder / CONFIG, described, keys, {"fields": fields, "stamp_px": side}, states.path)
@@ -360,8 +382,8 @@ def fit(
     rows, methods = [], methods_of_set(FITTED, test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
     columns = {"states": Column(product["states"], "range", "true states")}
-    # The emulator interpolates stamps between those of the large set; the network's estimate is
-    # the start of the first fit.
+    # The emulator interpolates stamps between those of the large set, and the network's estimate
+    # starts the first fit.
     started = time.perf_counter()
     emulator = StampEmulator(
         wavefronts, operator(), large_product["states"], large_product["stamps"], config.fit
@@ -369,6 +391,7 @@ def fit(
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
+        # Flux and place of the stars are known, or parameters of the fit, too.
         stamp_operator = operator(movable=method.unknown_flux)
         optics = partial(stamps_and_slopes, wavefronts, stamp_operator, emulator=emulator)
         exact = Likelihood(optics, noise_model(config), level)
@@ -393,6 +416,7 @@ def fit(
         fits["converged"].append(final_fit.converged)
         fits["twin_tried"].append(twin_tried)
         fits["twin_won"].append(best_fit.parameters[:, 0] != first_fit.parameters[:, 0])
+    # A column for each of them, with its description.
     about = {
         "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
         "deviance": "twice the log-likelihood missing to a perfect fit",
@@ -425,6 +449,7 @@ def bound(
     require(states, product.config, STAMP_KEYS, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
+    # Bounds with flux and place of the stars known, or unknown: the stamps are then movable.
     methods = methods_of_set(BOUNDS, test_set)
     unknown_flux = [method.unknown_flux for method in methods]
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(unknown_flux))

@@ -62,7 +62,15 @@ class Key(TypedDict):
 def read_errors(
     estimates: Sequence[Path], fits: Sequence[Path]
 ) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Yield key, true states and estimates, (n, 4) each, of every method and noise level."""
+    """Read the estimates of every method and noise level.
+
+    Yields
+    ------
+    key : Key
+    truth, estimate : ndarray, shape (n, 4)
+        True and estimated states, in units of the range.
+    """
+    # Networks, and beside them the constant estimate of the aligned telescope.
     for path in estimates:
         product = read_product(path, "alignment_estimates")
         truth, test_set = product["states"], product.config["test_set"]
@@ -71,10 +79,10 @@ def read_errors(
             yield key, truth, np.zeros_like(truth)
             for column, method in enumerate(LEARNED):
                 yield {**key, "method": method.name}, truth, product["estimates"][row, column]
+    # Maximum-likelihood fits; a product has one noise level.
     for path in fits:
         product = read_product(path, "alignment_fit", ("states", "estimates"))
-        test_set = product.config["test_set"]
-        level = product.config["level"]
+        test_set, level = product.config["test_set"], product.config["level"]
         methods = methods_of_set(FITTED, test_set)
         for method, states in zip(methods, product["estimates"], strict=True):
             key = Key(test_set=test_set, noise_level=level, method=method.name)
@@ -82,7 +90,16 @@ def read_errors(
 
 
 def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Yield key, true states (n, 4) and covariances (n, 4, 4) of every bound and noise level."""
+    """Read the Cramér–Rao bounds of every noise level.
+
+    Yields
+    ------
+    key : Key
+    truth : ndarray, shape (n, 4)
+        True states, in units of the range.
+    covariances : ndarray, shape (n, 4, 4)
+        Bounds on the covariances of unbiased estimates.
+    """
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
         test_set = product.config["test_set"]
@@ -96,7 +113,13 @@ def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.nd
 def require_one_test(
     estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
 ) -> None:
-    """Refuse estimates, fits and bounds that are not of the same telescope, noise and states."""
+    """Refuse estimates, fits and bounds that differ in telescope, noise or states.
+
+    Raises
+    ------
+    ProductError
+        With the first value that differs.
+    """
     same_keys = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
     earlier: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
@@ -104,6 +127,7 @@ def require_one_test(
             product = read_product(path, f"alignment_{kind}", ("states",))
             # Bounds have no noise that is drawn, and so no seed.
             keys = same_keys if kind == "bound" else ("seed", *same_keys)
+            # Compare with all products before; sets of the same name must have the same states.
             for reference in earlier:
                 require(path, product.config, keys, reference.config, reference.path)
                 if product.config["test_set"] == reference.config["test_set"]:
@@ -156,6 +180,7 @@ def tables(
         rows_by_table[errors] += rows.bound_rows(key, covariances, unit)
         if key["method"] == "cramer_rao":
             rows_by_table[correlation] += rows.predicted_correlations(key, covariances)
+    # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
         frame = pd.DataFrame(table_rows).sort_values(
@@ -182,6 +207,7 @@ def paper_tables(
         text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
         write_text(path.with_suffix(".md"), text)
 
+    # One table of errors for each of the paper's noise levels.
     measured = read_table(errors)
     for level in sorted(published("alignment").noise_level.unique()):
         if not np.isclose(measured.noise_level, level).any():
@@ -204,8 +230,10 @@ def time_table(
     """Tabulate the run times of the methods."""
     import pandas as pd
 
+    # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
+    # Seconds and states of each method, over all test sets and noise levels.
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
@@ -269,6 +297,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
         if key["method"] in FIGURE_METHODS and key["noise_level"] > 0:
             error = np.abs(states - truth).mean(axis=1)
             curves[key["noise_level"]][key["method"]] = (size_of(truth), error)
+    # The bound on the mean error of the four numbers.
     count = 0
     for key, truth, covariances in read_bounds(bounds):
         if key["method"] == "cramer_rao":
@@ -292,6 +321,7 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
     from psfdae_paper.evaluation.alignment_figures import twin_ambiguity
 
     limit_threads(1)
+    # In focus, the stamps of a state and of its twin hardly differ; a defocus tells them apart.
     rows, stamp_rows, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
         state, line_stamps = _stamps_of_multiples(config, defocus)
@@ -313,7 +343,15 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
 
 
 def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return a state, and the ray-traced stamps of its multiples with the CCD at a defocus."""
+    """Ray-trace the stamps of multiples of a state whose decentre cancels the coma of its tilt.
+
+    Returns
+    -------
+    state : ndarray, shape (4,)
+        The state in units of the range.
+    stamps : ndarray, shape (61, F, d, d)
+        Stamps of `MULTIPLES` of the state, with the CCD at a defocus of `defocus_m` metres.
+    """
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)

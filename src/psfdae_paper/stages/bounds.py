@@ -31,7 +31,6 @@ from psfdae_paper.bounds.floor import Comparison
 from psfdae_paper.bounds.posterior import Bank, jittered_templates
 from psfdae_paper.bounds.tables import (
     COLUMNS,
-    EFFICIENCY_COLUMNS,
     GROWTH_COLUMNS,
     PAPER_COLUMNS,
     POSTERIOR_MEANS,
@@ -39,7 +38,7 @@ from psfdae_paper.bounds.tables import (
     add_exact,
     add_floor,
     add_means,
-    compared,
+    compare_methods,
     paper_verdict,
 )
 from psfdae_paper.configuration.command import command
@@ -103,11 +102,10 @@ def bounds(
         add_floor(config, product, tables)
         bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
         require(bank, bank_product.config, STARS, product.config, stars)
-        framed_stars, field, peak = (bank_product[k] for k in ("framed", "field_index", "peak"))
         settings = bank_product.config
         sizes = (settings["grid"]["points"], settings["framing"]["jitter_px"])
         # Only the bound that is given the field uses the stars after the first `bank_stars`.
-        large_bank = Bank(framed_stars, field, peak, *sizes)
+        large_bank = Bank.of(bank_product.arrays, *sizes)
         count, fields = settings["bounds"]["bank_stars"], large_bank.points**2
         if count < fields:
             raise ProductError(
@@ -115,7 +113,7 @@ def bounds(
                 "a star for every field"
             )
         small_bank = large_bank.take(np.arange(count))
-        add_means(config, small_bank, large_bank, bank_product, product, static, tables)
+        add_means(config, small_bank, large_bank, product, static, tables)
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -221,8 +219,8 @@ def efficiency(
         errors = by_cell[key]
         if errors.method.isin(POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
-        rows += compared(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
-    write_csv(out, pd.DataFrame(rows, columns=EFFICIENCY_COLUMNS))
+        rows += compare_methods(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
+    write_csv(out, pd.DataFrame(rows).drop(columns="split"))
 
 
 @command("paper-rows")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import click
 
-from psfdae.cli import found, stage
+from psfdae.cli import command_modules, stage
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import Groups, command
 
@@ -25,12 +25,14 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
         settings = load(overrides)
     else:
         # "alignment model", "alignment_model" and "alignment-model" name the same stage.
-        names = {_key(name): name for name in found()}
+        names = {_key(name): name for name in command_modules()}
         reader = None
         if _key(only) in names:
             reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
         if reader is None:
-            raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
+            raise click.BadParameter(
+                f"{only!r} is not one of {', '.join(sorted(command_modules()))}"
+            )
         groups = Groups(reader.names({}), reader.choice)
         settings = load_stage(groups.names({}), groups.with_choice(overrides))
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)

@@ -45,7 +45,7 @@ def fit(
     method_class = method(name)
     limit_threads(method_class.threads(config))
     product = read_stars(stars, fits.learnt(method_class, reference))
-    checkpoint_path = checkpoint or fits.beside(method_class, out, "checkpoint.pt")
+    checkpoint_path = checkpoint or fits.path_beside(method_class, out, "checkpoint.pt")
     data = training_set(config, method_class, product, split, reference, checkpoint=checkpoint_path)
     # Warm start: a fit to templates begins with the result of one to the realisations.
     if start is not None:

@@ -64,7 +64,7 @@ def run(config: Config, task: Task, name: str) -> Measured:
     epochs, stopped = None, False
     if HISTORY in fits.storage_of(method_class).diagnostics:
         # The history has the duration of the training, with all its parts if it was interrupted.
-        last_epoch = read_table(fits.beside(method_class, place, HISTORY)).iloc[-1]
+        last_epoch = read_table(fits.path_beside(method_class, place, HISTORY)).iloc[-1]
         seconds, cpu_seconds = float(last_epoch["seconds"]), float(last_epoch["cpu_seconds"])
         groups = method_class.settings(settings).values()
         epochs = int(last_epoch["epoch"])
