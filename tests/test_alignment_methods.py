@@ -118,20 +118,20 @@ def tiny():
 
 def _training(config, epochs, data, seed=3, network=CNN):
     stamps, states = data
-    usual = config.train_original if network is CNN else config.train_noise_trained
-    settings = usual.model_copy(
+    defaults = config.train_original if network is CNN else config.train_noise_trained
+    settings = defaults.model_copy(
         update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
     )
     return NetworkTraining(TrainingStates(states, stamps), network, settings, seed, "test")
 
 
-def _train(path, *given, report=lambda row: None):
-    return train(lambda attempt: _training(*given), path, path.name, report)
+def _train(path, *arguments, report=lambda row: None):
+    return train(lambda attempt: _training(*arguments), path, path.name, report)
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
 def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, network, tmp_path):
-    whole, other_seed = (
+    complete, other_seed = (
         _train(tmp_path / str(seed), config, 4, tiny, seed, network) for seed in (3, 4)
     )
 
@@ -147,10 +147,10 @@ def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, networ
         report=lambda row: epochs.append(row["epoch"]),
     )
     assert epochs == [3, 4]
-    assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
-    for key, value in whole.result.items():
+    assert [row["loss"] for row in resumed.history] == [row["loss"] for row in complete.history]
+    for key, value in complete.result.items():
         assert torch.equal(value, resumed.result[key]), key
-    assert not torch.equal(whole.model.linear.weight, other_seed.model.linear.weight)
+    assert not torch.equal(complete.model.linear.weight, other_seed.model.linear.weight)
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
@@ -168,9 +168,9 @@ def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, stat
     assert np.cov(features.T) == pytest.approx(np.eye(10), abs=1e-3)
     assert features.mean(axis=0) == pytest.approx(np.zeros(10), abs=1e-3)
     # No other ten numbers hold more of the stamps.
-    kept = np.square(features / np.linalg.norm(model.axes.numpy(), axis=0)).sum()
+    held_variance = np.square(features / np.linalg.norm(model.axes.numpy(), axis=0)).sum()
     largest = np.linalg.svd(scaled.numpy() - model.mean.numpy(), compute_uv=False)[:10]
-    assert kept == pytest.approx(np.square(largest).sum(), rel=1e-3)
+    assert held_variance == pytest.approx(np.square(largest).sum(), rel=1e-3)
 
 
 # --- batches
@@ -209,8 +209,8 @@ def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, st
         scaled = scale_stamps(np.asarray(stamps, np.float32))
         parts = training.parts[0].sum(axis=1)
         assert parts == pytest.approx(training.model.components(scaled).numpy(), abs=1e-3)
-    many = np.repeat(np.mean(stamps, axis=0, keepdims=True), 1500, axis=0)
-    errors = noise.draw(many, level, np.random.default_rng(2)) - many
+    repeated = np.repeat(np.mean(stamps, axis=0, keepdims=True), 1500, axis=0)
+    errors = noise.draw(repeated, level, np.random.default_rng(2)) - repeated
     spread = training.model.components(scale_stamps(errors)).numpy().std(axis=0)
     expected = np.sqrt(np.square(training.roots[0]).sum(axis=0))
     # A standard deviation of 1500 draws scatters by 1.8 %.
@@ -245,24 +245,24 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 
 @pytest.mark.parametrize("movable", [False, True])
 def test_noise_free_parameters_are_recovered(model, config, noise, movable):
-    """From 0.08 of the range aside; with flux and place free, those of another star, too."""
+    """The start is 0.08 of the range aside; with flux and place unknown, they are found, too."""
     operator = _optics(config, movable, "complex128")
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
-    given = parameters_of(model, operator, truth)
-    given[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, given[:, 4:].shape)
-    images, _ = stamps_and_slopes(model, operator, given)
-    flux = 1 + given[:, 4::3] if movable else np.ones((2, 9))
+    parameters = parameters_of(model, operator, truth)
+    parameters[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, parameters[:, 4:].shape)
+    images, _ = stamps_and_slopes(model, operator, parameters)
+    flux = 1 + parameters[:, 4::3] if movable else np.ones((2, 9))
     assert images.sum(axis=(2, 3)) == pytest.approx(flux)
     start = parameters_of(model, operator, truth + 0.08)
     fit = fit_states(_likelihood(model, operator, noise, 0.002), images, start, EXACT)
     assert fit.converged.all()
-    assert fit.parameters == pytest.approx(given, abs=1e-6)
+    assert fit.parameters == pytest.approx(parameters, abs=1e-6)
     assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("movable", [False, True])
 def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
-    """At low noise the estimator is efficient: χ² of 20 × 4 errors within its 99.9 % range."""
+    """The estimator is efficient at low noise: χ² of 20 × 4 errors within its 99.9 % range."""
     operator = _optics(config, movable)
     level, truth = 2e-4, states[:20]
     images = noise.draw(stamps[:20], level, np.random.default_rng(7))
@@ -273,23 +273,23 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
     assert 45 < chi2 < 128
     # Pixels minus parameters, with the spread √(2 N) of χ².
-    pixels, free = 9 * 16 * 16, 4 + 27 * movable
+    pixels, fitted = 9 * 16 * 16, 4 + 27 * movable
     assert (-2 * fit.height).mean() == pytest.approx(
-        pixels - free, abs=5 * np.sqrt(2 * pixels / 20)
+        pixels - fitted, abs=5 * np.sqrt(2 * pixels / 20)
     )
 
 
 def test_free_flux_and_place_cost_precision(model, config, operator, noise, states):
-    """By a quarter to a third, and never gain in any direction."""
+    """Errors grow by a quarter to a third, and shrink in no direction."""
     covariances = bound_covariances(
         model, _optics(config, True), noise, [0.002], states[:12], [False, True]
     )
-    fixed, free = covariances[:, 0]
-    alone = bound_covariances(model, operator, noise, [0.002], states[:12], [False])[0, 0]
-    assert fixed == pytest.approx(alone, rel=1e-3)
-    ratio = expected_abs_error(free).mean() / expected_abs_error(fixed).mean()
+    known_flux, unknown = covariances[:, 0]
+    without_flux = bound_covariances(model, operator, noise, [0.002], states[:12], [False])[0, 0]
+    assert known_flux == pytest.approx(without_flux, rel=1e-3)
+    ratio = expected_abs_error(unknown).mean() / expected_abs_error(known_flux).mean()
     assert 1.2 < ratio < 1.35
-    assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
+    assert np.linalg.eigvalsh(unknown - known_flux).min() > -1e-9
 
 
 def test_emulator_of_few_states(model, operator, states, stamps):
@@ -300,9 +300,9 @@ def test_emulator_of_few_states(model, operator, states, stamps):
     emulated, slopes = emulator(mirror.states(states))
     assert emulated == pytest.approx(mirror.stamps(stamps), abs=2e-3)
     assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
-    step, asked = 1e-3 * np.eye(4)[2], states[:4] * 0.9
-    expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3
-    off = np.abs(emulator(asked)[1][:, :, 2] - expected)
+    step, queries = 1e-3 * np.eye(4)[2], states[:4] * 0.9
+    expected = (emulator(queries + step)[0] - emulator(queries - step)[0]) / 2e-3
+    off = np.abs(emulator(queries)[1][:, :, 2] - expected)
     assert off.max() < 0.1 * np.abs(expected).max()
 
 
@@ -318,8 +318,8 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, mova
     twin = parameters_of(model, operator, twin_states(model, truth, noll))
     once = settings.model_copy(update={"iterations": 1})
     stuck = fit_states(likelihood, images, twin, once)
-    others = twin_states(model, stuck.parameters, noll)
-    fit, tried = refit_twins(likelihood, images, stuck, others, settings)
-    assert tried.all()
+    twins = twin_states(model, stuck.parameters, noll)
+    fit, in_range = refit_twins(likelihood, images, stuck, twins, settings)
+    assert in_range.all()
     assert fit.parameters[:, :4] == pytest.approx(truth, abs=2e-3)
     assert (-2 * fit.height)[0] < (-2 * stuck.height)[0]

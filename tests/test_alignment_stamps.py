@@ -55,7 +55,7 @@ def test_mean_slope_of_zernikes_over_the_annulus():
 
 
 def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
-    """To a hundredth of a pixel over the image's period, and the better the longer it is."""
+    """The tolerance is a hundredth of a pixel over the image's period; a longer one is better."""
     zernikes, worst = shown_zernikes(tracer), []
     for samples in (126, 254):
         pupil = annular_pupil(samples, OBSCURATION)
@@ -90,7 +90,7 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
 @pytest.mark.parametrize("product_cost", [0.0, np.inf])
 @pytest.mark.parametrize("kind", [PointSampling, PeriodSampling])
 def test_derivatives_by_coefficients_are_differences(kind, product_cost):
-    """By products of polynomials, and each direction by itself."""
+    """Both ways are tested: products of polynomials, and each direction by itself."""
     pupil = annular_pupil(48, 0.3)
     sampling = kind(pupil, 8, 2.0, "complex128")
     sampling.product_cost = product_cost
@@ -118,7 +118,7 @@ def test_derivatives_by_state_are_differences(model, exact):
 
 
 def test_every_stamp_of_the_range_holds_its_light(operator, grid):
-    """At least 0.99 in the corners of the range, where the images are widest."""
+    """Corners of the range, where the images are widest, have 0.99 at least."""
     states, zernikes = grid
     corners = (np.abs(states) == 1).all(axis=1)
     stamps, energy = operator(zernikes[corners])

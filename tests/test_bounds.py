@@ -97,7 +97,7 @@ def test_fields_stay_equally_likely():
 
 
 def test_mirrored_crops_are_the_stars_of_mirrored_fields(scene1):
-    """On the axes, the diagonals, the centre and elsewhere, and all their mirror images."""
+    """Fields on axes, diagonals, in the centre and elsewhere, and all their mirror images."""
     position = relative_field(scene1.grid)
     field = np.array([60, 5, 115, 57, 0, 108, 32, 85])
     rng = np.random.default_rng(8)
@@ -172,11 +172,11 @@ def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members
 def test_given_the_field_only_its_images_count(level, corners, bank, members, noise):
     """The centre is its own orbit; corners are mirror images of each other."""
     images, field, _, weight = members
-    few = bank.take(np.flatnonzero(np.isin(bank.field, corners)))
+    orbit_bank = bank.take(np.flatnonzero(np.isin(bank.field, corners)))
     for corner in corners:
         noisy = noise.draw(images[field == corner][[3, 50]], level, np.random.default_rng(2))
         likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
-        sums = posterior_sums(few, noisy, likelihood, chunk=7, star_field=np.full(2, corner))
+        sums = posterior_sums(orbit_bank, noisy, likelihood, chunk=7, star_field=np.full(2, corner))
         inside = (images, field, None, weight * (field == corner))
         w = brute_force(inside, noisy, likelihood.flux, noise.background)
         expected = np.einsum("nk,khw->nhw", w, images).reshape(2, -1)
@@ -217,7 +217,7 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
 
 
 def test_derivatives_are_those_of_the_propagated_stamp(scene1):
-    """Of a star away from every mirror axis, at N = 160."""
+    """The star is away from every mirror axis, at N = 160."""
     field, offset, step = np.array([0.2, -0.6]), np.array([-3, 2]), 1e-4
     star = np.array([0.55, 3.7, 4.3, 1.7, -0.12])
     pupil = annular_pupil(160, scene1.telescope.obscuration)
@@ -261,12 +261,12 @@ def test_floor_of_a_linear_gaussian_problem():
 def test_comparison_is_paired_and_tolerant():
     rng = np.random.default_rng(9)
     field, bound = np.arange(400) % 20, rng.exponential(1.0, 400)
-    same = compare(bound, bound, field)
-    assert (same.efficiency, same.difference, same.beaten) == (1.0, 0.0, False)
-    worse = compare(bound + 0.1, bound, field)
-    assert worse.difference == pytest.approx(0.1)
-    assert worse.stderr < 1e-12  # the stars' own scatter is common to both
-    assert not worse.beaten
+    equal = compare(bound, bound, field)
+    assert (equal.efficiency, equal.difference, equal.beaten) == (1.0, 0.0, False)
+    shifted = compare(bound + 0.1, bound, field)
+    assert shifted.difference == pytest.approx(0.1)
+    assert shifted.stderr < 1e-12  # the stars' own scatter is common to both
+    assert not shifted.beaten
     assert not compare(0.96 * bound, bound, field).beaten
     assert compare(0.8 * bound, bound, field).beaten
     assert np.isnan(compare(bound, 0 * bound, field).efficiency)

@@ -102,24 +102,25 @@ def sampled(model, modes, stars, noise, draws=2000):
 def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
     unknown_field, known_field = sampled(model, modes, stars, noise)
     mean, share, mean_in_field = exact
-    free, in_field = merge(unknown_field.parts), merge(known_field.parts)
+    blind, own_field = merge(unknown_field.parts), merge(known_field.parts)
     error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
-    assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
-    assert ((in_field.mean_image - mean_in_field) ** 2).mean() < 0.01 * error
-    assert free.template_weight / free.weight_sum[:, None, None] == pytest.approx(share, abs=0.03)
+    assert ((blind.mean_image - mean) ** 2).mean() < 0.01 * error
+    assert ((own_field.mean_image - mean_in_field) ** 2).mean() < 0.01 * error
+    probability = blind.template_weight / blind.weight_sum[:, None, None]
+    assert probability == pytest.approx(share, abs=0.03)
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
-    assert (in_field.template_weight[:, 1:] == 0).all()
-    assert unknown_field.with_truth.mean_image == pytest.approx(free.mean_image, abs=1e-12)
-    assert ((free.effective_size > 500) & (free.effective_size < 2100)).all()
+    assert (own_field.template_weight[:, 1:] == 0).all()
+    assert unknown_field.with_truth.mean_image == pytest.approx(blind.mean_image, abs=1e-12)
+    assert ((blind.effective_size > 500) & (blind.effective_size < 2100)).all()
 
 
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
-    one, two = (sampled(model, modes, stars, noise, 80)[0].with_truth for _ in range(2))
-    assert one.image_sum.tobytes() == two.image_sum.tobytes()
+    first, second = (sampled(model, modes, stars, noise, 80)[0].with_truth for _ in range(2))
+    assert first.image_sum.tobytes() == second.image_sum.tobytes()
     monkeypatch.setattr(sampling, "STARS_AT_ONCE", 1)
     single = sampled(model, modes, stars, noise, 80)[0].with_truth
-    assert single.mean_image == pytest.approx(one.mean_image, abs=1e-6)
+    assert single.mean_image == pytest.approx(first.mean_image, abs=1e-6)
 
 
 def test_stamps_are_those_of_the_simulator(model, stars):
@@ -132,43 +133,43 @@ def test_stamps_are_those_of_the_simulator(model, stars):
 def test_twins_give_the_same_image(model, noise):
     """Twice as far from the axis: half the coma, a quarter of the astigmatism."""
     field = np.array([[0.4, 0.2], [0.8, 0.4], [-0.4, 0.6]])
-    wide = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
-    near = np.array([[0.0, 0.8, 0.4, 0.8, 0.0]])
-    far = near / [1, 2, 4, 4, 8]
+    broad = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
+    z = np.array([[0.0, 0.8, 0.4, 0.8, 0.0]])
+    z_far = z / [1, 2, 4, 4, 8]
     middle = np.array([[1, 2]])
-    images = [wide.stamps(z, np.array([k]), middle) for k, z in enumerate((near, far))]
+    images = [broad.stamps(c, np.array([k]), middle) for k, c in enumerate((z, z_far))]
     assert images[1] == pytest.approx(images[0], abs=1e-5)
-    odd = near * [-1, 1, -1, -1, 1]  # the even part negated
-    assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
+    z_negated = z * [-1, 1, -1, -1, 1]  # the even part negated
+    assert broad.stamps(z_negated, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
     none = np.zeros(1, int)
-    start = Modes.at(none, none, middle, none, near)
-    others = find_twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
-    there = (others.field == 1) & (others.offset == middle).all(axis=1)
-    assert others.z[there][0] == pytest.approx(far[0], abs=0.02)
+    start = Modes.at(none, none, middle, none, z)
+    twins = find_twins(start, Likelihood.of(noise, 1e-4, images[0]), broad)
+    at_twin = (twins.field == 1) & (twins.offset == middle).all(axis=1)
+    assert twins.z[at_twin][0] == pytest.approx(z_far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
-    assert len(others.star) > 1
+    assert len(twins.star) > 1
 
 
 def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
-    """Of two modes with nearly the same evidence, the one with more goes first."""
+    """Two modes with nearly the same evidence: the one with more comes first."""
     field = np.array([[0.4, 0.2], [0.8, 0.4], [-0.4, 0.6]])
-    wide = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
+    broad = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
     z = np.array([[0.0, 0.3, 0.2, 0.3, 0.0], [0.5, 2.0, 1.0, 2.0, 0.5]])
     number, middle = np.arange(2), np.array([[1, 2], [0, 0]])
-    images = wide.stamps(z, 2 * number, middle)
+    images = broad.stamps(z, 2 * number, middle)
     likelihood = Likelihood.of(noise, 1e-4, images)
     start = Modes.at(number, 2 * number, middle, 0 * number, z)
-    modes = climb(start, StarPosteriors(likelihood.counts(images), likelihood, wide))
+    modes = climb(start, StarPosteriors(likelihood.counts(images), likelihood, broad))
     for first in range(2):
         evidence = np.where(number == first, 100.0, 99.0)
-        both = replace(modes, star=0 * number, evidence=evidence)
-        other = find_twins(both, likelihood, wide)
+        two_modes = replace(modes, star=0 * number, evidence=evidence)
+        twins = find_twins(two_modes, likelihood, broad)
         at = [
-            np.flatnonzero((other.field == f) & (other.offset == o).all(axis=1))[0]
+            np.flatnonzero((twins.field == f) & (twins.offset == o).all(axis=1))[0]
             for f, o in zip(2 * number, middle, strict=True)
         ]
         assert at[first] < at[1 - first]
-        assert other.z[at] == pytest.approx(modes.z, abs=0.1)
+        assert twins.z[at] == pytest.approx(modes.z, abs=0.1)
 
 
 def test_density_of_draws_is_students_t():
@@ -183,9 +184,9 @@ def test_density_of_draws_is_students_t():
     for mode in number:
         scale = factor[mode] @ factor[mode].T
         law = multivariate_t(modes.z[mode], scale, FREEDOM)
-        there = (field == mode) & (np.arange(30) < 20)
-        assert density[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
-        assert (density[mode, ~there] == -np.inf).all()
+        at_mode = (field == mode) & (np.arange(30) < 20)
+        assert density[mode, at_mode] == pytest.approx(law.logpdf(z[at_mode]), abs=1e-9)
+        assert (density[mode, ~at_mode] == -np.inf).all()
 
 
 def aside(stars, model, noise, level, shift):
@@ -214,12 +215,12 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
 
 
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
-    wrong, truth, posteriors = aside(stars, model, noise, 1e-3, (0, 1))
-    both = wrong + climb(truth, posteriors)
-    one, two = (
+    misplaced, truth, posteriors = aside(stars, model, noise, 1e-3, (0, 1))
+    with_truth = misplaced + climb(truth, posteriors)
+    first, second = (
         sample_posterior(modes, posteriors, np.zeros(1, int), 100, [stream(1, "test", 0)])[1]
-        for modes in (wrong, both)
+        for modes in (misplaced, with_truth)
     )
-    for part, other in zip(one.parts, two.parts, strict=True):
-        assert part.image_sum.tobytes() == other.image_sum.tobytes()
-    assert two.with_truth.image_sum.tobytes() != one.with_truth.image_sum.tobytes()
+    for part, expected in zip(first.parts, second.parts, strict=True):
+        assert part.image_sum.tobytes() == expected.image_sum.tobytes()
+    assert second.with_truth.image_sum.tobytes() != first.with_truth.image_sum.tobytes()

@@ -25,9 +25,9 @@ SIZES += (f"bounds.position_stars={POSITIONS}", "bounds.star_draws=60")
 SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1")
 
 
-def settings(stage, dataset, *more):
+def settings(stage, dataset, *words):
     reads = stage if isinstance(stage, tuple) else stage.stage.settings.reads
-    return load_stage(reads, (f"dataset={dataset}", *SIZES, *more))
+    return load_stage(reads, (f"dataset={dataset}", *SIZES, *words))
 
 
 def build(folder, dataset):
@@ -35,12 +35,12 @@ def build(folder, dataset):
     stars.templates(settings(STATIC, dataset), folder / "templates.h5")
     stars.stars(settings(SIMULATION, dataset), folder / "templates.h5", folder / "stars.h5")
     config = settings(bounds.bounds, dataset)
-    drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
-    if drawn:
-        bounds.bank(config, drawn)
+    bank = folder / "bank.h5" if config.stars.aberration_fraction else None
+    if bank:
+        bounds.bank(config, bank)
     products = (folder / "stars.h5", folder / "templates.h5")
     tables = [folder / name for name in ("growth.csv", "bounds.parquet", "bounds.csv")]
-    bounds.bounds(config, dataset, *products, *tables, drawn)
+    bounds.bounds(config, dataset, *products, *tables, bank)
     return folder
 
 
@@ -56,14 +56,14 @@ def scene_2(tmp_path_factory):
 
 def evaluated(folder, dataset, factor, mean="bayes"):
     """Per-star errors of a made-up method, `factor` times those of a posterior mean."""
-    best = pd.read_parquet(folder / "bounds.parquet")
-    best = best[best.method == mean].assign(method="lmmse", dataset=dataset)
-    best["mse"] *= factor
+    rows = pd.read_parquet(folder / "bounds.parquet")
+    rows = rows[rows.method == mean].assign(method="lmmse", dataset=dataset)
+    rows["mse"] *= factor
     # The stage evaluate knows all test stars, in its own order, and other splits.
-    extra = best.assign(star=best.star + 1000, mse=1.0)
-    held_out = best.assign(split="held_out", mse=0.0)
+    extra = rows.assign(star=rows.star + 1000, mse=1.0)
+    held_out = rows.assign(split="held_out", mse=0.0)
     path = folder / f"evaluation_{factor}.parquet"
-    pd.concat([extra, best[::-1], held_out]).to_parquet(path)
+    pd.concat([extra, rows[::-1], held_out]).to_parquet(path)
     return path
 
 
@@ -75,15 +75,15 @@ def compared(folder, dataset, factor, mean="bayes"):
 
 
 def test_bank_holds_none_of_the_stars(scene_1):
-    drawn = read_product(scene_1 / "bank.h5", "bank")
+    bank = read_product(scene_1 / "bank.h5", "bank")
     seidel = read_product(scene_1 / "stars.h5", "stars", ("seidel",))["seidel"]
     count = BANK + POSITIONS
-    assert drawn["seidel"].shape == (count, 5)
-    assert len(np.unique(drawn["seidel"], axis=0)) == count
-    assert not np.isin(drawn["seidel"], seidel).any()
-    assert np.bincount(drawn["field_index"][:BANK]).tolist() == [8] + 8 * [7]
-    assert drawn["framed"].shape == (count, 20, 20)
-    central = drawn["framed"][:, 2:-2, 2:-2].reshape(count, -1)
+    assert bank["seidel"].shape == (count, 5)
+    assert len(np.unique(bank["seidel"], axis=0)) == count
+    assert not np.isin(bank["seidel"], seidel).any()
+    assert np.bincount(bank["field_index"][:BANK]).tolist() == [8] + 8 * [7]
+    assert bank["framed"].shape == (count, 20, 20)
+    central = bank["framed"][:, 2:-2, 2:-2].reshape(count, -1)
     # Of pixels that are equally bright, within `framing.tie`, the first is in the middle.
     assert (central[:, 8 * 16 + 8] > (1 - 1.1e-4) * central.max(axis=1)).all()
 
@@ -117,9 +117,9 @@ def test_a_posterior_mean_rests_on_the_bank_or_on_samples(scene_1):
     assert list(growth.columns) == bounds.GROWTH_COLUMNS
     table = pd.read_csv(scene_1 / "bounds.csv")
     keys = ["reference", "method", "noise_level"]
-    best = table[table.method != "floor"].set_index(keys)
+    means = table[table.method != "floor"].set_index(keys)
     for key, sizes in growth.groupby(keys):
-        row = best.loc[key]
+        row = means.loc[key]
         assert row.draws == (60 if row.found == "samples" else sizes.draws.max())
         assert row.sampled == {"bank": 0, "samples": STARS}.get(row.found, row.sampled)
         if row.found == "bank":
@@ -131,8 +131,8 @@ def test_a_posterior_mean_rests_on_the_bank_or_on_samples(scene_1):
     # Bank and positions are doubled from the least; a quarter where the bank is hopelessly thin.
     assert set(growth[growth.method == "bayes"].draws) == {4, 8, 16, 32, BANK}
     assert growth[growth.method == "bayes_position"].draws.max() == BANK + POSITIONS
-    assert set(best.found) >= {"bank", "samples"}
-    assert set(best.tight) == {"yes", "no"}
+    assert set(means.found) >= {"bank", "samples"}
+    assert set(means.tight) == {"yes", "no"}
 
 
 def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
@@ -152,14 +152,14 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
 def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
     outputs = [tmp_path / name for name in ("a.csv", "b.csv", "c.parquet")]
     products = (scene_1 / "stars.h5", scene_1 / "templates.h5")
-    other, few = tmp_path / "other.h5", tmp_path / "few.h5"
-    bounds.bank(settings(bounds.bounds, "dataset3", "bounds.bank_stars=9"), other)
-    bounds.bank(settings(bounds.bounds, "dataset6", "bounds.bank_stars=8"), few)
+    dataset3_bank, small_bank = tmp_path / "other.h5", tmp_path / "few.h5"
+    bounds.bank(settings(bounds.bounds, "dataset3", "bounds.bank_stars=9"), dataset3_bank)
+    bounds.bank(settings(bounds.bounds, "dataset6", "bounds.bank_stars=8"), small_bank)
     config = settings(bounds.bounds, "dataset6")
     for message, *bank in (
-        (r"other\.h5: stars\.aberration_fraction = 0\.1", other),
+        (r"other\.h5: stars\.aberration_fraction = 0\.1", dataset3_bank),
         ("a bank is needed",),
-        (r"few\.h5: bounds\.bank_stars = 8", few),
+        (r"few\.h5: bounds\.bank_stars = 8", small_bank),
     ):
         with pytest.raises(ProductError, match=message):
             bounds.bounds(config, "dataset6", *products, *outputs, *bank)
@@ -186,24 +186,24 @@ def test_scene_2_is_exact(scene_2):
     table = pd.read_csv(scene_2 / "bounds.csv")
     assert set(table.method) == {"bayes", "bayes_position"}
     assert set(table.tight) == {"yes"}
-    right = table[table.metric == "p_right"].sort_values("noise_level").value
-    assert (np.diff(right) < 0).all()
-    assert right.iloc[0] > 0.999
+    p_right = table[table.metric == "p_right"].sort_values("noise_level").value
+    assert (np.diff(p_right) < 0).all()
+    assert p_right.iloc[0] > 0.999
     errors = table[table.metric == "mse"].sort_values("noise_level").groupby("method").value
-    free, given = (errors.get_group(name).to_numpy() for name in ("bayes", "bayes_position"))
-    assert free[0] == 0.0
-    assert free[-1] > 1e-9
-    assert (given <= free).all()
-    assert given[-1] < free[-1]  # only its centring is left to find
+    unknown_field, known_field = (errors.get_group(name).to_numpy() for name in POSTERIOR_MEANS)
+    assert unknown_field[0] == 0.0
+    assert unknown_field[-1] > 1e-9
+    assert (known_field <= unknown_field).all()
+    assert known_field[-1] < unknown_field[-1]  # only its centring is left to find
     assert pd.read_csv(scene_2 / "growth.csv").empty
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.5, "ok"), (1e-3, "beaten")])
-@pytest.mark.parametrize(("given", "mean"), [(False, "bayes"), (True, "bayes_position")])
+@pytest.mark.parametrize(("knows_field", "mean"), [(False, "bayes"), (True, "bayes_position")])
 def test_a_method_is_judged_by_the_mean_of_what_it_is_given(
-    scene_1, monkeypatch, factor, verdict, given, mean
+    scene_1, monkeypatch, factor, verdict, knows_field, mean
 ):
-    monkeypatch.setattr(method("lmmse"), "needs", Needs(level=True, position=given))
+    monkeypatch.setattr(method("lmmse"), "needs", Needs(level=True, position=knows_field))
     table = compared(scene_1, "dataset6", factor, mean)
     rows = table[table.method == "lmmse"]
     assert set(rows.bound) == {mean, "floor"}
@@ -215,9 +215,9 @@ def test_a_method_is_judged_by_the_mean_of_what_it_is_given(
     assert floor.efficiency.to_numpy() == pytest.approx(floor.mse_bound / floor.mse, rel=1e-5)
     # At low noise a few stars in doubtful fields have most of the error, and its uncertainty.
     assert set(tight[tight.noise_level > 0.005].verdict) == {verdict}
-    assert given or set(floor.verdict) == {verdict}
+    assert knows_field or set(floor.verdict) == {verdict}
     thin = rows[(rows.bound == mean) & (rows.tight == "no")]
-    assert given or len(thin)
+    assert knows_field or len(thin)
     assert thin[["verdict", "efficiency"]].isna().all(axis=None)
     # Posterior means respect the floor.
     means = table[table.method.isin(POSTERIOR_MEANS)]
@@ -239,8 +239,8 @@ def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
 
 def test_same_config_gives_the_same_bytes(scene_1, tmp_path):
     bounds.bank(settings(bounds.bounds, "dataset6"), tmp_path / "bank.h5")
-    with h5py.File(tmp_path / "bank.h5") as one, h5py.File(scene_1 / "bank.h5") as two:
-        assert (one["framed"][()] == two["framed"][()]).all()
+    with h5py.File(tmp_path / "bank.h5") as first, h5py.File(scene_1 / "bank.h5") as second:
+        assert (first["framed"][()] == second["framed"][()]).all()
 
 
 def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
@@ -271,9 +271,9 @@ def test_a_row_of_the_paper_is_judged_by_a_tight_bound_alone(tmp_path, bound, ti
     rows = [column | limit | {"reference": name} for name in ("realisation", "template")]
     rows += [rows[0] | {"metric": "p_right"}, rows[0] | {"method": "bayes_position"}]
     pd.DataFrame(rows).to_csv(tmp_path / "bounds.csv")
-    ours = column | {"reference": "realisation", "bound": "bayes", "method": "dae", "mse": 3e-6}
-    others = [ours | {"method": "lmmse"}, ours | {"bound": "floor"}, ours | {"dataset": "dataset7"}]
-    pd.DataFrame([ours, *others]).to_csv(tmp_path / "efficiency.csv")
+    row = column | {"reference": "realisation", "bound": "bayes", "method": "dae", "mse": 3e-6}
+    ignored = [row | {"method": "lmmse"}, row | {"bound": "floor"}, row | {"dataset": "dataset7"}]
+    pd.DataFrame([row, *ignored]).to_csv(tmp_path / "efficiency.csv")
     out = tmp_path / "paper.csv"
     bounds.paper_rows_table(tmp_path / "bounds.csv", tmp_path / "efficiency.csv", out)
     (row,) = pd.read_csv(out).to_dict("records")

@@ -39,7 +39,7 @@ def test_the_error_of_an_exact_posterior_mean_is_its_variance():
 
 @pytest.mark.parametrize(("assumed", "sign"), [(0.5, 1), (2.0, -1)])
 def test_too_sure_and_too_unsure_are_both_seen(assumed, sign):
-    """With half the noise the variance is 0.11 and the error larger, with twice it is 0.33."""
+    """The variance is 0.11 with half the noise, and the error larger; 0.33 with twice the noise."""
     score = calibration(*gaussian(assumed), FIELD)
     assert sign * score > 10
     assert SURE.tight
@@ -47,9 +47,9 @@ def test_too_sure_and_too_unsure_are_both_seen(assumed, sign):
 
 
 def test_variances_that_are_the_errors_need_no_standard_error():
-    ones = np.ones(STARS)
-    assert calibration(ones, ones, FIELD) == 0.0
-    assert calibration(2 * ones, ones, FIELD) == np.inf
+    errors = np.ones(STARS)
+    assert calibration(errors, errors, FIELD) == 0.0
+    assert calibration(2 * errors, errors, FIELD) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -59,11 +59,11 @@ def test_every_part_of_the_evidence_is_needed(but):
     assert not replace(SURE, **but).tight
 
 
-@pytest.mark.parametrize(("few", "missing", "low"), [(4, 0, 300), (5, 0, 3), (2, 3, 3), (0, 5, 0)])
-def test_one_in_a_hundred_may_have_few_samples_or_none(few, missing, low):
+@pytest.mark.parametrize(("thin", "missing", "low"), [(4, 0, 300), (5, 0, 3), (2, 3, 3), (0, 5, 0)])
+def test_one_in_a_hundred_may_have_few_samples_or_none(thin, missing, low):
     mse, variance = gaussian()
     ess = np.full(STARS, 300.0)
-    ess[:few] = 3.0
+    ess[:thin] = 3.0
     mse[10 : 10 + missing] = np.nan
     evidence = Evidence.of(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
     assert evidence.ess_low == low
@@ -71,7 +71,7 @@ def test_one_in_a_hundred_may_have_few_samples_or_none(few, missing, low):
 
 
 def measured(mse, ess=300.0):
-    """Rows of `_measures` that are calibrated: errors, variances, effective sample sizes."""
+    """Rows of `star_measures` that are calibrated: errors, variances, effective sample sizes."""
     return np.stack([mse, mse, mse, mse, np.full(STARS, ess)])
 
 
@@ -81,11 +81,11 @@ def estimates(mse, helped):
 
 def test_a_mode_undetected_with_the_field_given_is_not_tight():
     """One star of 400 whose mode only the truth leads to: a fifth of the error."""
-    right = gaussian()[0]
-    wrong = right.copy()
-    wrong[7] += 0.25 * right.sum()
-    assert estimates(right, right).evidence(0, FIELD).tight
-    evidence = estimates(wrong, right).evidence(0, FIELD)
+    exact = gaussian()[0]
+    without_mode = exact.copy()
+    without_mode[7] += 0.25 * exact.sum()
+    assert estimates(exact, exact).evidence(0, FIELD).tight
+    evidence = estimates(without_mode, exact).evidence(0, FIELD)
     assert evidence.undetected == pytest.approx(0.2)
     assert not evidence.tight
 
@@ -143,11 +143,11 @@ def test_a_star_comes_from_the_bank_or_from_its_own_samples():
     """Wherever the bank has too few, and never fewer than it has."""
     bank = Estimates(*(measured(np.full(STARS, 1.0), ess=20.0) for _ in range(3)))
     assert bank.improved(np.zeros(0, int), None) == (bank, 0)
-    few = np.array([3, 9, 11])
+    sparse = np.array([3, 9, 11])
     rows = np.full((5, 3), 2.0)
     rows[-1] = [300.0, 5.0, 60.0]
     bank.full[-1, 11] = 55.0
-    best, chosen = bank.improved(few, Estimates(rows, rows, rows))
-    assert chosen == 1
-    assert np.flatnonzero(best.full[0] == 2.0).tolist() == [3]
-    assert best.full[-1, [3, 9, 11]].tolist() == [300.0, 20.0, 55.0]
+    improved, replaced = bank.improved(sparse, Estimates(rows, rows, rows))
+    assert replaced == 1
+    assert np.flatnonzero(improved.full[0] == 2.0).tolist() == [3]
+    assert improved.full[-1, [3, 9, 11]].tolist() == [300.0, 20.0, 55.0]

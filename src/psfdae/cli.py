@@ -132,6 +132,7 @@ class Commands(Careful):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with the first sentence of their help, from the modules' text."""
+        # Sentences are cut to what a line has room for beside the longest name.
         words = self.list_commands(ctx)
         listed = {"Commands": words} if self.prefix else sections(words)
         width = formatter.width - 6 - max(map(len, words))
@@ -160,6 +161,7 @@ def command_modules() -> dict[str, tuple[str, Path]]:
 
     They are found in the text of the modules, none of which is imported.
     """
+    # Lines such as @command("from-stars", …), perhaps with the name on the next line.
     pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
     commands = {}
     for package in _packages():
@@ -181,6 +183,7 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
     The packages' `SECTIONS` have the commands of each heading, and their `REQUIRED` the module
     that a command needs; a command in no section is a stage of the paper.
     """
+    # Headings of all packages, in their order; packages may share a heading.
     headings: dict[str, list[str]] = {}
     required: dict[str, str] = {}
     for package in map(import_module, _packages()):
@@ -190,6 +193,7 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
     in_sections = {word for commands in headings.values() for word in commands}
     headings["The paper's stages"] = [word for word in words if word not in in_sections]
 
+    # The module "*" is that of all commands that are in no section.
     def can_run(word: str) -> bool:
         module = required.get(word, "" if word in in_sections else required.get("*", ""))
         return word in words and (not module or find_spec(module) is not None)
@@ -309,6 +313,7 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
     attributes = {"type": value_type, **attributes}
     if value_type is bool:
         attributes |= {"type": None, "is_flag": True}
+    # A parameter without a default must be given.
     required = default is Parameter.empty
     if attributes.pop("argument", False):
         nargs = -1 if attributes.pop("multiple", False) else 1

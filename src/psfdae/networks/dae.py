@@ -143,6 +143,7 @@ def build_dae(
         With the weights in the order in memory that makes convolutions fastest.
     """
     model = channels_last(Dae(kernels, widths))
+    # In the order of the layers, weights before biases, because the draws depend on it.
     with torch.no_grad():
         for layer in model.layers:
             weight, bias = layer.parameters()
@@ -200,6 +201,7 @@ def begin_linear(
     patches = torch.cat([identity, eigenpatches], dim=1).T[: len(first.weight) // 2]
     kernels = torch.stack([patches, -patches], dim=1).flatten(0, 1)
     first.weight[: len(kernels)] = kernels.view(-1, 1, *first.kernel_size)
+    # Each channel is copied by a 1 in the middle of its kernel, added to a tenth of the draw.
     for layer in inner_layers:
         layer.weight *= 0.1
         middle = layer.kernel_size[0] // 2
@@ -283,6 +285,7 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
         "template" depends on more of the stamp: three quarters of the side, and whole stamps from
         2/3 on.
     """
+    # Part of the side that is seen, and the same number of pixels less on either edge.
     if reference == "realisation":
         middle = 0.5 + 0.5 * min(part, 1.0) ** 2
     else:
@@ -310,6 +313,7 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
     ndarray, shape (n, d, d), float32
         PSFs of about sum 1, neither clipped nor renormalised.
     """
+    # In batches, which limits the memory of the channels between the layers.
     model.eval()
     psf = np.empty(noisy.shape, dtype=np.float32)
     for start in range(0, len(noisy), batch):
@@ -349,6 +353,7 @@ class DaeTraining(Training):
         # The last digits of the linear start depend on the number of threads, too.
         torch.set_num_threads(settings.threads)
         self.factor = image_scale(dae.scale, data.images.shape[-1])
+        # Initial weights: random, those of a fit to realisations, or about a linear estimator.
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
@@ -371,6 +376,7 @@ class DaeTraining(Training):
             )
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
+        # One noisy image of every star for all epochs, if the settings ask for that.
         self.fixed: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
@@ -418,6 +424,7 @@ class DaeTraining(Training):
                 noisy, level = self.data.draw(stars, rng)
             else:
                 noisy, level = (fixed[stars] for fixed in self.fixed)
+            # Squared errors grow with λ: without weights, the faintest stars would decide alone.
             power = -self.settings.level_weight
             weight = level**power / np.mean(self.data.levels**power)
             weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
@@ -440,6 +447,7 @@ class DaeTraining(Training):
         """
         noisy, target, weight = batch
         output: torch.Tensor = self.model(noisy)
+        # Not at every step, because the look at the values waits for the computation.
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         return (weight * (output - target) ** 2).mean()
@@ -459,6 +467,7 @@ class DaeTraining(Training):
         """
         if epoch % self.settings.validate_every and epoch != self.settings.epochs:
             return float("nan")
+        # Every star with several draws of noise, which are the same in all epochs.
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = predict(self.model, noisy, self.factor)

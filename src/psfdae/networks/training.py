@@ -71,7 +71,7 @@ class Muon(torch.optim.Adam):
                 momentum.lerp_(weight.grad, 1 - beta)
                 steps.append(weight.grad.lerp(momentum, beta).flatten(1))
             # A semi-orthogonal (m, n) matrix has elements of RMS 1/√max(m, n); Adam's steps have
-            # about 0.2.
+            # about 0.2. Without a gradient, Adam then leaves the matrix as it is.
             for weight, step in zip(weights, orthogonal(steps), strict=True):
                 scale = 0.2 * max(step.shape) ** 0.5
                 weight.add_(step.view_as(weight), alpha=-group["lr"] * scale)
@@ -237,21 +237,13 @@ class Training(ABC):
         DeadNetworkError
             If the outputs of the network are zero.
         """
+        # Times of epochs add up over interruptions, so they are part of the state.
         started, started_cpu = time.monotonic(), time.process_time()
         epoch, rate = len(self.history), self.rate
         losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
-            step = epoch * self.steps + len(losses)
-            loss = self.loss(batch, step)
-            losses.append(self._finite("loss", loss, step))
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            # Clipping returns the norm before it.
-            norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
-            self._finite("gradient's norm", norm, step)
-            self.optimiser.step()
-            self.scheduler.step()
+            losses.append(self._step(batch, epoch * self.steps + len(losses)))
         error = self.validate(epoch + 1)
         if error < self.best_mse:
             # A copy, because the next steps change the weights in place.
@@ -264,6 +256,19 @@ class Training(ABC):
         self.cpu_seconds += time.process_time() - started_cpu
         self.history.append(self.row(epoch + 1, rate, float(np.mean(losses)), error))
         return self.history[-1]
+
+    def _step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
+        """Make a step of the optimiser with a batch, and return the loss before it."""
+        loss = self.loss(batch, step)
+        value = self._finite("loss", loss, step)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        # Clipping returns the norm before it.
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
+        self._finite("gradient's norm", norm, step)
+        self.optimiser.step()
+        self.scheduler.step()
+        return value
 
     def _finite(self, quantity: str, tensor: torch.Tensor, step: int) -> float:
         """Return the value of a tensor of one element; raise TrainingError if it is not finite."""
@@ -320,6 +325,7 @@ def train(
     TrainingError
         If something is not finite, or if every attempt died.
     """
+    # A training that was interrupted goes on in the attempt in which it was.
     saved, log_epoch = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
     for attempt in range(saved["attempt"] if saved else 0, restarts + 1):
         training = begin(attempt)
@@ -333,11 +339,13 @@ def train(
                 row = training.run_epoch()
                 report(row)
                 log_epoch(row)
+                # Writing takes time: only every few seconds, and after whole epochs.
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
             return training
         except DeadNetworkError as death:
+            # Other initial weights and other noise may give a network that lives.
             print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
     raise TrainingError(
         f"the network died in all {restarts + 1} attempts: "

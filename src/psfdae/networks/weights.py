@@ -28,6 +28,7 @@ CHECKPOINT_HEADER = b"psfdae checkpoint, sha256 "
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 of the names, types, shapes and values of arrays, sorted by name."""
+    # With names, types and shapes, because equal bytes may be arrays of another network.
     digest = hashlib.sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name])
@@ -91,6 +92,7 @@ def with_weights(build: Callable[[], Network], path: Path) -> Network:
                 f"{path}: shape of {name} is {shape}, but {needed_shape} in the network of its "
                 "config.yaml"
             )
+    # The shapes agree: make the network itself.
     model = channels_last(build())
     model.load_state_dict(state)
     return model.eval()
@@ -165,6 +167,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
     if head != CHECKPOINT_HEADER + hashlib.sha256(content).hexdigest().encode():
         print(f"{path}: damaged checkpoint ignored (wrong checksum)", flush=True)
         return None
+    # weights_only: a file must not be able to run code.
     try:
         state: dict[str, Any] = torch.load(io.BytesIO(content), weights_only=True)
     except Exception as error:  # written by another version of torch
