@@ -303,9 +303,9 @@ def histories_of(dataset):
     """Courses of the trainings of a dataset, and a label of each."""
     trained = [m for m in methods_of(dataset) if HISTORY in m.storage.diagnostics]
     return {
-        str(fits.path_beside(m, model_of(m, dataset, split, reference), HISTORY)): ", ".join(
-            [dataset, split, reference] + [m.look.label] * (len(trained) > 1)
-        )
+        str(
+            fits.path_beside(m, model_of(m, dataset, split, reference), HISTORY)
+        ): ", ".join([dataset, split, reference] + [m.look.label] * (len(trained) > 1))
         for m in trained
         for split, reference in networks_of(dataset)
     }
