@@ -10,6 +10,7 @@ import pytest
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
 from psfdae.image.stamps import cut
+from psfdae.method import Packing
 from psfdae.model import restoration
 from psfdae.model.psf_model import PsfModel
 
@@ -155,7 +156,7 @@ def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
 def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, request):
     model = request.getfixturevalue(name)
     clean = model.predict(medium.stamps)
-    assert len(medium.stamps) > 256
+    assert len(medium.stamps) > Packing().together
     assert same(model.predict(medium.stamps, threads=2), clean)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
     for rows in (slice(300, 301), order):

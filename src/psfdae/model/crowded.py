@@ -105,8 +105,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         sky = replace(sky, bad=bad)
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
-    # The first errors are from the pixels themselves, light of neighbours included.
     wings, wing_light = None, np.zeros_like(image)
+    # The first errors are from the pixels themselves, light of neighbours included.
     error = _pixel_error(sky.noise, sky.flat, observation.gain)
     for turn in range(ROUNDS):
         limits = _box(fwhm), MOST_MOVED_FWHM * fwhm

@@ -51,7 +51,7 @@ class _Field(FieldPsfs):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low[:2], self.fitted.high[:2]
 
-    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: the fit is used on its own image."""
 
     def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:

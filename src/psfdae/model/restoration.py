@@ -2,8 +2,8 @@
 
 Each star goes through three steps, and no star influences another one:
 
-1. `centred_stars`: the star is moved to the middle of its stamp, and its flux, sky and noise are
-   found by the mean PSF of the training (`psfdae.model.photometry`).
+1. `Restorer._centred`: the star is moved to the middle of its stamp, and its flux, sky and noise
+   are found by the mean PSF of the training (`psfdae.model.photometry`).
 2. The method restores its PSF: `Restorer._by_own_fluxes` for a method that measures flux, sky and
    centre itself (`psfdae.methods.field`), `Restorer._by_photometry` for all others.
 3. `Restorer._prediction`: half-widths of the errors, χ², light beyond the stamp, shape and flags.
@@ -125,7 +125,7 @@ class Restorer:
         pixels = bundle.info.stamp_px**2
         self.block_size = min(packing.together, max(1, packing.together * 32**2 // pixels))
         # A network rounds otherwise if it computes another number of stars together.
-        self._least_count = self.block_size if packing.padded else 1
+        self._padded_count = self.block_size if packing.padded else 1
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
         self.wings: Wings | None = bundle.wings
         calibration = bundle.info.config.get("stars", {}).get("calibration_stars", {})
@@ -145,8 +145,8 @@ class Restorer:
             If the method meets a pixel that is not finite.
         """
         count = len(stars)
-        if count < self._least_count:
-            stars = _padded(stars, self.bundle, self._least_count)
+        if count < self._padded_count:
+            stars = _padded(stars, self.bundle, self._padded_count)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             # 2048 stars at a time are measured and described: their arrays fit in memory.
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
@@ -281,7 +281,7 @@ class Restorer:
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
         mean_psf = self.bundle.flux_model.mean.reshape(photometry.images.shape[1:])
 
-        def network_input() -> tuple[np.ndarray, np.ndarray]:
+        def normalised_images() -> tuple[np.ndarray, np.ndarray]:
             """Return images of flux 1, and their noise; a mean PSF for stars without flux."""
             images = photometry.images
             if has_no_flux.any():
@@ -296,7 +296,7 @@ class Restorer:
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
         if is_free.any() and isinstance(self.free_flux, FindsFlux):
-            images, noise = network_input()
+            images, noise = normalised_images()
             level = np.hypot(noise, info.misfit) / info.kappa
             factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
@@ -305,7 +305,7 @@ class Restorer:
         score = np.full(len(has_no_flux), np.nan)
         # Stars of a catalogue that reaches far beyond the image have all no flux.
         if not has_no_flux.all():
-            images, noise = network_input()
+            images, noise = normalised_images()
             estimate = self.method.estimate(images, noise / info.kappa, **near_clusters)
             psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
             for array in (psf, sigma):
