@@ -24,10 +24,9 @@ from psfdae_paper.configuration.compose import (
     load,
 )
 from psfdae_paper.configuration.compose import (
-    cache_compositions,
-    load_groups,
     neutral_settings,
     overrides_for,
+    part,
 )
 from psfdae_paper.configuration.compose import write_settings
 from psfdae.method import HISTORY
@@ -37,7 +36,6 @@ from psfdae.files import DIGESTS, ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
-cache_compositions(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
@@ -142,7 +140,7 @@ def default_datasets():
 
     Sizes that fit together in one dataset may not in another: that counts where one is built.
     """
-    names = load_groups(overrides_for(GIVEN)).workflow.datasets
+    names = part(("workflow",), composed()).workflow.datasets
     if SCENE3 in names:
         raise ConfigError(f"workflow.datasets: {SCENE3} is built by the target scene3")
     return names

@@ -51,7 +51,7 @@ rule sweep_point:
         "Training point {wildcards.point} of sweep {wildcards.sweep}"
     shell:
         "psfdae sweep point {params.options:q} {params.data:q}"
-        " --checkpoint {params.checkpoint} --source {params.source} --out {params.folder}"
+        " --checkpoint {params.checkpoint} --out {params.folder}"
         " {params.config:q} {params.free:q} > {log} 2>&1"
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.metrics import clustered_mean, clustered_ratio, seed_stderr
+from psfdae_paper.evaluation.measure import CELL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,9 +30,6 @@ Scatter = Mapping[tuple[str, str, str], float]
 
 FITTED = ["dataset", "reference", "method"]
 """Columns that identify a fit."""
-
-CELL = ["dataset", "split", "reference", "noise_level"]
-"""Columns that identify a column of the paper's tables: methods are compared inside it."""
 
 PAPER_ORDER = ("dae", "pca_som", "noisy")
 """The paper's methods by ascending error, as it concludes."""

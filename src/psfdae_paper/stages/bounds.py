@@ -21,7 +21,6 @@ from psfdae.files import (
     write_product,
 )
 from psfdae.methods import method
-from psfdae.metrics import quality, summarised
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.options import File
 from psfdae.reading import read_table
@@ -44,7 +43,7 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.comparison import CELL
+from psfdae_paper.evaluation.measure import CELL, MeasuredStars
 
 if TYPE_CHECKING:
     from psfdae_paper.methods.wavefront import Wavefront
@@ -151,12 +150,12 @@ def optics(
             for reference, estimator in estimators.items():
                 estimate = estimator.estimate_from_posterior(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
-                metrics = quality(estimate, truth, config.evaluation.data_range)
+                stars_of_truth = MeasuredStars(bounded.star, bounded.field, position, truth)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
                 row |= {"reference": reference, "method": name, "noise_level": level}
-                summary += summarised(row, metrics, bounded.field)
-                star_columns = {"star": bounded.star, "field": bounded.field}
-                stars_table.append(pd.DataFrame({**row, **star_columns, **metrics}))
+                rows, table = stars_of_truth.errors(row, estimate, config.evaluation.data_range)
+                summary += rows
+                stars_table.append(table)
             print(f"{name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))

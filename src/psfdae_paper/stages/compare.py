@@ -188,7 +188,7 @@ def read_errors(folder: Path) -> pd.DataFrame:
     """Read the mean errors of all methods in a folder of results; raises ProductError."""
     import pandas as pd
 
-    from psfdae_paper.evaluation.comparison import CELL
+    from psfdae_paper.evaluation.measure import CELL
 
     columns = [*CELL, "method", "metric", "value", "stderr"]
     tables = {path: read_table(path) for path in _tables(folder)}

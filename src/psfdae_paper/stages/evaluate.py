@@ -11,14 +11,7 @@ from psfdae import fits
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.method import Method
 from psfdae.methods import method
-from psfdae.metrics import quality, summarised
-from psfdae.model.star_sets import (
-    field_positions,
-    noisy_test_images,
-    read_stars,
-    split_stars,
-    training_set,
-)
+from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars, training_set
 from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.settings import ConfigError, Reference, SplitKind
@@ -26,6 +19,7 @@ from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,19 +75,18 @@ def evaluate(
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), split, reference)
     test = split_stars(product, split, config).test
-    truth, field = product[reference][test], product["field_index"][test]
-    position = field_positions(product)[test]
+    test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
         # The same noisy images for all methods: their errors are compared star by star.
         noisy = noisy_test_images(config, product, test, level)
         for name, estimator in methods.items():
-            estimate = estimator.estimate(noisy, level, position)
-            metrics = quality(estimate, truth, config.evaluation.data_range)
+            estimate = estimator.estimate(noisy, level, test_stars.position)
             row = {**key, "method": name, "noise_level": level}
-            summary += summarised(row, metrics, field)
-            stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
+            rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)
+            summary += rows
+            stars_table.append(per_star_rows)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
@@ -154,10 +147,6 @@ def estimators(
             fitted[method_class.name] = method_class.fit(data, **method_class.settings(config))
     return fitted
 
-
-COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
-COLUMNS += ["value", "stderr", "n"]
-"""Columns of the table of an evaluation."""
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]

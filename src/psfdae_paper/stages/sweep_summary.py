@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from psfdae.figures import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.options import File, Folder
-from psfdae.reading import read_table, read_yaml
+from psfdae.reading import read_json, read_table, read_yaml
 from psfdae_paper.configuration.command import command
-from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
+from psfdae_paper.sweeps.measured import read_cost
 from psfdae_paper.sweeps.points import SweepError
 
 BEST_POINT = "best.yaml"
@@ -30,7 +30,7 @@ def sweep_summary(
     from psfdae_paper.sweeps.points import plan_sweep
 
     plan = plan_sweep(name, overrides)
-    files = [points / point / RESULT for point in plan.points]
+    files = [points / point / "result.json" for point in plan.points]
     summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
 
 
@@ -76,7 +76,7 @@ def summary(
     import pandas as pd
     import yaml
 
-    results = [read_result(path) for path in points]
+    results = [read_json(path) for path in points]
     best_result = choose(results, definition["metric"], definition["direction"])
     if best_result is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
