@@ -13,22 +13,18 @@ from psfdae import fits
 from psfdae.cli import stage
 from psfdae.fits import suffix_of
 from psfdae.method import GoesOn
-from psfdae.settings import ConfigError, as_overrides
+from psfdae.settings import ConfigError
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
-from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
     dataset_names,
-    decisive_settings,
     load,
-)
-from psfdae_paper.configuration.compose import (
-    neutral_settings,
     overrides_for,
     part,
+    write_settings,
 )
-from psfdae_paper.configuration.compose import write_settings
 from psfdae.method import HISTORY
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered

@@ -403,6 +403,20 @@ def _deciding_keys(override: str) -> list[str]:
     return ([key] if override.startswith("++") else []) + ([group] if group else [])
 
 
+def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration tree without the settings that cannot change a result.
+
+    These are marked `NEUTRAL` in their class, such as the time between checkpoints.
+    """
+    neutral = _neutral_keys()
+    return {
+        group: {key: value for key, value in values.items() if (group, key) not in neutral}
+        if isinstance(values, Mapping)
+        else values
+        for group, values in tree.items()
+    }
+
+
 @cache
 def _neutral_keys() -> frozenset[tuple[str, str]]:
     """Return group and name of the settings that cannot change a result."""
@@ -412,32 +426,6 @@ def _neutral_keys() -> frozenset[tuple[str, str]]:
         for name, field in group_class.model_fields.items()
         if NEUTRAL in field.metadata
     )
-
-
-def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration tree without the settings that cannot change a result."""
-    return _filtered(tree, lambda key: key not in _neutral_keys())
-
-
-def neutral_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those settings of a configuration tree that cannot change a result."""
-    return _filtered(tree, lambda key: key in _neutral_keys())
-
-
-def _filtered(
-    tree: Mapping[str, Any], accepts: Callable[[tuple[str, str]], bool]
-) -> dict[str, Any]:
-    """Return a tree with those settings whose group and name are accepted.
-
-    A value that is no group, such as the seed, has its own name and no second one.
-    """
-    filtered: dict[str, Any] = {}
-    for group, value in tree.items():
-        if isinstance(value, Mapping):
-            filtered[group] = {key: value[key] for key in value if accepts((group, key))}
-        elif accepts((group, "")):
-            filtered[group] = value
-    return filtered
 
 
 def _first_lines(error: Exception) -> str:

@@ -6,24 +6,48 @@ metric) and a table with the errors of every single star.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
+from psfdae.files import Product, ProductError
+from psfdae.method import Estimate
 from psfdae.metrics import quality, summarised
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from psfdae.files import Product
-    from psfdae.method import Estimate
+from psfdae.model.star_sets import field_positions
+from psfdae.reading import read_table
 
 CELL = ["dataset", "split", "reference", "noise_level"]
 """Columns that identify a column of the paper's tables: methods are compared inside it."""
 
 COLUMNS = [*CELL[:3], "method", "noise_level", "metric", "value", "stderr", "n"]
 """Columns of the summary."""
+
+
+def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> pd.DataFrame:
+    """Join CSV files.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    columns : sequence of str, optional
+        Columns to take from each file; by default those of the first.
+
+    Raises
+    ------
+    ProductError
+        If a file is missing or damaged, or has not all columns.
+    """
+    tables = [read_table(path) for path in paths]
+    columns = list(tables[0].columns if columns is None else columns)
+    for path, table in zip(paths, tables, strict=True):
+        if missing := [name for name in columns if name not in table]:
+            raise ProductError(f"{path}: column {missing[0]!r} is missing")
+    # Tables without rows would change the types of columns.
+    tables = [table for table in tables if len(table)] or tables[:1]
+    return pd.concat([table[columns] for table in tables], ignore_index=True)
 
 
 class MeasuredStars(NamedTuple):
@@ -49,8 +73,6 @@ class MeasuredStars(NamedTuple):
     @classmethod
     def of(cls, product: Product, star: np.ndarray, reference: str) -> MeasuredStars:
         """Take some stars of a product "stars", with one of its references as the truth."""
-        from psfdae.model.star_sets import field_positions
-
         field, position = product["field_index"][star], field_positions(product)[star]
         return cls(star, field, position, product[reference][star])
 
@@ -75,8 +97,6 @@ class MeasuredStars(NamedTuple):
         per_star : DataFrame
             `row`, star, field, and a column for each metric.
         """
-        import pandas as pd
-
         metrics = quality(estimate, self.truth, data_range)
         per_star = pd.DataFrame({**row, "star": self.star, "field": self.field, **metrics})
         return summarised(row, metrics, self.field), per_star

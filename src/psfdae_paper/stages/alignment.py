@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require
 from psfdae.files import Column, read_product, write_csv, write_product
@@ -155,8 +156,6 @@ def telescope(
     out: Annotated[File, "CSV with key figures."],
 ) -> None:
     """Tabulate key figures of telescope, model and stamps."""
-    import pandas as pd
-
     quadratic = read_product(model, "alignment_model")
     sets = {
         name: read_product(path, "alignment_states", ("energy", "stamps"))

@@ -9,20 +9,22 @@ seed, set and λ only, so all methods get the same stamps and their differences 
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
 import numpy as np
+import pandas as pd
+from pydantic import Field
 
 from psfdae.belonging import require, require_origin, write_origin
 from psfdae.files import (
     Column,
     Product,
+    ProductError,
     as_csv,
     as_yaml,
     read_product,
@@ -38,9 +40,18 @@ from psfdae.noise import mixed_levels
 from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
-from psfdae.settings import deciding
+from psfdae.settings import ConfigError, Group, deciding, validate
 from psfdae.threads import limit_threads
+from psfdae_paper.alignment.emulator import StampEmulator
+from psfdae_paper.alignment.fisher import (
+    bound_covariances,
+    parameters_of,
+    stamps_and_slopes,
+    twin_states,
+)
+from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
 from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.alignment.telescope import QuadraticModel, mirror_symmetries
 from psfdae_paper.configuration.aligners import (
     ALIGNERS,
     BOUNDS,
@@ -66,8 +77,15 @@ DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
 """Networks that are trained on the DAE's output."""
 
-NOISE_FREE = 0.0
-"""Noise level of the rows without noise."""
+
+class NetworkDescription(Group):
+    """Keys of the configuration beside a network's weights that tell its shape and its input."""
+
+    fields: Annotated[int, Field(ge=1, le=4096)] = Field(description="Field points of a state")
+    stamp_px: Annotated[int, Field(ge=1, le=4096)] = Field(description="Side of a stamp")
+    network: Literal["cnn", "perceptron"] = Field(description="Kind of the network")
+    mirrors: bool = Field(description="Estimates are averaged over the stamps' mirror images")
+
 
 if TYPE_CHECKING:
 
@@ -228,7 +246,7 @@ def noisy_test_states(
     config: Config, stamps: np.ndarray, test_set: str, level: float
 ) -> np.ndarray:
     """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0."""
-    if level == NOISE_FREE:
+    if level == 0:
         return stamps
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
     return noise_model(config).draw(stamps, level, rng)
@@ -246,34 +264,22 @@ def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np
     """
     import torch
 
-    from psfdae.settings import validate
     from psfdae_paper.alignment.networks import load_network, predict_states
-    from psfdae_paper.alignment.telescope import mirror_symmetries
 
     torch.set_num_threads(config.evaluation.threads)
     # The configuration beside the weights describes the network; every value is checked.
     path = folder / CONFIG
-    described = read_yaml(path)
-    fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
-    kind = from_tree(path, described, "network", make=_network_kind)
-    settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
-    model = load_network(settings, fields, side, folder / WEIGHTS)
-    mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
+    tree = read_yaml(path)
+    keys = {key: from_tree(path, tree, key) for key in NetworkDescription.model_fields}
+    try:
+        described = validate(NetworkDescription, keys)
+    except ConfigError as error:
+        raise ProductError(f"{path}: {error}") from None
+    kind = NETWORKS[described.network]
+    settings = from_tree(path, tree, described.network, make=lambda group: validate(kind, group))
+    model = load_network(settings, described.fields, described.stamp_px, folder / WEIGHTS)
+    mirrors = mirror_symmetries(described.fields - 1) if described.mirrors else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
-
-
-def _network_kind(value: object) -> str:
-    """Return the kind of a network; ValueError if there is no such kind."""
-    if value not in NETWORKS:
-        raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
-    return str(value)
-
-
-def _size(value: object) -> int:
-    """Return a size; ValueError if it is no whole number in the possible range."""
-    if not isinstance(value, int) or not 1 <= value <= 4096:
-        raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
-    return value
 
 
 def require_network(folder: Path, states: Product, name: str | None = None) -> None:
@@ -310,8 +316,8 @@ def estimate(
     for name, folder in folders.items():
         require_network(folder, product, name)
     predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
-    # The same noisy stamps for all methods, with the time that each takes.
-    levels = [NOISE_FREE, *config.noise.levels]
+    # The same stamps for all methods, without noise and at every λ, with the time that each takes.
+    levels = [0.0, *config.noise.levels]
     estimates = np.empty((len(levels), len(LEARNED), *product["states"].shape))
     rows = []
     for row, level in enumerate(levels):
@@ -339,8 +345,6 @@ def _names(methods: list[Aligner]) -> str:
 
 def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]]) -> None:
     """Write the table of run times."""
-    import pandas as pd
-
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
     table = pd.DataFrame(rows, columns=columns)
     write_csv(path, table, digits=6)
@@ -363,10 +367,6 @@ def fit(
     times: Annotated[File, "CSV that receives the run time."],
 ) -> None:
     """Fit the states of a test set by maximum likelihood."""
-    from psfdae_paper.alignment.emulator import StampEmulator
-    from psfdae_paper.alignment.fisher import parameters_of, stamps_and_slopes, twin_states
-    from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
-
     limit_threads(1)
     product, large_product = (
         read_product(path, "alignment_states", ("states", "stamps", "noll"))
@@ -378,44 +378,24 @@ def fit(
     require_network(network, product)
     predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
-    fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows, methods = [], methods_of_set(FITTED, test_set)
-    operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
     columns = {"states": Column(product["states"], "range", "true states")}
     # The emulator interpolates stamps between those of the large set, and the network's estimate
     # starts the first fit.
     started = time.perf_counter()
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
     emulator = StampEmulator(
-        wavefronts, operator(), large_product["states"], large_product["stamps"], config.fit
+        wavefronts, operator, large_product["states"], large_product["stamps"], config.fit
     )
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
+    rows, fits, methods = [], [], methods_of_set(FITTED, test_set)
     for method in methods:
-        # Flux and place of the stars are known, or parameters of the fit, too.
-        stamp_operator = operator(movable=method.unknown_flux)
-        optics = partial(stamps_and_slopes, wavefronts, stamp_operator, emulator=emulator)
-        exact = Likelihood(optics, noise_model(config), level)
-        # The emulator can compute stars at their given position only.
-        fast = exact if method.unknown_flux else replace(exact, stamps=emulator)
-        parameters = parameters_of(wavefronts, stamp_operator, start)
-        first_fit = fit_states(fast, stamps, parameters, config.fit)
-        # In focus, a state and its twin have nearly the same stamps: the better one of both fits.
-        twins = twin_states(wavefronts, first_fit.parameters, product["noll"])
-        best_fit, twin_tried = refit_twins(fast, stamps, first_fit, twins, config.fit)
-        # The last steps use the exact optics.
-        final_fit = best_fit
-        if fast is not exact:
-            final_fit = fit_states(exact, stamps, best_fit.parameters, config.fit)
-        last_evaluations = final_fit.evaluations * (fast is not exact)
+        fits.append(
+            fit_method(method, config, wavefronts, emulator, stamps, level, start, product["noll"])
+        )
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
-        start = final_fit.parameters[:, :4]
-        fits["estimates"].append(final_fit.parameters[:, :4])
-        fits["deviance"].append(-2.0 * final_fit.height)
-        fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
-        fits["converged"].append(final_fit.converged)
-        fits["twin_tried"].append(twin_tried)
-        fits["twin_won"].append(best_fit.parameters[:, 0] != first_fit.parameters[:, 0])
+        start = fits[-1]["estimates"]
     # A column for each of them, with its description.
     about = {
         "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
@@ -427,10 +407,69 @@ def fit(
     }
     for name, text in about.items():
         unit = "range" if name == "estimates" else "1"
-        columns[name] = Column(np.array(fits[name]), unit, text)
+        columns[name] = Column(np.array([fitted[name] for fitted in fits]), unit, text)
     described = {**config.model_dump(), "test_set": test_set, "level": level}
     write_product(out, "alignment_fit", columns, described)
     _write_times(times, rows)
+
+
+def fit_method(
+    method: Aligner,
+    config: Config,
+    wavefronts: QuadraticModel,
+    emulator: StampEmulator,
+    stamps: np.ndarray,
+    level: float,
+    start: np.ndarray,
+    noll: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Fit n states by one method of maximum likelihood.
+
+    Parameters
+    ----------
+    method : Aligner
+        Decides whether flux and place of the stars are parameters of the fit, too.
+    config : Config
+        Stage configuration (telescope, alignment, optics, noise, fit).
+    wavefronts : QuadraticModel
+    emulator : StampEmulator
+        Fast stamps of states, for stars at their given position.
+    stamps : ndarray, shape (n, F, d, d)
+        Noisy stamps.
+    level : float
+        Their noise level λ.
+    start : ndarray, shape (n, 4)
+        States from which the fit starts, in units of the range.
+    noll : ndarray of int, shape (Z,)
+        Noll index of every Zernike term of the wavefront.
+
+    Returns
+    -------
+    dict of ndarray
+        estimates (n, 4), deviance (n,), evaluations (2, n), converged, twin_tried and
+        twin_won (n,).
+    """
+    movable = method.unknown_flux
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
+    optics = partial(stamps_and_slopes, wavefronts, operator, emulator=emulator)
+    exact = Likelihood(optics, noise_model(config), level)
+    # The emulator can compute stars at their given position only.
+    fast = exact if movable else replace(exact, stamps=emulator)
+    first_fit = fit_states(fast, stamps, parameters_of(wavefronts, operator, start), config.fit)
+    # In focus, a state and its twin have nearly the same stamps: the better one of both fits.
+    twins = twin_states(wavefronts, first_fit.parameters, noll)
+    best_fit, twin_tried = refit_twins(fast, stamps, first_fit, twins, config.fit)
+    # The last steps use the exact optics.
+    final_fit = best_fit if movable else fit_states(exact, stamps, best_fit.parameters, config.fit)
+    last_evaluations = final_fit.evaluations * (not movable)
+    return {
+        "estimates": final_fit.parameters[:, :4],
+        "deviance": -2.0 * final_fit.height,
+        "evaluations": np.array([best_fit.evaluations, last_evaluations]),
+        "converged": final_fit.converged,
+        "twin_tried": twin_tried,
+        "twin_won": best_fit.parameters[:, 0] != first_fit.parameters[:, 0],
+    }
 
 
 @command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), choice=CHOICE)
@@ -442,8 +481,6 @@ def bound(
     out: Annotated[File, "HDF5 product with Cramér-Rao bounds."],
 ) -> None:
     """Bound the errors of any unbiased estimate."""
-    from psfdae_paper.alignment.fisher import bound_covariances
-
     limit_threads(1)
     product = read_product(states, "alignment_states", ("states",))
     require(states, product.config, STAMP_KEYS, config)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import Annotated, TypedDict
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require, require_origin
 from psfdae.figures import write_png
@@ -31,11 +32,12 @@ from psfdae_paper.configuration.aligners import (
 from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation import alignment_figures, alignment_tables
+from psfdae_paper.evaluation.alignment_tables import PARAMETERS, Row
+from psfdae_paper.evaluation.measure import read_tables
+from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.alignment import StatesFile
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]
@@ -160,9 +162,6 @@ def tables(
     correlation: Annotated[File, "CSV that receives their correlations."],
 ) -> None:
     """Tabulate errors and their correlations."""
-    import pandas as pd
-
-    from psfdae_paper.evaluation import alignment_tables as rows
 
     require_one_test(estimates, fits, bounds)
     product = read_product(states, "alignment_states", ("unit",))
@@ -171,15 +170,17 @@ def tables(
         require(path, bound_config, STAMP_KEYS, product.config, states)
     unit = product["unit"]
     # Measured errors, then those that unbiased estimates at the bound would have.
-    rows_by_table: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
+    rows_by_table: dict[Path, list[Row]] = {errors: [], correlation: []}
     for key, truth, estimate in read_errors(estimates, fits):
-        rows_by_table[errors] += rows.error_rows(key, estimate - truth, unit)
+        rows_by_table[errors] += alignment_tables.error_rows(key, estimate - truth, unit)
         if key["method"] != "constant":
-            rows_by_table[correlation] += rows.measured_correlations(key, estimate - truth)
+            rows_by_table[correlation] += alignment_tables.measured_correlations(
+                key, estimate - truth
+            )
     for key, _, covariances in read_bounds(bounds):
-        rows_by_table[errors] += rows.bound_rows(key, covariances, unit)
+        rows_by_table[errors] += alignment_tables.bound_rows(key, covariances, unit)
         if key["method"] == "cramer_rao":
-            rows_by_table[correlation] += rows.predicted_correlations(key, covariances)
+            rows_by_table[correlation] += alignment_tables.predicted_correlations(key, covariances)
     # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
@@ -198,13 +199,11 @@ def paper_tables(
     out: Annotated[Folder, "Folder for CSV and Markdown files."],
 ) -> None:
     """Set measured errors beside the paper's tables."""
-    from psfdae_paper.evaluation import alignment_tables as rows
-    from psfdae_paper.evaluation.paper import published
 
     def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
-        text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
+        text = alignment_tables.as_markdown(table, f"{title}. {alignment_tables.TEST_SETS}", digits)
         write_text(path.with_suffix(".md"), text)
 
     # One table of errors for each of the paper's noise levels.
@@ -214,8 +213,8 @@ def paper_tables(
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
-        write(f"{level:g}", rows.paper_errors(measured, level), title, digits)
-    table = rows.paper_correlations(read_table(correlation))
+        write(f"{level:g}", alignment_tables.paper_errors(measured, level), title, digits)
+    table = alignment_tables.paper_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
 
@@ -228,14 +227,11 @@ def time_table(
     out: Annotated[File, "CSV with the cost of an estimate and of the trainings."],
 ) -> None:
     """Tabulate the run times of the methods."""
-    import pandas as pd
-
     # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
     # Seconds and states of each method, over all test sets and noise levels.
-    table = pd.concat([read_table(path) for path in times], ignore_index=True)
-    total = table.groupby("method")[["seconds", "states"]].sum()
+    total = read_tables(times).groupby("method")[["seconds", "states"]].sum()
     rows = []
     for method in ESTIMATORS:
         seconds, states = total.loc[method.name].to_numpy()
@@ -250,8 +246,6 @@ def time_table(
 @command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE."""
-    from psfdae_paper.evaluation.alignment_figures import stamp_rows
-
     product = read_product(states, "alignment_states", ("states", "stamps"))
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
@@ -263,7 +257,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
         "decentre ({:+.2f}, {:+.2f}), tilt ({:+.2f}, {:+.2f}) of the range".format(*state)
         for state in product["states"][:2]
     ]
-    write_png(stamp_rows(rows, titles), out)
+    write_png(alignment_figures.stamp_rows(rows, titles), out)
 
 
 @command("alignment figure predicted")
@@ -275,36 +269,32 @@ def predicted(
     out: Png,
 ) -> None:
     """Draw estimates against the truth."""
-    from psfdae_paper.evaluation.alignment_figures import predicted_against_true
-
     require_one_test([estimates], fits, [])
     by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
     truth = np.empty(0)
     for key, truth, states in read_errors([estimates], fits):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
-    write_png(predicted_against_true(truth, by_method), out)
+    write_png(alignment_figures.predicted_against_true(truth, by_method), out)
 
 
 @command("alignment figure errors")
 def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     """Draw errors against the size of the misalignment."""
-    from psfdae_paper.evaluation.alignment_figures import errors_against_size, size_of
-
     require_one_test(estimates, fits, bounds)
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, states in read_errors(estimates, fits):
         if key["method"] in FIGURE_METHODS and key["noise_level"] > 0:
             error = np.abs(states - truth).mean(axis=1)
-            curves[key["noise_level"]][key["method"]] = (size_of(truth), error)
+            curves[key["noise_level"]][key["method"]] = (alignment_figures.size_of(truth), error)
     # The bound on the mean error of the four numbers.
     count = 0
     for key, truth, covariances in read_bounds(bounds):
         if key["method"] == "cramer_rao":
             error, count = expected_abs_error(covariances).mean(axis=1), len(truth)
-            curves[key["noise_level"]]["cramer_rao"] = (size_of(truth), error)
+            curves[key["noise_level"]]["cramer_rao"] = (alignment_figures.size_of(truth), error)
     title = f"Errors against misalignment, {count} uniform states"
-    write_png(errors_against_size(curves, title), out)
+    write_png(alignment_figures.errors_against_size(curves, title), out)
 
 
 @command(
@@ -316,19 +306,16 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
     """Draw a state and its twin, in focus and with the CCD's defocus."""
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
-    import pandas as pd
-
-    from psfdae_paper.evaluation.alignment_figures import twin_ambiguity
 
     limit_threads(1)
     # In focus, the stamps of a state and of its twin hardly differ; a defocus tells them apart.
-    rows, stamp_rows, state = [], [], np.empty(0)
+    rows, stamp_groups, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
         state, line_stamps = _stamps_of_multiples(config, defocus)
         state_stamps = line_stamps[np.argmin(np.abs(MULTIPLES - 1.0))].astype(np.float64)
         twin_stamps = line_stamps[np.argmin(np.abs(MULTIPLES + 1.0))]
         focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
-        stamp_rows += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
+        stamp_groups += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
         # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
         for level in config.noise.levels:
             variance = noise_model(config).variance(state_stamps, level)
@@ -339,7 +326,7 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(twin_ambiguity(curves, stamp_rows, state), out)
+    write_png(alignment_figures.twin_ambiguity(curves, stamp_groups, state), out)
 
 
 def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -364,9 +351,6 @@ def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, 
 @command("alignment figure correlation")
 def correlation(correlation: ErrorTable, out: Png) -> None:
     """Draw measured and predicted correlations of errors beside the paper's."""
-    from psfdae_paper.evaluation.alignment_figures import correlation_matrices
-    from psfdae_paper.evaluation.alignment_tables import PARAMETERS
-    from psfdae_paper.evaluation.paper import published
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
@@ -391,4 +375,4 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
         upper = [panel(method, paper_rows, "paper, ") for method in in_paper]
         upper += [panel(method, rows) for method in in_paper]
         panels += [upper, [panel(method, rows) for method in not_in_paper]]
-    write_png(correlation_matrices(panels), out)
+    write_png(alignment_figures.correlation_matrices(panels), out)

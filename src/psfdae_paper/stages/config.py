@@ -9,9 +9,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import click
+import yaml
 
 from psfdae.cli import command_modules, stage
 from psfdae_paper.configuration.command import Groups, command
+from psfdae_paper.configuration.compose import load, load_stage
 
 
 @command("config")
@@ -22,10 +24,6 @@ def config(
     ] = None,
 ) -> None:
     """Check the configuration and print it, resolved, as YAML."""
-    import yaml
-
-    from psfdae_paper.configuration.compose import load, load_stage
-
     if only is None:
         settings = load(overrides)
     else:

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import pandas as pd
+
 from psfdae import fits
-from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
+from psfdae.files import Product, write_csv, write_parquet, write_text
 from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars, training_set
 from psfdae.options import File, Folder
-from psfdae.reading import read_table
 from psfdae.settings import ConfigError, Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars
-
-if TYPE_CHECKING:
-    import pandas as pd
-
+from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
+from psfdae_paper.evaluation.paper import as_markdown, paper_table
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -69,8 +68,6 @@ def evaluate(
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
     """Measure every method on the test stars at each noise level."""
-    import pandas as pd
-
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), split, reference)
@@ -155,9 +152,9 @@ Metric = Literal["mse", "ssim"]
 @command("collect")
 def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
     """Join evaluations into one tidy table, with the scatter of each method between seeds."""
-    from psfdae_paper.evaluation.comparison import seed_scatter, with_seed_stderr
-
-    table = with_seed_stderr(read_evaluations(evaluations), seed_scatter())
+    table = comparison.with_seed_stderr(
+        read_tables(evaluations, COLUMNS), comparison.seed_scatter()
+    )
     write_csv(out, table[[*COLUMNS[:-1], "seed_stderr", "n"]])
 
 
@@ -170,13 +167,9 @@ def held_out(
 
     PER_STAR are the evaluations' Parquet files of both splits.
     """
-    import pandas as pd
-
-    from psfdae_paper.evaluation.comparison import HELD_OUT_COLUMNS, held_out_ratios
-
-    columns = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    columns = [*comparison.HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
     parts = [pd.read_parquet(path, columns=columns) for path in per_star]
-    write_csv(out, held_out_ratios(pd.concat(parts)))
+    write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 
 
 @command("paper-tables")
@@ -188,23 +181,8 @@ def paper_tables(
     ],
 ) -> None:
     """Write the paper's tables, with measured errors beside the published ones."""
-    from psfdae_paper.evaluation.paper import as_markdown, paper_table
-
-    measured = read_evaluations(evaluations)
+    measured = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)
         write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
-
-
-def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:
-    """Join CSV files of the stage `evaluate`; raises ProductError if one has other columns."""
-    import pandas as pd
-
-    parts = []
-    for path in evaluations:
-        part = read_table(path)
-        if list(part.columns) != COLUMNS:
-            raise ProductError(f"{path}: columns {list(part.columns)}, expected {COLUMNS}")
-        parts.append(part)
-    return pd.concat(parts, ignore_index=True)

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
+import pandas as pd
 
-from psfdae.figures import write_png
+from psfdae.figures import (
+    REFERENCES,
+    StripRow,
+    in_field_unit,
+    restoration_strip,
+    spread_stars,
+    write_png,
+)
 from psfdae.files import Product, ProductError, read_product
 from psfdae.method import Method
+from psfdae.metrics import mse
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.options import AboveZero, File
 from psfdae.reading import read_table
@@ -18,19 +28,18 @@ from psfdae.settings import Reference
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation import bound_figures, curves
+from psfdae_paper.evaluation.figures import stamp_energy_map, template_map
+from psfdae_paper.evaluation.measure import COLUMNS, read_tables
+from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.evaluate import (
     READS,
     Evaluations,
     Metric,
     Models,
     estimators,
-    read_evaluations,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from psfdae.figures import StripRow
+from psfdae_paper.stars.fields import square_grid
 
 Stars = Annotated[File, "Product of the stage stars."]
 Templates = Annotated[File, "Product of the stage templates."]
@@ -43,8 +52,6 @@ Efficiency = Annotated[File, "CSV of the stage efficiency."]
 @command("figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
     """Draw the static PSFs at their field positions."""
-    from psfdae_paper.evaluation.figures import template_map
-
     product = read_product(templates, "templates", ("psf", "grid", "field"))
     psf = without_margin(product)
     title = (
@@ -57,8 +64,6 @@ def figure_templates(templates: Templates, out: Png) -> None:
 @command("figure energy")
 def figure_energy(templates: Templates, out: Png) -> None:
     """Draw the light inside the stamp over the field."""
-    from psfdae_paper.evaluation.figures import stamp_energy_map
-
     product = read_product(templates, "templates", ("energy", "grid", "field"))
     stamp_px = product.config["framing"]["stamp_px"]
     write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
@@ -80,8 +85,6 @@ def figure_strip(
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
-    from psfdae.figures import REFERENCES, in_field_unit, restoration_strip, spread_stars
-
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
@@ -111,11 +114,6 @@ def figure_headline(
     out: Png,
 ) -> None:
     """Draw restored stars beside the errors and their bounds."""
-    from dataclasses import replace
-
-    from psfdae.figures import spread_stars
-    from psfdae_paper.evaluation.curves import headline
-
     limit_threads(config.evaluation.threads)
     reference = "realisation"
     product = read_stars(stars, reference)
@@ -133,7 +131,7 @@ def figure_headline(
     errors, limits = (rows_of(path, dataset, reference) for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    write_png(headline(rows, list(methods.values()), errors, limits, titles), out)
+    write_png(bound_figures.headline(rows, list(methods.values()), errors, limits, titles), out)
 
 
 @command("figure curves")
@@ -143,8 +141,6 @@ def figure_curves(
     out: Png,
 ) -> None:
     """Draw training and validation error of networks."""
-    from psfdae_paper.evaluation.curves import training_curves
-
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
     tables = {}
@@ -153,7 +149,7 @@ def figure_curves(
         missing = {"step", "train_mse", "validation_mse"} - set(tables[label].columns)
         if missing:
             raise ProductError(f"{path}: no column {min(missing)!r}")
-    write_png(training_curves(tables, "Training of the denoising autoencoders"), out)
+    write_png(curves.training_curves(tables, "Training of the denoising autoencoders"), out)
 
 
 @command("figure errors")
@@ -163,15 +159,12 @@ def figure_errors(
     out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
 ) -> None:
     """Draw metrics against the noise level, with the paper's points."""
-    from psfdae_paper.evaluation.curves import error_against_noise
-    from psfdae_paper.evaluation.paper import published
-
-    metrics = read_evaluations(evaluations)
+    metrics = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
-        write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
+        write_png(curves.error_against_noise(metrics, published("psf"), dataset, metric), path)
 
 
 def without_margin(templates: Product) -> np.ndarray:
@@ -183,8 +176,6 @@ def without_margin(templates: Product) -> np.ndarray:
 
 def field_of(stars: Product) -> np.ndarray:
     """Return the field angle (x, y) of every field point in radians, shape (F, 2)."""
-    from psfdae_paper.stars.fields import square_grid
-
     grid = stars.config["grid"]
     angle: np.ndarray = np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
     return angle
@@ -204,9 +195,6 @@ def strip_rows(
     `config` is that of the stage `evaluate`; `test` are the test stars, and `selected` the
     indices of those in the figure.
     """
-    from psfdae.figures import StripRow
-    from psfdae.metrics import mse
-
     truth = product[reference][test][selected]
     position = field_positions(product)[test][selected]
     rows = [StripRow("reference", truth)]
@@ -231,10 +219,8 @@ def figure_bounds(
     out: Png,
 ) -> None:
     """Draw the methods' errors above the bounds."""
-    from psfdae_paper.evaluation.curves import errors_above_bounds
-
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
-    write_png(errors_above_bounds(*tables, dataset), out)
+    write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
 
 
 @command("figure efficiency")
@@ -244,9 +230,7 @@ def figure_efficiency(
     out: Png,
 ) -> None:
     """Draw the methods' efficiency against the noise level."""
-    from psfdae_paper.evaluation.curves import efficiency_against_noise
-
-    write_png(efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
+    write_png(bound_figures.efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
 
 
 @command("figure bank-growth")
@@ -256,9 +240,7 @@ def figure_bank_growth(
     out: Png,
 ) -> None:
     """Draw the posterior mean's error against the size of the bank."""
-    from psfdae_paper.evaluation.curves import bank_growth
-
-    write_png(bank_growth(rows_of(growth, dataset), dataset), out)
+    write_png(bound_figures.bank_growth(rows_of(growth, dataset), dataset), out)
 
 
 def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require
 from psfdae.files import read_product, write_csv
@@ -46,8 +47,6 @@ def run(config: Config, task: Task, name: str) -> Measured:
     ProductError
         If the products are of different telescopes or stamps.
     """
-    import pandas as pd
-
     trained_on = read_product(task.data["states"], "alignment_states", ())
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())

@@ -8,16 +8,19 @@ from typing import Annotated
 
 import click
 import numpy as np
+import pandas as pd
 
 from psfdae.errors import Error
 from psfdae.figures import write_png
 from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
 from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
+from psfdae.optics.pupil import SamplingError
 from psfdae.options import File, Folder
 from psfdae.rng import stream
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
@@ -25,7 +28,7 @@ from psfdae_paper.stages.figures import without_margin
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
 from psfdae_paper.stars.example import example_field as simulate_field
-from psfdae_paper.stars.framing import normalise_flux
+from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux
 from psfdae_paper.stars.scenes import template_wavefronts
 
 ENOUGH_LIGHT = 0.8
@@ -55,8 +58,6 @@ def simulate(
 
     Writes templates.h5, psfs.png and fields.csv.
     """
-    from psfdae_paper.configuration.compose import load_stage
-
     # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
         overrides = ("dataset=_telescope", *overrides)
@@ -97,8 +98,6 @@ def figure_telescope(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw the static PSFs of a telescope with their light and their width."""
-    import pandas as pd
-
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
     x, y = np.rad2deg(fields.field).T
@@ -162,9 +161,6 @@ def _sufficient_stamp_px(config: Config, worst_field: int, max_px: int) -> int |
 
     None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
     """
-    from psfdae.optics.pupil import SamplingError
-    from psfdae_paper.stars.framing import FramingError, Propagation
-
     framing = config.framing.model_copy(update={"stamp_px": max_px})
     source = template_wavefronts(config)
     try:

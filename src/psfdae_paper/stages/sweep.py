@@ -1,7 +1,7 @@
 """Stages `sweep list` and `sweep point`: the points of a sweep, and one of its trainings.
 
-A point goes in as overrides, which are its whole configuration, and the data that it is trained
-and tested on. Out come `result.json` with its metrics, its tables of errors, what it cost, and
+In go the name of a sweep, that of one of its points and the data that it is trained and tested
+on. Out come `result.json` with its metrics, its tables of errors, what it cost, and
 the files of the trained model.
 """
 
@@ -20,15 +20,14 @@ from psfdae.files import write_text
 from psfdae.method import FitError
 from psfdae.options import File, Folder
 from psfdae.reading import read_json
-from psfdae.settings import Reference, SplitKind, validate
+from psfdae.settings import validate
 from psfdae_paper.configuration.aligners import SWEPT
-from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.configuration.sweep import Axis, Value, models, point_groups
+from psfdae_paper.configuration.sweep import Axis, Value
 from psfdae_paper.sweeps.measured import TABLES, Measured, Task
-from psfdae_paper.sweeps.points import changes, with_values
+from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, with_values
 
 ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
 """Module of the adaptive search; it is imported only if it is used, because it needs Optuna."""
@@ -58,35 +57,12 @@ class Trial:
     earlier_points: Sequence[str]
 
 
-class JsonType(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 takes none
-    """A JSON object as one argument."""
-
-    name = "json"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> dict[str, Any]:
-        """Return the object of a JSON text; any other text is a usage error."""
-        if isinstance(value, dict):
-            return value
-        try:
-            tree = json.loads(value)
-        except json.JSONDecodeError as error:
-            self.fail(f"{value!r} is no JSON: {error}", param, ctx)
-        if not isinstance(tree, dict):
-            self.fail(f"{value!r} is no JSON object", param, ctx)
-        return tree
-
-
-Json = Annotated[dict[str, Any], JsonType()]
 Overrides = Annotated[tuple[str, ...], {"argument": True}]
 
 
 @command("sweep list")
 def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = ()) -> None:
     """List the points of a sweep as tab-separated text, without running it."""
-    from psfdae_paper.sweeps.points import plan_sweep
-
     for entry in plan_sweep(name, overrides).points.values():
         values: Mapping[str, object] = entry.values or {"trial": entry.slot}
         print("\t".join([entry.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
@@ -94,39 +70,31 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
 
 @command("sweep point")
 def sweep_point(
-    model: Annotated[str, click.Choice(models()), "What is trained."],
-    dataset: Annotated[str, "Name that goes into the tables."],
-    split: SplitKind = "random",
-    reference: Reference = "realisation",
-    *,
+    name: Annotated[str, {"argument": True}],
     data: Annotated[
         tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
         "Role and product: stars; for scene 3 states, validation and test.",
     ],
-    levels: Annotated[tuple[float, ...], {"flag": "--level"}, "Noise level λ."],
-    values: Annotated[Json | None, "Value of every axis, as JSON."] = None,
-    keys: Annotated[Json | None, "Keys that were changed, as JSON."] = None,
     checkpoint: Annotated[File, "State of an interrupted training."],
-    slot: Annotated[int | None, "Number of a trial of an adaptive sweep."] = None,
-    search: Annotated[Json | None, "Space and settings of an adaptive sweep, as JSON."] = None,
-    known: Annotated[tuple[str, ...], "Point of an earlier trial, beside OUT."] = (),
-    out: Annotated[Folder, "Folder that receives the point's files; its name is the point's."],
+    out: Annotated[Folder, "Folder for the point's files; its name is the point's."],
     overrides: Overrides = (),
 ) -> None:
     """Train one point of a sweep and measure it."""
-    if (slot is None) != (search is None):
-        raise click.UsageError("--slot and --search go together")
+    plan = plan_sweep(name, overrides)
+    sweep = plan.sweep
+    if out.name not in plan.points:
+        raise SweepError(f"{out}: sweep {name} has no point {out.name}")
+    entry = plan.points[out.name]
     # Networks of scene 3 choose between epochs on states of their own; methods split their stars.
-    is_network = model in SWEPT
-    roles = {"states", "validation", "test"} if is_network else {"stars"}
+    roles = {"states", "validation", "test"} if sweep.model in SWEPT else {"stars"}
     if {role for role, _ in data} != roles:
-        raise click.UsageError(f"--data: {model} needs {', '.join(sorted(roles))}")
+        raise click.UsageError(f"--data: {sweep.model} needs {', '.join(sorted(roles))}")
+    dataset = sweep.dataset or sweep.model
+    task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
     trial = None
-    if slot is not None and search is not None:
-        trial = Trial(slot, search, known)
-    task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
-    config = load_stage(point_groups(model), (*(CHOICE if is_network else ()), *overrides))
-    point(config, model, values or {}, keys or {}, task, trial)
+    if entry.slot is not None:
+        trial = Trial(entry.slot, plan.search, [other.name for other in plan.earlier_trials(entry)])
+    point(part(sweep.reads, entry.config), sweep.model, entry.values, entry.keys, task, trial)
 
 
 def point(

@@ -9,17 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from psfdae.files import write_csv
 from psfdae.fits import storage_of
 from psfdae.method import Method
+from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars, split_stars
 from psfdae.reading import from_tree, read_json
+from psfdae.rng import stream
 from psfdae.settings import Reference, SplitKind
-
-if TYPE_CHECKING:
-    from psfdae_paper.configuration.schema import Config
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.measure import MeasuredStars
 
 TABLES = {"validation": "validation.csv", "test": "evaluation.csv"}
 """Tables of a point's errors by part of the data; that of the test is the main workflow's."""
@@ -128,13 +131,6 @@ def measure_images(
     dict
         See `Measured.metrics`.
     """
-    import pandas as pd
-
-    from psfdae.files import write_csv
-    from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars, split_stars
-    from psfdae.rng import stream
-    from psfdae_paper.evaluation.measure import MeasuredStars
-
     product = read_stars(task.data["stars"], task.reference)
     parts = split_stars(product, task.split, config)
 
