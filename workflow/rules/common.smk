@@ -230,6 +230,16 @@ def products_of(dataset):
     ]
 
 
+def products_of_scene(experiment):
+    """Everything that the target of a scene builds: its datasets of the default target."""
+    return [
+        file
+        for dataset in default_datasets()
+        if dataset_config(dataset).scene.experiment == experiment
+        for file in products_of(dataset)
+    ]
+
+
 def model_of(method, dataset, split, reference):
     """Folder or file of a fit."""
     return f"{RESULTS}/{fits.place_of(method, dataset, split, reference)}"
