@@ -116,4 +116,4 @@ def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarra
     images, weight = flat_modes(wavefronts.terms, wavefronts.telescope.obscuration, 48)
     opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ images
     opd[:, weight < 0.5 * weight.max()] = np.nan
-    return opd.reshape(len(star), 50, 50)
+    return np.asarray(opd.reshape(len(star), 50, 50))
