@@ -87,7 +87,7 @@ def run(config: Config, task: Task, name: str) -> Measured:
 def _rows(config: Config, task: Task, role: str, test_set: str) -> list[Row]:
     """Measure one network at all noise levels; return rows like those of the main workflow."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
-    predict = network_predictor(task.folder, config)
+    predict = network_predictor(task.folder, product, config)
     rows: list[Row] = []
     for level in task.levels:
         stamps = noisy_test_states(config, product["stamps"], test_set, level)
