@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
-from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
+from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.containers import in_unit
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, shorten, silent
@@ -52,6 +52,7 @@ from psfdae.image.header_checks import (
     sky_sample,
 )
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
+from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 from psfdae.image.trails import with_trails
 
