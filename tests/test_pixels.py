@@ -180,9 +180,10 @@ def test_noise_of_neighbours_that_is_shared_is_that_of_their_sum(clean):
 def test_trails_are_found_and_stars_are_none(clean):
     image, none = clean[0], np.zeros(clean[0].shape, bool)
     row, column = np.indices(image.shape)
-    assert find_trails(image, none)[1] == 0
+    assert find_trails(image, none, sky_level(image, none))[1] == 0
     across = (row - 100 - 0.4 * column) / np.hypot(1, 0.4)
-    mask, count = find_trails(image + 150 * np.exp(-0.5 * (across / 1.2) ** 2), none)
+    image = image + 150 * np.exp(-0.5 * (across / 1.2) ** 2)
+    mask, count = find_trails(image, none, sky_level(image, none))
     assert count == 1 and mask[np.abs(across) < 2].mean() > 0.95
     assert not mask[np.abs(across) > 12].any()
 

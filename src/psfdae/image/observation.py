@@ -764,10 +764,11 @@ class Layers:
 def _sky(layers: Layers) -> Sky:
     """The image of layers as a whole with its sky; that of the last ones is kept for more calls."""
     image, masked, sigma = layers._whole()
-    bad = layers._found(image, masked).mask
+    bad_pixels = layers._found(image, masked)
     with silent():
         try:
-            sky = sky_of(image, bad, sigma, layers.least_noise)
+            measured = bad_pixels.sky
+            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:
