@@ -307,7 +307,7 @@ def test_noise_of_few_counts_has_no_blank_areas():
     image[100:132, 100:132] += drawn(moffat(3.0), [(16, 16)], [1e4], 32)
     none = np.zeros(image.shape, bool)
     assert not bad_pixels.blank_areas(image, none)
-    assert bad_pixels.least_value_share(image, none)[0] == 0
+    bad_pixels.refuse_clipped_sky(image, none)
 
 
 def test_overscan_of_the_header_is_bad_where_the_pixels_confirm_it(clean):
@@ -338,12 +338,10 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
         Stars.from_image(clipped, place)
     for scatter, sky in ((12.0, 0.0), (12.0, -12.0)):
         noise = np.random.default_rng(7).normal(sky, scatter, (256, 256))
-        share, least = bad_pixels.least_value_share(
-            np.maximum(noise, 0), np.zeros(noise.shape, bool)
-        )
-        assert share >= 0.49 and least == 0
+        with pytest.raises(bad_pixels.ClippedSkyError, match="least value, 0: the sky"):
+            bad_pixels.refuse_clipped_sky(np.maximum(noise, 0), np.zeros(noise.shape, bool))
     few = np.random.default_rng(8).poisson(1.0, (256, 256)).astype(float)
-    assert bad_pixels.least_value_share(few, np.zeros(few.shape, bool))[0] == 0
+    bad_pixels.refuse_clipped_sky(few, np.zeros(few.shape, bool))
 
 
 # Units.

@@ -344,7 +344,7 @@ def cosmic_rays(
     def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
         return _cosmic_rays_of_band(band, bad, noise, saturate, ratio)
 
-    return _in_bands(find, image, bad, noise) & ~bad
+    return np.asarray(_in_bands(find, image, bad, noise) & ~bad)
 
 
 def _cosmic_rays_of_band(

@@ -50,7 +50,8 @@ class Positions:
     @classmethod
     def of_pairs(cls, pairs: str, **meaning: Any) -> tuple[Positions, ...]:
         """Return the columns of pairs of names, `x,y` with blanks between them, of one meaning."""
-        return tuple(cls(*pair.split(","), **meaning) for pair in pairs.split())
+        names = [pair.split(",") for pair in pairs.split()]
+        return tuple(cls(first, second, **meaning) for first, second in names)
 
 
 CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
