@@ -1,4 +1,9 @@
-"""Stages of scene 3 that turn estimates, fits and bounds into tables and figures."""
+"""Stages of scene 3 that turn estimates, fits and bounds into tables and figures.
+
+In: the products of `psfdae_paper.stages.alignment_methods`. They are read in one place,
+`read_results`, which refuses products of different telescopes, noise or states. Out: tables of
+errors and of their correlations, the paper's beside them, run times, and figures.
+"""
 
 from __future__ import annotations
 
@@ -145,7 +150,13 @@ def products_of_one_test(
 
 
 def _require_states(product: Product, reference: Product) -> None:
-    """Raise ProductError if two products of one test set have different true states."""
+    """Refuse two products of one test set that have different true states.
+
+    Raises
+    ------
+    ProductError
+        With the number of states, or the first state that differs.
+    """
     states, expected = product["states"], reference["states"]
     if np.array_equal(states, expected):
         return
@@ -168,8 +179,12 @@ def tables(
     errors: Annotated[File, "CSV that receives the errors."],
     correlation: Annotated[File, "CSV that receives their correlations."],
 ) -> None:
-    """Tabulate errors and their correlations."""
+    """Tabulate errors and their correlations.
 
+    A row of the errors has the mean absolute error, the bias and the variance of a method in one
+    of the four numbers of a state, at one noise level; rows of the Cramér-Rao bound have expected
+    values.
+    """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
         bound_config = read_product(path, "alignment_bound", ()).config
@@ -205,7 +220,10 @@ def paper_tables(
     correlation: ErrorTable,
     out: Annotated[Folder, "Folder for CSV and Markdown files."],
 ) -> None:
-    """Set measured errors beside the paper's tables."""
+    """Set measured errors beside the paper's tables.
+
+    One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
+    """
 
     def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
@@ -233,7 +251,10 @@ def time_table(
     ],
     out: Annotated[File, "CSV with the cost of an estimate and of the trainings."],
 ) -> None:
-    """Tabulate the run times of the methods."""
+    """Tabulate the run times of the methods.
+
+    A row has the seconds of an estimate, and those of all trainings that the method needs.
+    """
     # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
@@ -253,7 +274,10 @@ def time_table(
 
 @command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
-    """Draw the nine stamps of a few states before and after the DAE."""
+    """Draw the nine stamps of a few states before and after the DAE.
+
+    The first two states of the set are shown, without noise and at every noise level.
+    """
     product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
@@ -276,7 +300,8 @@ def predicted(
     ],
     out: Png,
 ) -> None:
-    """Draw estimates against the truth."""
+    """Draw estimates against the truth, for each method, number of a state and noise level."""
+    # Estimated states of each method and noise level.
     by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
@@ -286,7 +311,10 @@ def predicted(
 
 @command("alignment figure errors")
 def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
-    """Draw errors against the size of the misalignment."""
+    """Draw errors against the size of the misalignment, with the Cramér-Rao bound.
+
+    The error of a state is the mean of the absolute errors of its four numbers.
+    """
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
@@ -303,7 +331,11 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     choice=CHOICE,
 )
 def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
-    """Draw a state and its twin, in focus and with the CCD's defocus."""
+    """Draw a state and its twin, in focus and with the CCD's defocus.
+
+    The curve is the difference χ² of the stamps of multiples of a state from those of the state:
+    at −1, its twin, it is small in focus.
+    """
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
 
@@ -346,6 +378,7 @@ def _stamps_of_multiples(
     stamps : ndarray, shape (len(multiples), F, d, d)
         Stamps of multiples of the state, with the CCD at a defocus of `defocus_m` metres.
     """
+    # The telescope with another defocus, its wavefront, and its stamps.
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
@@ -357,7 +390,10 @@ def _stamps_of_multiples(
 
 @command("alignment figure correlation")
 def correlation(correlation: ErrorTable, out: Png) -> None:
-    """Draw measured and predicted correlations of errors beside the paper's."""
+    """Draw measured and predicted correlations of errors beside the paper's.
+
+    A panel is the matrix of the correlations between the four numbers of a state.
+    """
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
@@ -368,6 +404,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
             matrix[a, b] = matrix[b, a] = value
         return f"{source}{method.short}, λ = {level:g}", matrix
 
+    # Correlations of uniform states with noise, and the paper's; both as rows of pairs.
     measured, paper = read_table(correlation), published("correlation")
     measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
     measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)
