@@ -87,7 +87,7 @@ class Cnn(Group):
     )
 
     @model_validator(mode="after")
-    def _check_layers(self) -> Cnn:
+    def check_layers(self) -> Cnn:
         """Require odd kernels, and as many kernels and strides as widths."""
         if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")

@@ -270,7 +270,7 @@ class Config(Consistent):
     fit: Fit
 
     @model_validator(mode="after")
-    def _check_groups(self) -> Config:
+    def check_groups(self) -> Config:
         """Refuse values of single groups that contradict those of other groups."""
         # Parts for training (with validation) and test have no star in common.
         part_stars = self.parts.train_stars + self.parts.test_stars

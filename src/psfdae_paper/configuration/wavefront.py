@@ -33,7 +33,7 @@ class VonKarman(Group):
     remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
 
     @model_validator(mode="after")
-    def _check_layers(self) -> VonKarman:
+    def check_layers(self) -> VonKarman:
         """Require one strength for each layer, which add up to 1."""
         if len(self.layer_heights_m) != len(self.layer_strengths):
             raise ValueError(
