@@ -23,7 +23,7 @@ from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import _locked
 from psfdae.files import read_product, write_product
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
@@ -56,7 +56,7 @@ def made(training):
 
 @pytest.fixture(scope="module")
 def candidates(training, config):
-    observation = Source(training.image, training.catalogue).open(16, 8)
+    observation = ImageInput(training.image, catalogue=training.catalogue).open(16, 8)
     return collect(observation, config.calibration_stars, config.framing)
 
 
@@ -117,14 +117,14 @@ def test_what_the_list_says_against_a_star_counts(training, candidates, config, 
     listed.loc[good[:4], "FLAGS"] = [1, 2, 7, 8]
     listed.loc[good[4], "X_IMAGE"] = np.nan
     listed.drop(columns=["ra", "dec"]).to_csv(tmp_path / "stars.csv", index=False)
-    observation = Source(training.image, tmp_path / "stars.csv").open(16, 8)
+    observation = ImageInput(training.image, catalogue=tmp_path / "stars.csv").open(16, 8)
     verdict = collect(observation, config.calibration_stars, config.framing).verdict
     assert verdict[good].tolist() == [
         *("good", "blended", "saturated", "incomplete", "no position"),
     ]
     others = np.setdiff1d(candidates.bright.row, good)
     assert (verdict[others] == "good").mean() > 0.95
-    assert f"no position in row {good[4] + 1}: flagged" in observation.said()
+    assert f"no position in row {good[4] + 1}: flagged" in observation.summary()
 
 
 def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):

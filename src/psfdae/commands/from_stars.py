@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae import fits
-from psfdae.cli import command
+from psfdae.cli import command, typed_words
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
-from psfdae.commands.predict import ImageOptions, write_list
+from psfdae.commands.predict import write_list
 from psfdae.errors import Error
 from psfdae.files import (
     atomic_path,
@@ -26,7 +26,7 @@ from psfdae.files import (
     write_text,
 )
 from psfdae.image.errors import ObservationError
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
 from psfdae.method import Method, facts_of
 from psfdae.methods import method
@@ -114,7 +114,10 @@ class ModelFiles:
 def from_stars(
     config: Settings,
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
-    options: ImageOptions,
+    options: ImageStatements,
+    all_extensions: Annotated[
+        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
+    ] = False,
     name: Annotated[str | None, "Name of the model.  [default: the image's; all]"] = None,
     licence: Annotated[str, "Licence of the model."] = "not stated",
     method_name: Annotated[
@@ -152,7 +155,7 @@ def from_stars(
     config = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
     job = {key: value for key, value in locals().items() if key in signature(train).parameters}
     stem = _model_name(image, name)
-    if not options.all_extensions:
+    if not all_extensions:
         print(train(**job))
     elif len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
@@ -176,16 +179,17 @@ def from_stars(
     if several and options.catalogue:
         options = replace(options, on_image=True)
     stem = _model_name(image[:1], None if several else name)
-    model = out if several or options.all_extensions else ModelFiles(out, stem, ()).bundle
-    outputs = ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
-    words = ["psfdae", "predict", str(image[0]), *options.words(), *outputs]
+    model = out if several or all_extensions else ModelFiles(out, stem, ()).bundle
+    words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
+    words += ["--all-extensions"] * all_extensions
+    words += ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
     print(f"next: {shlex.join(words)}")
 
 
 def train(
     config: Settings | Mapping[str, Any],
     image: tuple[Path, ...],
-    options: ImageOptions,
+    options: ImageStatements,
     name: str | None,
     licence: str,
     method_name: str | None,
@@ -210,7 +214,7 @@ def train(
     ConfigError
         If no method of the list makes models.
     """
-    sources, settings = options.source(image[0]).of_each(image), of_config(config)
+    sources, settings = ImageInput(image[0], **vars(options)).of_each(image), of_config(config)
     exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
     if exposures and method_name is None and "field" in settings.methods:
         # Validation stars would judge the field that all exposures share, but each gets its own.
@@ -277,7 +281,7 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
     FolderError
         If no file can have such a name.
     """
-    name = name or (ALL if len(image) > 1 else Source(image[0]).name)
+    name = name or (ALL if len(image) > 1 else ImageInput(image[0]).name)
     # Linux allows 255 bytes in the name of a file.
     longest = 255 - len(SUFFIX)
     if "/" in name or len(name.encode()) > longest:
@@ -325,7 +329,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _write_model(
     settings: Settings,
-    sources: list[Source],
+    sources: list[ImageInput],
     files: ModelFiles,
     licence: str,
     candidates: list[type[Method]],
@@ -342,7 +346,7 @@ def _write_model(
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
     for image_stars in stars.images:
-        if image_stars.observation.found is not None:
+        if image_stars.observation.detections is not None:
             write_list(image_stars.observation, files.star_list(image_stars.name))
     write_table(files.path / "selection.csv", stars.table)
     write_product(files.stars, "stars", stars.columns, stars.described())

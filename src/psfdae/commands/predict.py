@@ -9,7 +9,6 @@ import itertools
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -21,103 +20,33 @@ from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_imag
 from psfdae.figures import write_png
 from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.image.fits_file import Card
-from psfdae.image.observation import Observation, Source, list_offset
+from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.observation import Observation
+from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import PsfModel, load_model
-from psfdae.options import File, NameOrNumber
+from psfdae.options import File
 from psfdae.progress import silence
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """Options on an image and its stars, which several commands take; each overrides the header."""
-
-    catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None
-    detect: Annotated[bool, "Find the stars of an image; the list is written, too."] = False
-    on_image: Annotated[bool, "Leave out stars of the list that are off the image."] = False
-    threshold: Annotated[float, "Detection limit of --detect, in σ above the sky."] = 5.0
-    pixel_scale: Annotated[float | None, "Arcseconds per pixel.  [default: the WCS's]"] = None
-    origin: Annotated[int | None, click.IntRange(0, 1), "Index of the first pixel's centre."] = None
-    extension: Annotated[
-        str | int | None, NameOrNumber(), "Name or number of the extension with the stars."
-    ] = None
-    all_extensions: Annotated[
-        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
-    ] = False
-    mask: Annotated[
-        str | int | None,
-        NameOrNumber(),
-        "Extension or FITS file; pixels other than 0 are bad.  [default: DQ of the file; none]",
-    ] = None
-    bad_bits: Annotated[
-        int | None,
-        click.IntRange(1, 2**63 - 1),
-        "Sum of the mask's bits that are bad.  [default: all]",
-    ] = None
-    weight: Annotated[
-        str | int | None, NameOrNumber(), "Extension or FITS file with 1/variance of the pixels."
-    ] = None
-    variance: Annotated[
-        str | int | None, NameOrNumber(), "Extension or FITS file with their variance."
-    ] = None
-    error: Annotated[
-        str | int | None,
-        NameOrNumber(),
-        "Extension or FITS file with their σ.  [default: ERR of the file; none]",
-    ] = None
-    gain: Annotated[float | None, "Electrons per count.  [default: the header's]"] = None
-    read_noise: Annotated[float | None, "Electrons.  [default: the header's]"] = None
-    saturate: Annotated[float | None, "Counts of a saturated pixel.  [default: the header's]"] = (
-        None
-    )
-    colour_column: Annotated[
-        str | None,
-        "Colours of the list's stars, with which the PSF may change; empty where unknown.",
-    ] = None
-    accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
-
-    def words(self) -> list[str]:
-        """Return the options that differ from their defaults, as they are typed."""
-        words = []
-        for option in fields(self):
-            value = getattr(self, option.name)
-            if value != option.default:
-                flag = f"--{option.name.replace('_', '-')}"
-                words += [flag] if value is True else [flag, str(value)]
-        return words
-
-    def source(
-        self, path: Path, flux_column: str | None = None, background_column: str | None = None
-    ) -> Source:
-        """Return the image in the file `path`, with all that the options say about it."""
-        statements = vars(self).copy()
-        threshold, pixel_scale = statements.pop("threshold"), statements.pop("pixel_scale")
-        del statements["all_extensions"]
-        statements["detect"] = threshold if statements["detect"] else None
-        return Source(
-            path,
-            pixel_scale_arcsec=pixel_scale,
-            flux_column=flux_column,
-            background_column=background_column,
-            **statements,
-        )
 
 
 def write_list(observation: Observation, path: Path) -> None:
     """Write the stars that were detected in an image as a star list in CSV."""
-    assert observation.found is not None
+    assert observation.detections is not None
     with atomic_path(path) as temporary:
-        observation.found.table.write(temporary, format="ascii.csv", overwrite=True)
+        observation.detections.table.write(temporary, format="ascii.csv", overwrite=True)
 
 
 @command("predict")
 def predict(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
-    options: ImageOptions,
+    options: ImageStatements,
+    all_extensions: Annotated[
+        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
+    ] = False,
     flux_column: Annotated[
         str | None, "Fluxes inside the stamp; estimated where not given."
     ] = None,
@@ -145,8 +74,8 @@ def predict(
     Stars are flagged, never dropped. Files that cannot be used end with one line
     and exit code 2.
     """
-    job = dict(locals())
-    if not options.all_extensions:
+    job = {name: value for name, value in locals().items() if name != "all_extensions"}
+    if not all_extensions:
         summary = predict_image(**job)
         if not quiet:
             print(summary)
@@ -189,7 +118,7 @@ def _bundle_of_image(model: Path | None, name: str) -> Path | None:
 
 def predict_image(
     stars: Path,
-    options: ImageOptions,
+    options: ImageStatements,
     flux_column: str | None,
     background_column: str | None,
     fixed_positions: bool,
@@ -215,7 +144,9 @@ def predict_image(
         If the options do not fit the image or the model, or a file cannot be written.
     """
     # Check all that can be checked without reading pixels.
-    source = options.source(stars, flux_column=flux_column, background_column=background_column)
+    source = ImageInput(
+        stars, **vars(options), flux_column=flux_column, background_column=background_column
+    )
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
     model = _bundle_of_image(model, source.name)
     check_targets((*source.files(), model), out, plot, list_path, overwrite=overwrite)
@@ -249,7 +180,7 @@ def predict_image(
     except OSError as error:
         raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
-    lines = [observation.said(), list_note]
+    lines = [observation.summary(), list_note]
     instrument_note = loaded.other_instrument(observation.instrument, observation.colour_column)
     if instrument_note:
         lines.append(f"{source.path}: {instrument_note}")
@@ -298,7 +229,7 @@ def check_targets(
 
 def _write_prediction(
     model: PsfModel,
-    source: Source,
+    source: ImageInput,
     observation: Observation,
     out: Path,
     threads: int | None,

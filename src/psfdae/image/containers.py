@@ -194,4 +194,5 @@ def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
     content = io.BytesIO()
     with reading(name):
         hdus().writeto(content, output_verify="silentfix+ignore")
-    return temporary_file(name, content.getvalue())
+    content.seek(0)
+    return temporary_file(name, content)

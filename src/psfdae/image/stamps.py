@@ -6,10 +6,14 @@ import warnings
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.moments import FWHM_OF_SIGMA
+
+if TYPE_CHECKING:
+    from psfdae.image.fits_file import Pixels
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,63 @@ MEANING: dict[StarFlag, str] = {
 def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray | np.bool) -> None:
     """Add a flag to some stars of `flags`, shape (n,), uint16."""
     flags[where] |= np.uint16(flag)
+
+
+# Cutting stamps out of an image.
+
+LARGEST_POSITION_PX = 2**30
+"""Positions are clipped to ± this many pixels, far off any image."""
+
+
+def central_pixel(position: np.ndarray) -> np.ndarray:
+    """Return the pixel in which a 0-based position lies, int64; one far off the image for NaN.
+
+    Pixel k covers k − ½ ≤ position < k + ½.
+    """
+    far = LARGEST_POSITION_PX
+    rounded = np.floor(np.nan_to_num(position, nan=-far, posinf=far, neginf=-far) + 0.5)
+    return np.asarray(np.clip(rounded, -far, far), np.int64)
+
+
+def cut_image(
+    pixels: Pixels | np.ndarray,
+    shape: tuple[int, ...],
+    x: np.ndarray,
+    y: np.ndarray,
+    stamp_px: int,
+    margin: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a stamp around each star, with the star's pixel at index d//2 + margin.
+
+    Parameters
+    ----------
+    pixels : array-like of that shape, indexed once with arrays of rows and columns
+    x, y : ndarray, shape (n,)
+        0-based positions; NaN is off the image.
+    stamp_px, margin : int
+        d, and pixels added on every side.
+
+    Returns
+    -------
+    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin), 0 off the image
+    inside : ndarray of bool, the same shape: the pixel is on the image
+    truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
+    """
+    side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
+    rows = central_pixel(y)[:, None] + side
+    columns = central_pixel(x)[:, None] + side
+    row_inside: np.ndarray = (rows >= 0) & (rows < shape[0])
+    column_inside: np.ndarray = (columns >= 0) & (columns < shape[1])
+    # Pixels off the image are those at its edge first, and 0 then.
+    stamps: np.ndarray = pixels[
+        np.clip(rows, 0, shape[0] - 1)[:, :, None], np.clip(columns, 0, shape[1] - 1)[:, None, :]
+    ]
+    inside = row_inside[:, :, None] & column_inside[:, None, :]
+    if not inside.all():
+        stamps = np.where(inside, stamps, 0)
+    stamp = slice(margin, margin + stamp_px)
+    is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
+    return stamps, inside, np.asarray(~is_whole)
 
 
 # The border and what is around it: where there is most sky and least star.
