@@ -103,8 +103,8 @@ class ModelFiles:
 
     def paths(self) -> list[Path]:
         """Return the paths of all files but the star lists and the page."""
-        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
-        paths = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
+        names = ("selection.csv", "overrides.txt", "report.csv", "found.csv", "report.png")
+        paths = [self.path / name for name in names]
         for method_class in self.methods:
             paths += fits.outputs(method_class, self.fit(method_class))
         return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
@@ -306,23 +306,15 @@ def _locked(folder: Path) -> Iterator[None]:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / ".from_stars.lock"
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with path.open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # A process that has just ended may have removed the file that is open here, and
-                # a third one may have made it anew: then this lock protects nothing.
-                holds_lock = os.path.samestat(os.fstat(lock.fileno()), path.stat())
-            except (BlockingIOError, FileNotFoundError):
-                holds_lock = False
-            if not holds_lock:
-                raise FolderError(f"{folder}: another psfdae from-stars works there")
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderError(f"{folder}: another psfdae from-stars works there") from None
+        yield
     finally:
+        os.close(descriptor)
         with suppress(OSError):
             folder.rmdir()
 
@@ -387,8 +379,6 @@ def _write_model(
         # Stars that no fit has seen, degraded to low S/N, test the model.
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
-        write_columns(files.path / "evaluation.csv", report.evaluation.columns)
-        write_columns(files.path / "per_star.csv", report.per_star.columns)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.found.columns, digits=6)
         write_bytes(files.path / "report.png", report.strip_png)

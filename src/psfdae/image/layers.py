@@ -51,8 +51,6 @@ class NoiseMap:
     image : ImageFile
     kind : str
         A key of `NOISE_MAPS`.
-    zeros : int
-        Pixels in which a stated map is 0; they are bad.
     scale : float
         Factor from σ of the map to σ in the image, where the sky shows it.
     photons : float
@@ -61,7 +59,6 @@ class NoiseMap:
 
     image: ImageFile
     kind: str
-    zeros: int = 0
     scale: float = 1.0
     photons: float = 0.0
 
@@ -133,11 +130,6 @@ class Layers:
             return np.asarray(values != 0)
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
             return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
-
-    def masked_part(self) -> float:
-        """Return the part of the pixels that the mask calls bad."""
-        with self.open(in_pieces=False) as (_, mask, _):
-            return 0.0 if mask is None else float(np.mean(self.is_bad(mask[:])))
 
     def sky(self) -> Sky:
         """Return the image as a whole with its sky.
@@ -248,7 +240,9 @@ def find_layers(
     notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
     for kind, place in stated.items():
         noise = _layer_of(image, place, NOISE_MAPS[kind])
-        layers = replace(layers, noise=_stated_noise(noise, kind))
+        if zeros := _count_zeros(noise, kind):
+            remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
+        layers = replace(layers, noise=NoiseMap(noise, kind))
     if all(place is None for place in maps.values()):
         for kind in layers_of_file.keys() & NOISE_MAPS.keys():
             noise = layers_of_file[kind]
@@ -262,12 +256,15 @@ def find_layers(
                 notes.insert(0, f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}")
     if notes:
         line = f"{source.path}: uses {' and '.join(notes)}"
-        # A bit may mark pixels that are fine; then good stars would be lost.
-        if mask is not None and source.mask is None and (share := layers.masked_part()) > 0.2:
-            line += (
-                f"; {100 * share:.0f} % of the pixels have a bit of {mask.label}: "
-                "state --bad-bits, or --mask none"
-            )
+        if mask is not None and source.mask is None:
+            # A bit may mark pixels that are fine; then good stars would be lost.
+            with open_pixels(mask, in_pieces=False, dtype=np.float64) as pixels:
+                share = float(np.mean(layers.is_bad(pixels[:])))
+            if share > 0.2:
+                line += (
+                    f"; {100 * share:.0f} % of the pixels have a bit of {mask.label}: "
+                    "state --bad-bits, or --mask none"
+                )
         remarks.insert(0, line)
     return layers, remarks
 
@@ -322,8 +319,14 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
     return layer
 
 
-def _stated_noise(noise: ImageFile, kind: str) -> NoiseMap:
-    """Return a map of noise that is stated; one whose name says another kind is refused."""
+def _count_zeros(noise: ImageFile, kind: str) -> int:
+    """Return the number of pixels, bad ones, in which a map of noise that is stated is 0.
+
+    Raises
+    ------
+    ObservationError
+        If its name says another kind, or it has values that no map of its kind has.
+    """
     kind_by_name = map_kind(noise)
     if kind_by_name in NOISE_MAPS and kind_by_name != kind:
         raise ObservationError(
@@ -343,7 +346,7 @@ def _stated_noise(noise: ImageFile, kind: str) -> NoiseMap:
             f"pixels are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, "
             "or a mask",
         )
-    return NoiseMap(noise, kind, zeros)
+    return zeros
 
 
 def with_photons(

@@ -209,8 +209,6 @@ class Observation:
             for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True)
         ]
         lines = [f"{self.path}: {', '.join(words)}", *self.remarks]
-        if (noise := self._layers.noise) is not None and noise.zeros:
-            lines.append(f"{noise.image.path}: {noise.kind} 0, bad pixels: {noise.zeros}")
         if self.shape is not None and (notes := self._layers.bad_pixels.notes):
             lines.append(f"{self.path}: left out: {', '.join(notes)}")
         if (no_position := self.without_position()).any():
