@@ -10,16 +10,13 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.sky_level import noise_correlation
-
-if TYPE_CHECKING:
-    from astropy.wcs import WCS
 
 BLOCK_PX = 32
 """Side of the squares in which sky and noise are measured."""
@@ -91,13 +88,13 @@ def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[
         stated.
     """
     values = {
-        "pixel scale": _pixel_scale(image),
-        "gain": _gain(image),
+        "pixel scale": pixel_scale(image),
+        "gain": electrons_per_count(image),
         "read noise": header_number(image, HEADER_KEYS["read noise"]),
         "saturation": header_number(image, HEADER_KEYS["saturation"]),
     }
-    given = {name: CameraValue(v, "given") for name, v in stated.items() if v is not None}
-    return values | given
+    values |= {name: CameraValue(v, "given") for name, v in stated.items() if v is not None}
+    return values
 
 
 def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
@@ -114,18 +111,14 @@ def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
     return CameraValue(None, "not known")
 
 
-def pixel_scale(wcs: WCS) -> float:
-    """Return the side in arcseconds of a square as large as a pixel at the reference point."""
+def pixel_scale(image: ImageFile) -> CameraValue:
+    """Return arcseconds per pixel by the WCS, or by other cards of the header."""
     from astropy.wcs.utils import proj_plane_pixel_area
 
-    return float(np.sqrt(proj_plane_pixel_area(wcs))) * 3600.0
-
-
-def _pixel_scale(image: ImageFile) -> CameraValue:
-    """Return arcseconds per pixel by the WCS, or by other cards of the header."""
     if image.wcs is not None:
+        # Side of a square as large as a pixel at the reference point.
         with reading(image.path):
-            scale = pixel_scale(image.wcs)
+            scale = float(np.sqrt(proj_plane_pixel_area(image.wcs))) * 3600.0
         if math.isfinite(scale) and scale > 0:
             return CameraValue(scale, "WCS")
     header_scale = header_number(image, HEADER_KEYS["pixel scale"])
@@ -138,7 +131,7 @@ def _pixel_scale(image: ImageFile) -> CameraValue:
     return header_scale
 
 
-def _gain(image: ImageFile) -> CameraValue:
+def electrons_per_count(image: ImageFile) -> CameraValue:
     """Return electrons per count of the pixels.
 
     Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
@@ -240,8 +233,8 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     sky, values = sky_sample(image), dict(camera)
     if sky is None:
         return CheckedCamera(values, [])
-    values["saturation"], remarks = _checked_saturation(image, sky, camera["saturation"])
-    problem = _gain_problem(image, sky, camera["gain"], camera["read noise"])
+    values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
+    problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
         return CheckedCamera(values, remarks)
     origin = camera["gain"].origin
@@ -259,7 +252,7 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     return CheckedCamera(values, remarks)
 
 
-def _checked_saturation(
+def checked_saturation(
     image: ImageFile, sky: SkySample, saturation: CameraValue
 ) -> tuple[CameraValue, list[str]]:
     """Return the saturation that fits the pixels, and sentences on another one.
@@ -285,7 +278,7 @@ def _checked_saturation(
     return saturation, remarks
 
 
-def _gain_problem(
+def gain_contradiction(
     image: ImageFile, sky: SkySample, gain: CameraValue, read_noise: CameraValue
 ) -> str | None:
     """Return how gain and read noise contradict the pixels; None if they do not.

@@ -61,7 +61,8 @@ Card = tuple[str, str | float | None, str]
 # Files.
 
 
-def _only_member(file: IO[bytes]) -> IO[bytes]:
+def only_member(file: IO[bytes]) -> IO[bytes]:
+    """Open the only file in a zip file."""
     packed = zipfile.ZipFile(file)
     names = packed.namelist()
     if len(names) != 1:
@@ -69,13 +70,13 @@ def _only_member(file: IO[bytes]) -> IO[bytes]:
     return packed.open(names[0])
 
 
-# How files compressed as a whole are read, by their first bytes.
 UNPACK: dict[bytes, Callable[[IO[bytes]], Any]] = {
     b"\x1f\x8b": gzip.open,
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ\x00": lzma.LZMAFile,
-    b"PK\x03\x04": _only_member,
+    b"PK\x03\x04": only_member,
 }
+"""How files that are compressed as a whole are read, by their first bytes."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def plain_file(path: Path) -> PlainFile:
         If there is no such file, or it is none of FITS.
     """
     with reading(path), path.open("rb") as file:
+        # The first bytes tell how the file is compressed, if it is.
         start = file.read(80)
         file.seek(0)
         for magic, unpack in UNPACK.items():
@@ -285,7 +287,7 @@ def find_image(
     file = path if isinstance(path, PlainFile) else plain_file(path)
     path = file.name
     with reading(path), open_hdus(file, as_stored=True) as hdus:
-        hdu = _choose(path, hdus, extension)
+        hdu = choose_extension(path, hdus, extension)
         index, header = hdus.index(hdu), hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
         shape = tuple(int(n) for n in hdu.shape)
@@ -298,7 +300,8 @@ def find_image(
         # values = BSCALE · stored + BZERO
         bscale, bzero, blank = (card_value(header, key) for key in ("BSCALE", "BZERO", "BLANK"))
         bscale, bzero = float(1.0 if bscale is None else bscale), float(bzero or 0.0)
-        wcs = _celestial(header, hdus)
+        wcs = celestial_wcs(header, hdus)
+    # Axes of one element in front of those of an image or a cube are no axes.
     leading = 0
     while len(shape) > 3 and shape[0] == 1:
         shape, leading = shape[1:], leading + 1
@@ -332,9 +335,14 @@ def is_science(name: str) -> bool:
     return NOT_SCIENCE.fullmatch(name.strip().upper()) is None
 
 
-def _choose(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
+def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
     """Return the extension with the image; see `find_image`."""
-    listed = shorten([_label(k, hdu) for k, hdu in enumerate(hdus)])
+    # Number, name and size of each extension, for messages.
+    labels = []
+    for k, hdu in enumerate(hdus):
+        size = "×".join(map(str, hdu.shape)) if has_pixels(hdu) else "no image"
+        labels.append(f"{k} {hdu.name or '(no name)'} ({size})")
+    listed = shorten(labels)
     if extension is not None:
         hdu = _named(hdus, str(extension).strip())
         if hdu is None:
@@ -379,13 +387,7 @@ def has_pixels(hdu: Any) -> bool:
     )
 
 
-def _label(index: int, hdu: Any) -> str:
-    """Return number, name and size of an extension, for messages."""
-    size = "×".join(str(n) for n in hdu.shape) if has_pixels(hdu) else "no image"
-    return f"{index} {hdu.name or '(no name)'} ({size})"
-
-
-def _celestial(header: Header, hdus: HDUList) -> WCS | None:
+def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     """Return the celestial WCS of an image; None without a stated scale, or if it is damaged."""
     from astropy.wcs import WCS
 

@@ -1,4 +1,4 @@
-"""What is stated about an image and its stars, once for the command line and for Python.
+"""Statements on an image and its stars, once for the command line and for Python.
 
 An option of `psfdae predict`, a keyword of `psfdae.Stars.from_image` and a row of a table on the
 pages are fields of `ImageStatements`. `ImageInput` adds the image, and opens it.

@@ -220,7 +220,7 @@ def find_layers(
         other.
     """
     layers_of_file = {} if is_cube else layers_beside(image)
-    mask, bad_bits, remarks = _mask_and_bits(source, image, layers_of_file.get("mask"))
+    mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
     gain, read_noise = camera["gain"].value, camera["read noise"].value
     layers = Layers(
         image,
@@ -240,7 +240,7 @@ def find_layers(
     notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
     for kind, place in stated.items():
         noise = _layer_of(image, place, NOISE_MAPS[kind])
-        if zeros := _count_zeros(noise, kind):
+        if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
         layers = replace(layers, noise=NoiseMap(noise, kind))
     if all(place is None for place in maps.values()):
@@ -269,7 +269,7 @@ def find_layers(
     return layers, remarks
 
 
-def _mask_and_bits(
+def mask_and_bits(
     source: ImageInput, image: ImageFile, mask: ImageFile | None
 ) -> tuple[ImageFile | None, int | None, list[str]]:
     """Return the mask that is stated, else that of the image's file, its bad bits, and remarks."""
@@ -319,7 +319,7 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
     return layer
 
 
-def _count_zeros(noise: ImageFile, kind: str) -> int:
+def count_zeros(noise: ImageFile, kind: str) -> int:
     """Return the number of pixels, bad ones, in which a map of noise that is stated is 0.
 
     Raises

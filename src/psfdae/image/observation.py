@@ -280,56 +280,13 @@ class Observation:
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}, expected at least 1")
-        cut_stamps = self._cut_from_cube if self.shape is None else self._cut_from_image
-        with self._layers.open(in_pieces=self.shape is None) as pixels_of_layers:
+        with self._layers.open(in_pieces=self.shape is None) as (pixels, mask, noise):
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
-                yield self._stamps(part, *cut_stamps(part, *pixels_of_layers))
-
-    def _cut_from_cube(
-        self, part: slice, pixels: Pixels, mask: Pixels | None, _noise: Pixels | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return pixels and masks (n, s, s), which stars are truncated, and their noise (n,)."""
-        side, count = self.stamp_px + 2 * self.margin, part.stop - part.start
-        data = cut(_stamps_of_cube(pixels, part), side)
-        masked = np.zeros(data.shape, dtype=bool)
-        if mask is not None:
-            mask_part = part if len(mask.image.shape) == 3 else slice(0, 1)
-            masked |= self._layers.is_bad(cut(_stamps_of_cube(mask, mask_part), side))
-        return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
-
-    def _cut_from_image(
-        self, part: slice, pixels: Pixels, _mask: Pixels | None, noise: Pixels | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return what `_cut_from_cube` does, of stars in an image."""
-        assert self.shape is not None and self.positions is not None
-        x, y = self.positions[part].T
-        # The noise of the sky is that of a ring of at least 8 px around the stamp.
-        margin = max(self.margin, 8)
-        window = (self.shape, x, y, self.stamp_px, margin)
-        data, inside, truncated = cut_image(pixels, *window)
-        raw = data
-        if self.neighbour_light is not None:
-            # Saturated pixels stay, or they would not be seen.
-            full = np.inf if self.saturate is None else self.saturate
-            cleaned = data - self.neighbour_light(part, self.stamp_px, margin)
-            data = np.where(data >= full, data, cleaned)
-        masked = ~inside | (cut_image(self._layers.bad_pixels.mask, *window)[0] != 0)
-        stamp = slice(margin - self.margin, margin + self.stamp_px + self.margin)
-        if noise is not None and (noise_map := self._layers.noise) is not None:
-            # σ of the sky by the map, without the photons of the star.
-            light: np.ndarray | float = 0.0
-            if noise_map.photons:
-                level, _ = sky_around(raw, masked, self.stamp_px)
-                light = raw - level[:, None, None]
-            sigma = noise_map.sigma(cut_image(noise, *window)[0], light)
-            stamp_sigma = np.ma.array(sigma, mask=masked)[:, stamp, stamp]
-            sky_noise = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
-        else:
-            # In the stamp of a bright star, light that no PSF explains would pass for noise.
-            _, sky_noise = sky_around(data, masked | ~np.isfinite(data), self.stamp_px)
-            sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, self.least_noise), np.nan)
-        return data[:, stamp, stamp], masked[:, stamp, stamp], truncated, sky_noise
+                if self.shape is None:
+                    yield self._stamps(part, *_cut_from_cube(self, part, pixels, mask))
+                else:
+                    yield self._stamps(part, *_cut_from_image(self, part, pixels, noise))
 
     def _stamps(
         self,
@@ -339,14 +296,16 @@ class Observation:
         truncated: np.ndarray,
         noise: np.ndarray,
     ) -> Stamps:
-        """Return stamps with all that is known of their stars."""
+        """Return stamps (n, s, s) of a part of the stars with all that is known of these."""
         # A pixel of +inf is saturated, one of NaN is not.
-        level = np.inf if self.saturate is None else self.saturate
-        saturated = np.zeros(data.shape, bool) if self.saturate is None else data >= level
+        level = self.saturate
+        saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
+        # Pixels without a number are masked, and 0.
         finite = np.isfinite(data)
         if not finite.all():
             data[~finite] = 0.0
             masked |= ~finite
+        # Positions in the image; and in an image, centres from the middle of the central pixel.
         unknown, stars = np.full(len(data), np.nan), self.stars.select(part)
         x, y = (unknown, unknown) if self.positions is None else self.positions[part].T
         listed = np.full((len(data), 2), np.nan)
@@ -374,9 +333,75 @@ class Observation:
         )
 
 
-def _stamps_of_cube(pixels: Pixels, part: slice) -> np.ndarray:
-    """Return stamps of a cube; a 2-d image counts as a cube of one."""
-    return pixels[part] if len(pixels.image.shape) == 3 else pixels[slice(None)][None]
+def _cut_from_cube(
+    observation: Observation, part: slice, pixels: Pixels, mask: Pixels | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cut stamps out of the middle of those of a cube.
+
+    Returns
+    -------
+    data, masked : ndarray, shape (n, s, s)
+        Pixels, and which of them the mask calls bad.
+    truncated : ndarray of bool, shape (n,)
+        Stars of which a part is off the image: none.
+    noise : ndarray, shape (n,)
+        σ of the sky, NaN: it is to be estimated.
+    """
+
+    def stamps_of(pixels: Pixels, rows: slice) -> np.ndarray:
+        # A 2-d image counts as a cube of one stamp.
+        is_cube = len(pixels.image.shape) == 3
+        return cut(pixels[rows] if is_cube else pixels[slice(None)][None], side)
+
+    side, count = observation.stamp_px + 2 * observation.margin, part.stop - part.start
+    data = stamps_of(pixels, part)
+    masked = np.zeros(data.shape, dtype=bool)
+    if mask is not None:
+        # All stamps may share one mask.
+        mask_rows = part if len(mask.image.shape) == 3 else slice(0, 1)
+        masked |= observation._layers.is_bad(stamps_of(mask, mask_rows))
+    return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
+
+
+def _cut_from_image(
+    observation: Observation, part: slice, pixels: Pixels, noise: Pixels | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cut stamps out of an image, and measure the noise of the sky of each.
+
+    Returns
+    -------
+    data, masked, truncated, noise
+        As `_cut_from_cube`; a noise of NaN cannot be measured.
+    """
+    shape, layers, stamp_px = observation.shape, observation._layers, observation.stamp_px
+    assert shape is not None and observation.positions is not None
+    x, y = observation.positions[part].T
+    # The noise of the sky is that of a ring of at least 8 px around the stamp.
+    margin = max(observation.margin, 8)
+    window = (shape, x, y, stamp_px, margin)
+    data, inside, truncated = cut_image(pixels, *window)
+    raw = data
+    if observation.neighbour_light is not None:
+        # Saturated pixels stay, or they would not be seen.
+        full = np.inf if observation.saturate is None else observation.saturate
+        cleaned = data - observation.neighbour_light(part, stamp_px, margin)
+        data = np.where(data >= full, data, cleaned)
+    masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
+    stamp = slice(margin - observation.margin, margin + stamp_px + observation.margin)
+    if noise is not None and layers.noise is not None:
+        # σ of the sky by the map, without the photons of the star.
+        light: np.ndarray | float = 0.0
+        if layers.noise.photons:
+            level, _ = sky_around(raw, masked, stamp_px)
+            light = raw - level[:, None, None]
+        sigma = layers.noise.sigma(cut_image(noise, *window)[0], light)
+        stamp_sigma = np.ma.array(sigma, mask=masked)[:, stamp, stamp]
+        sky_noise = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
+    else:
+        # In the stamp of a bright star, light that no PSF explains would pass for noise.
+        _, sky_noise = sky_around(data, masked | ~np.isfinite(data), stamp_px)
+        sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, layers.least_noise), np.nan)
+    return data[:, stamp, stamp], masked[:, stamp, stamp], truncated, sky_noise
 
 
 def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observation:
@@ -393,30 +418,21 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
     ObservationError
         If the image, its list or a statement cannot be used.
     """
+    # The image, and whether it is a cube of stamps.
     image = find_image(source.image, source.extension)
-    stated_camera, threshold = source.camera(image.unit), source.detection_sigma
+    stated_camera = source.camera(image.unit)
     table = None if source.catalogue is None else as_catalogue(source.catalogue)
-    # A cube with one plane is an image, if it is no stamp of the only star of a list.
-    if len(image.shape) == 3 and image.shape[0] == 1:
-        is_searched = threshold is not None or (table is not None and len(table) != 1)
-        if is_searched or max(image.shape) > LARGEST_STAMP_PX:
-            image = image.one_plane()
-    refuse_colours(image)
-    is_cube = _is_cube(source, image, stamp_px)
-    is_listed = source.catalogue is not None or source.origin is not None
-    if threshold is not None and (is_cube or is_listed):
-        raise ObservationError(
-            source.path, "--detect takes an image, no cube; no list, and no origin of one"
-        )
-    # The header's values are used as far as the pixels of an image do not contradict them.
+    image, is_cube = image_or_cube(source, image, table, stamp_px)
+    # The camera: values of a header are used as far as the pixels do not contradict them.
     camera, remarks = camera_values(image, stated_camera), list[str]()
     if not is_cube:
         camera, remarks = checked_camera(image, camera)
         remarks += sky_coordinate_remarks(image)
+    # Mask and map of noise. The map is scaled to the scatter of the sky, above which stars are
+    # searched.
     layers, layer_remarks = find_layers(source, image, is_cube, camera)
     remarks += layer_remarks
-    # A map of noise is scaled to the scatter of the sky; stars are searched above the sky.
-    detections = None
+    detections, threshold = None, source.detection_sigma
     if threshold is not None or layers.noise is not None:
         sky = layers.sky()
         remarks += [f"{source.path}: {note}" for note in sky.notes]
@@ -425,8 +441,10 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
             layers, camera, photon_remarks = with_photons(layers, camera, sky)
             remarks += photon_remarks
         if threshold is not None:
-            detections = _detect(source.path, sky, threshold)
-    stars, positions, list_remarks = _locate(source, image, detections or table, layers, is_cube)
+            detections = detected_stars(source.path, sky, threshold)
+    stars, positions, list_remarks = locate_stars(
+        source, image, detections or table, layers, is_cube
+    )
     return Observation(
         source.path,
         stamp_px,
@@ -445,33 +463,57 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
     )
 
 
-def _is_cube(source: ImageInput, image: ImageFile, stamp_px: int) -> bool:
-    """Return True for a cube of stamps or one stamp, False for an image with stars to cut out.
+def image_or_cube(
+    source: ImageInput, image: ImageFile, table: Catalogue | None, stamp_px: int
+) -> tuple[ImageFile, bool]:
+    """Tell an image, out of which stars are cut, from a cube of stamps, or one stamp.
+
+    Returns
+    -------
+    image : ImageFile
+        An image is a plane, even if its file has it as a cube with one.
+    is_cube : bool
 
     Raises
     ------
     ObservationError
-        If an image has neither a list nor is to be searched, or stamps are too small.
+        If the image has several colours, an image has neither a list nor is to be searched, a cube
+        is to be searched, or stamps are too small.
     """
-    shape = image.shape
-    has_stars = source.catalogue is not None or source.detection_sigma is not None
-    if len(shape) == 2 and has_stars:
-        return False
+    is_searched = source.detection_sigma is not None
+    # A cube with one plane is an image, if it is no stamp of the only star of a list.
+    if len(image.shape) == 3 and image.shape[0] == 1:
+        has_stars = is_searched or (table is not None and len(table) != 1)
+        if has_stars or max(image.shape) > LARGEST_STAMP_PX:
+            image = image.one_plane()
+    refuse_colours(image)
+    shape, size = image.shape, "×".join(map(str, image.shape[-2:]))
+    is_image = len(shape) == 2 and (table is not None or is_searched)
     is_square = shape[-2] == shape[-1] >= stamp_px
-    if is_square and (len(shape) == 3 or shape[-1] == stamp_px):
-        return True
-    size = f"{shape[-2]}×{shape[-1]}"
-    if len(shape) == 2:
+    if not is_image and not (is_square and (len(shape) == 3 or shape[-1] == stamp_px)):
+        if len(shape) == 2:
+            raise ObservationError(
+                image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
+            )
         raise ObservationError(
-            image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
+            image.path,
+            f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger",
         )
-    raise ObservationError(
-        image.path, f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger"
-    )
+    if is_searched and (not is_image or table is not None or source.origin is not None):
+        raise ObservationError(
+            source.path, "--detect takes an image, no cube; no list, and no origin of one"
+        )
+    return image, not is_image
 
 
-def _detect(path: Path, sky: Sky, threshold: float) -> Catalogue:
-    """Return the stars of an image that are `threshold` σ above its sky."""
+def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
+    """Return the stars of an image that are `threshold` σ above its sky.
+
+    Raises
+    ------
+    ObservationError
+        If there is none.
+    """
     from astropy.table import Table
 
     with silent():
@@ -481,7 +523,7 @@ def _detect(path: Path, sky: Sky, threshold: float) -> Catalogue:
     return Catalogue(path, table)
 
 
-def _locate(
+def locate_stars(
     source: ImageInput, image: ImageFile, table: Catalogue | None, layers: Layers, is_cube: bool
 ) -> tuple[ListedStars, np.ndarray | None, list[str]]:
     """Return the stars of a list, or of a cube without one, with their positions.
@@ -490,6 +532,7 @@ def _locate(
     -------
     stars : ListedStars
     positions : ndarray or None, shape (n, 2)
+        None for a cube whose list has no pixels.
     remarks : list of str
         Sentences on the list's origin, and on rows of the same star.
     """
@@ -507,6 +550,7 @@ def _locate(
             columns, remarks = with_origin(table, columns, layers)
         positions = positions_in_image(image, table, columns, is_cube)
         identifiers, flags = table.identifiers(), table.flags(columns)
+        # Rows of a star that is listed already have no light of their own.
         if positions is not None and not is_cube and source.detection_sigma is None:
             is_repeated = repeated_rows(positions)
             raise_flag(flags, StarFlag.BLENDED, is_repeated)
@@ -524,6 +568,7 @@ def _locate(
         if name is not None and table is not None:
             numbers[k] = table.numbers(name)
     stars = ListedStars(identifiers, np.arange(count), numbers[0], numbers[1], numbers[2], flags)
+    # A list may cover a larger part of the sky than the image.
     if source.on_image and positions is not None and not is_cube:
         selected = on_image(positions, image.shape)
         stars, positions = stars.select(selected), positions[selected]

@@ -92,7 +92,7 @@ def positions_in_image(
     # What is beyond any image is no position: its squares would not even be numbers.
     positions = np.where(np.abs(positions) < LARGEST_POSITION_PX, positions, np.nan)
     if not is_cube:
-        _check_overlap(image, table, columns, positions)
+        check_overlap(image, table, columns, positions)
     return positions
 
 
@@ -130,7 +130,7 @@ def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(((pixel >= 0) & (pixel < shape)).all(axis=1))
 
 
-def _check_overlap(
+def check_overlap(
     image: ImageFile, table: Catalogue, columns: Positions, positions: np.ndarray
 ) -> None:
     """Refuse a list without a star on the image, or with more there than the image has pixels."""
