@@ -161,6 +161,7 @@ def sky_sample(image: ImageFile) -> SkySample | None:
     Squares of one value, such as an area without data, do not count.
     """
     rows, columns = image.shape
+    # Bands of 32 rows, evenly spread over the image.
     last_row = max(rows - BLOCK_PX, 0)
     starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // BLOCK_PX))).astype(int))
     levels, noises, highest = [], [], -np.inf
@@ -177,6 +178,7 @@ def sky_sample(image: ImageFile) -> SkySample | None:
                 values = square[np.isfinite(square)]
                 if values.size < BLOCK_PX:
                     continue
+                # Stars in a square hardly change its median.
                 highest = max(highest, float(values.max()))
                 level = float(np.median(values))
                 # σ of a normal distribution is 1.4826 times its median deviation.
@@ -187,6 +189,7 @@ def sky_sample(image: ImageFile) -> SkySample | None:
                     noises.append(noise)
     if not levels:
         return None
+    # Resampled pixels share noise: sums of them scatter by more than independent ones.
     correlation = noise_correlation(np.concatenate(deviations))
     return SkySample(float(np.median(levels)), correlation * float(np.median(noises)), highest)
 
@@ -210,6 +213,7 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
             count += int(np.count_nonzero(full))
             pairs += int(np.count_nonzero(full[:, 1:] & full[:, :-1]))
             pairs += int(np.count_nonzero(full[1:] & full[:-1]))
+    # Few pixels, most of them in pairs, far above the sky.
     suits_stars = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
     clipped = suits_stars and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
     return (largest, count) if clipped else None
@@ -234,6 +238,7 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     if sky is None:
         return CheckedCamera(values, [])
     values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
+    # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
         return CheckedCamera(values, remarks)
@@ -268,6 +273,7 @@ def checked_saturation(
             raise ObservationError(image.path, f"{problem}; --saturate takes that of a pixel")
         saturation = CameraValue(None, f"not known, {origin} is below the sky")
         remarks.append(f"{image.path}: {problem}: not used, --saturate states another one")
+    # A pile-up of the largest value below the level of the header shows a lower saturation.
     clipped = None if origin == "given" else clipped_level(image, sky)
     if clipped is not None and (saturation.value is None or clipped[0] < saturation.value):
         saturation = CameraValue(clipped[0], "the largest value")
@@ -299,6 +305,7 @@ def gain_contradiction(
             f"{cause} mean a noise of the sky of at least {least_sigma:.3g} "
             f"{image.unit or 'counts'}, but the pixels scatter by {sky.noise:.3g}"
         )
+    # A gain of counts on pixels of another unit, such as an image scaled to 0 … 1.
     if sky.highest <= 1.0 and gain.origin not in ("given", "BUNIT"):
         return f"{cause} is of counts, but no pixel is above 1"
     return None
@@ -344,6 +351,7 @@ def refuse_colours(image: ImageFile) -> None:
                 f"such as astropy.io.fits.getdata(…){plane}, or their sum",
             )
         return
+    # The pattern of a colour filter array, four letters.
     for header in image.headers:
         for key in ("BAYERPAT", "COLORTYP", "CFAPAT"):
             pattern = str(card_value(header, key) or "").strip().upper()

@@ -125,6 +125,7 @@ def plain_file(path: Path) -> PlainFile:
 
 def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
     """Return a FITS file of this content, which exists as long as the object that is returned."""
+    # The file goes with the object that holds it.
     copy = tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits")  # noqa: SIM115
     shutil.copyfileobj(content, copy)
     copy.flush()
@@ -211,6 +212,7 @@ class ImageFile:
 
         They are of double precision where all are below 1e-15.
         """
+        # value = bscale · stored + bzero
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
         else:
@@ -229,6 +231,7 @@ class ImageFile:
 
     def provenance(self) -> list[Card]:
         """Return the cards that say where the stars come from, those that can be parsed."""
+        # Of a key that stands in both headers, the value of the image's own.
         cards: list[Card] = []
         for key in (
             *("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER"),
@@ -288,6 +291,7 @@ def find_image(
     path = file.name
     with reading(path), open_hdus(file, as_stored=True) as hdus:
         hdu = choose_extension(path, hdus, extension)
+        # Its own header, then that of the file.
         index, header = hdus.index(hdu), hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
         shape = tuple(int(n) for n in hdu.shape)
@@ -322,6 +326,7 @@ def science_images(path: Path) -> dict[str, int]:
     images = {k: name for k, name in images.items() if is_science(name)}
     if not images:
         raise ObservationError(path, "no image")
+    # Names of letters and digits, but no number, that no other image has.
     names = list(images.values())
     suits_files = re.compile("(?![0-9]+$)[A-Za-z0-9_+-]+")
     return {
@@ -343,6 +348,7 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
         size = "×".join(map(str, hdu.shape)) if has_pixels(hdu) else "no image"
         labels.append(f"{k} {hdu.name or '(no name)'} ({size})")
     listed = shorten(labels)
+    # The extension that is stated.
     if extension is not None:
         hdu = _named(hdus, str(extension).strip())
         if hdu is None:
@@ -352,6 +358,7 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
                 path, f"extension {extension!r} holds no image; the file has {listed}"
             )
         return hdu
+    # Else the only image that is no mask, error or the like.
     images = [hdu for hdu in hdus if has_pixels(hdu)]
     science = [hdu for hdu in images if is_science(hdu.name)] or images
     if not science:
@@ -391,6 +398,7 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     """Return the celestial WCS of an image; None without a stated scale, or if it is damaged."""
     from astropy.wcs import WCS
 
+    # Without a scale, the pixels would be degrees.
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
         return None
     try:
@@ -443,6 +451,7 @@ def open_pixels(
         return
     with ExitStack() as files:
         with reading(image.path):
+            # Sections of the file, or all of its pixels.
             hdus = files.enter_context(open_hdus(image.file, as_stored=True, memmap=not in_pieces))
             hdu = hdus[image.index]
             if tuple(hdu.shape)[image.leading :] != image.shape:

@@ -67,6 +67,7 @@ class NoiseMap:
 
         The photons of stars, `light` above the sky, are taken out of a map that has them.
         """
+        # σ² of the sky and of the light of stars.
         with np.errstate(all="ignore"):
             if self.kind == "weight":
                 variance = 1.0 / values
@@ -149,6 +150,7 @@ class Layers:
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Return the image (h, w), its masked pixels, and σ of all pixels if there is a map."""
         sigma = None
+        # Pixels without a number, of the mask, or without noise in its map are masked.
         with self.open(in_pieces=False) as (pixels, mask, noise):
             image = pixels[:]
             masked = ~np.isfinite(image)
@@ -174,6 +176,7 @@ class Layers:
 @lru_cache(maxsize=1)
 def _sky(layers: Layers) -> Sky:
     """Return the image of layers with its sky; that of the last ones is kept for more calls."""
+    # The sky is measured without bad pixels, in units of the map of σ if there is one.
     image, masked, sigma = layers.read()
     bad = layers.find_bad(image, masked).mask
     with silent():
@@ -219,6 +222,7 @@ def find_layers(
         If a layer cannot be found, or is not as large as the image; or if statements exclude each
         other.
     """
+    # The mask, and the noise of the electronics in counts: read noise / gain.
     layers_of_file = {} if is_cube else layers_beside(image)
     mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
     gain, read_noise = camera["gain"].value, camera["read noise"].value
@@ -243,6 +247,7 @@ def find_layers(
         if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
         layers = replace(layers, noise=NoiseMap(noise, kind))
+    # Without a statement, the map of the image's own file.
     if all(place is None for place in maps.values()):
         for kind in layers_of_file.keys() & NOISE_MAPS.keys():
             noise = layers_of_file[kind]
@@ -301,6 +306,7 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
     role : str
         Words for the layer, for messages.
     """
+    # An array, the path of a file, or else an extension; a text may be either of these two.
     is_array = isinstance(place, np.ndarray)
     is_file = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
     if image.values is not None and not (is_array or is_file):
@@ -309,6 +315,7 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
         layer = array_image(np.asarray(place, dtype=np.float64), role)
     else:
         layer = find_image(Path(place)) if is_file else find_image(image.file, place)
+    # It has the shape of the image.
     shape = image.shape
     if len(layer.shape) == 3 and layer.shape[0] == 1 and len(shape) == 2:
         layer = layer.one_plane()
@@ -336,6 +343,7 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
         )
     with open_pixels(noise, in_pieces=False) as pixels:
         values = pixels[:]
+    # Values that no σ², 1/σ² or σ has.
     negative, zeros = int(np.count_nonzero(values < 0)), int(np.count_nonzero(values == 0))
     # SWarp and SExtractor write the weight or σ 0 where there are no data.
     may_be_0 = kind != "variance"
@@ -416,12 +424,14 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
     if image.values is not None:
         return {}
     with reading(image.path), open_hdus(image.file) as hdus:
+        # Layers belong to a science image if it is the only one, or that of a pipeline.
         images = [(k, hdu) for k, hdu in enumerate(hdus) if has_pixels(hdu)]
         science_hdu = hdus[image.index]
         science_count = sum(is_science(hdu.name) for _, hdu in images)
         of_pipeline = science_hdu.name.upper() in SCIENCE
         if not is_science(science_hdu.name) or (science_count > 1 and not of_pipeline):
             return {}
+        # Layers of its size and version, whose name is no part of another, such as VAR_POISSON.
         places = [
             k
             for k, hdu in images
@@ -430,6 +440,7 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
             and tuple(hdu.shape)[-2:] == image.shape[-2:]
             and hdu.ver == science_hdu.ver
         ]
+    # The first layer of each kind.
     layers: dict[str, ImageFile] = {}
     for place in places:
         layer = find_image(image.file, place)

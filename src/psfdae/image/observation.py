@@ -197,18 +197,21 @@ class Observation:
 
         if self.shape is None or (wcs := self._layers.image.wcs) is None:
             return None
+        # A WCS may have any frame of the sky, such as galactic coordinates.
         with reading(self.path):
             coordinates = pixel_to_skycoord(x, y, wcs).icrs
         return coordinates.ra.deg, coordinates.dec.deg
 
     def summary(self) -> str:
         """Return lines: camera values with their origins, remarks, pixels and rows left out."""
+        # The camera: number and unit with their origin, or why the number is not known.
         units = ("arcsec", "electrons per count", "electrons", "counts")
         words = [
             f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}"
             for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True)
         ]
         lines = [f"{self.path}: {', '.join(words)}", *self.remarks]
+        # Pixels of the image that are bad, and rows of the list without a position.
         if self.shape is not None and (notes := self._layers.bad_pixels.notes):
             lines.append(f"{self.path}: left out: {', '.join(notes)}")
         if (no_position := self.without_position()).any():
@@ -243,10 +246,14 @@ class Observation:
     def check_list(self) -> None:
         """Refuse a star list of another image.
 
-        At least half of its positions must be on a source.
+        Raises
+        ------
+        ObservationError
+            If fewer than half of its positions are on a source.
         """
         if self.shape is None or self.catalogue is None or self.positions is None:
             return
+        # Positions on pixels of a source, of those that are known.
         located = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
         sky = self._layers.sky()
         with silent():
@@ -262,6 +269,7 @@ class Observation:
 
     def sha256(self) -> str:
         """Return SHA-256 of all pixels of the image or cube, as float32."""
+        # 256 rows of an image, or stamps of a cube, are in memory at a time.
         digest, rows = hashlib.sha256(), 256
         with open_pixels(self._layers.image, in_pieces=True) as pixels:
             for start in range(0, pixels.image.shape[0], rows):
@@ -280,6 +288,7 @@ class Observation:
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}, expected at least 1")
+        # A cube is read piece by piece; positions in an image are anywhere.
         with self._layers.open(in_pieces=self.shape is None) as (pixels, mask, noise):
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
@@ -353,6 +362,7 @@ def _cut_from_cube(
         is_cube = len(pixels.image.shape) == 3
         return cut(pixels[rows] if is_cube else pixels[slice(None)][None], side)
 
+    # The star of a larger stamp stands in its middle, too.
     side, count = observation.stamp_px + 2 * observation.margin, part.stop - part.start
     data = stamps_of(pixels, part)
     masked = np.zeros(data.shape, dtype=bool)
@@ -380,12 +390,14 @@ def _cut_from_image(
     margin = max(observation.margin, 8)
     window = (shape, x, y, stamp_px, margin)
     data, inside, truncated = cut_image(pixels, *window)
+    # Other stars of a crowded image are subtracted.
     raw = data
     if observation.neighbour_light is not None:
         # Saturated pixels stay, or they would not be seen.
         full = np.inf if observation.saturate is None else observation.saturate
         cleaned = data - observation.neighbour_light(part, stamp_px, margin)
         data = np.where(data >= full, data, cleaned)
+    # Pixels off the image, of the mask, and those that show no sky.
     masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
     stamp = slice(margin - observation.margin, margin + stamp_px + observation.margin)
     if noise is not None and layers.noise is not None:
@@ -488,6 +500,7 @@ def image_or_cube(
             image = image.one_plane()
     refuse_colours(image)
     shape, size = image.shape, "×".join(map(str, image.shape[-2:]))
+    # A plane is an image if it has stars, and else one stamp; stamps are squares of the right size.
     is_image = len(shape) == 2 and (table is not None or is_searched)
     is_square = shape[-2] == shape[-1] >= stamp_px
     if not is_image and not (is_square and (len(shape) == 3 or shape[-1] == stamp_px)):
@@ -536,12 +549,14 @@ def locate_stars(
     remarks : list of str
         Sentences on the list's origin, and on rows of the same star.
     """
+    # Without a list, stars are numbered and have no place.
     remarks: list[str] = []
     positions = None
     count = len(table) if table is not None else image.shape[0] if len(image.shape) == 3 else 1
     identifiers = np.arange(count, dtype=np.int64)
     flags = np.zeros(count, dtype=np.uint16)
     if table is not None:
+        # Position columns of the list, with the origin of pixels that is stated, or by custom.
         columns = table.positions()
         if source.origin is not None:
             columns = replace(columns, origin=source.origin)

@@ -69,6 +69,7 @@ def positions_in_image(
             table.path, f"{len(table)} stars for the {image.shape[0]} stamps of {image.path}"
         )
     names = f"{columns.first},{columns.second}"
+    # From the sky by the WCS, or from pixels by their origin.
     if columns.sky:
         if is_cube:
             return None
@@ -108,6 +109,7 @@ def with_origin(
     remarks : list of str
         A sentence on the origin.
     """
+    # Centroids of the stars differ from the listed pixels by the origin.
     listed = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
     try:
         data_origin = origin_of(layers.sky(), listed)
@@ -143,6 +145,7 @@ def check_overlap(
         )
     if count:
         return
+    # The range of the positions shows a wrong unit, or another image.
     ranges = "nowhere in its projection"
     located = positions[np.isfinite(positions).all(axis=1)]
     if len(located):
@@ -161,6 +164,7 @@ def repeated_rows(positions: np.ndarray) -> np.ndarray:
 
     located = np.flatnonzero(np.isfinite(positions).all(axis=1))
     is_repeated = np.zeros(len(positions), dtype=bool)
+    # Of each pair of rows at one place, the later one is a repetition.
     pairs = cKDTree(positions[located]).query_pairs(SAME_STAR_PX, output_type="ndarray")
     is_repeated[located[pairs.max(axis=1)]] = True
     return is_repeated
@@ -191,6 +195,7 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
     offsets = off[~np.isnan(off).any(axis=1)]
     if path is None or len(offsets) < 5:
         return None
+    # Medians: neighbours and defects move some stars.
     x, y = np.median(offsets, axis=0)
     distance = np.median(np.abs(offsets), axis=0)
     sentence = (
@@ -208,6 +213,7 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
             f"{sentence}: its positions count from {origin}? --origin {origin} says so "
             "(--accept-offset takes it as it is)",
         )
+    # Half of the stars more than 1 px off: the list belongs to something else.
     if (distance > 1.0).any():
         raise ObservationError(
             path,
@@ -243,6 +249,7 @@ def sky_to_pixel(
     from astropy.wcs import NoConvergence
     from astropy.wcs.utils import skycoord_to_pixel
 
+    # First by the projection without its distortions.
     stars = SkyCoord(ra, dec, unit="deg")
     x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
     # Stars at most one size of the image off its edge.
@@ -251,6 +258,7 @@ def sky_to_pixel(
     if wcs.has_distortion and is_near.any():
         try:
             x[is_near], y[is_near] = skycoord_to_pixel(stars[is_near], wcs, mode="all")
+        # Where the iteration does not end, its last step counts, unless it runs away.
         except NoConvergence as error:
             solution = np.array(error.best_solution, dtype=np.float64)
             if error.divergent is not None:
