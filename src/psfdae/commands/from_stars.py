@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -111,7 +110,7 @@ class ModelFiles:
 
 @command("from-stars", SettingsReader())
 def from_stars(
-    config: Settings,
+    config: Settings | Mapping[str, Any],
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
     options: ImageStatements,
     all_extensions: Annotated[
@@ -138,7 +137,7 @@ def from_stars(
     stamp_px: Annotated[
         int | None, "Side of the stamps, even.  [default: 16, more if stars are larger]"
     ] = None,
-) -> None:
+) -> str:
     """Train a model on the bright stars of IMAGE.
 
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
@@ -146,32 +145,43 @@ def from_stars(
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
     # The three options of the selection are settings of the configuration by shorter names.
+    job = dict(locals())
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
-    config = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
-    job = {key: value for key, value in locals().items() if key in signature(train).parameters}
-    stem = _model_name(image, name)
-    if not all_extensions:
-        print(train(**job))
-    elif len(image) > 1:
+    settings = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
+    stem, sentence = _model_name(image, name), ""
+    if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
-    else:
-        # Each image of the file gets a model in a folder of its own, by a process of its own.
+    if all_extensions:
+        # Each image of the file gets a model in a folder of its own, by a process of its own, which
+        # receives the settings as a tree.
         jobs = {
             extension: {
                 **job,
-                "config": config.model_dump(),
+                "config": settings.model_dump(),
                 "options": image_options,
+                "all_extensions": False,
                 "name": f"{stem}_{extension}",
                 "out": out / extension,
                 "page": path_of_image(page, extension),
             }
             for extension, image_options in options_by_image(image[0], options).items()
         }
-        run_for_images(train, jobs, image[0])
+        run_for_images(from_stars, jobs, image[0])
+    else:
+        sources = ImageInput(image[0], **vars(options)).of_each(image)
+        exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
+        if exposures and method_name is None and "field" in settings.methods:
+            # Validation stars would judge the field of all exposures, but each gets its own.
+            method_name = "field"
+        settings, methods, candidates = _methods(settings, method_name)
+        files = ModelFiles(out, stem, methods, exposures)
+        with _folder(files, sources, page, overwrite):
+            sentence = _write_model(settings, sources, files, licence, candidates, page)
+        print(sentence)
     # The command that applies the model to all stars of the image, or of the first exposure. A
     # list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
@@ -183,56 +193,7 @@ def from_stars(
     words += ["--all-extensions"] * all_extensions
     words += ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
     print(f"next: {shlex.join(words)}")
-
-
-def train(
-    config: Settings | Mapping[str, Any],
-    image: tuple[Path, ...],
-    options: ImageStatements,
-    name: str | None,
-    licence: str,
-    method_name: str | None,
-    out: Path,
-    page: Path | None,
-    overwrite: bool,
-) -> str:
-    """Train a model on the stars of one image, or of exposures; return how good it is.
-
-    Parameters are those of `from_stars`; `config` may also be its tree, which another process
-    receives.
-
-    Returns
-    -------
-    str
-        A sentence on the error of the model.
-
-    Raises
-    ------
-    FolderError
-        If the folder holds a model, or another process works there.
-    ConfigError
-        If no method of the list makes models.
-    """
-    sources, settings = ImageInput(image[0], **vars(options)).of_each(image), of_config(config)
-    exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
-    if exposures and method_name is None and "field" in settings.methods:
-        # Validation stars would judge the field that all exposures share, but each gets its own.
-        method_name = "field"
-    settings, methods, candidates = _methods(settings, method_name)
-    files = ModelFiles(out, _model_name(image, name), methods, exposures)
-    # Refuse outputs that are inputs or exist, before anything is computed.
-    if files.name in exposures:
-        raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
-    lists = [files.star_list(source.name) for source in sources] if options.detect else []
-    inputs = [path for source in sources for path in source.files()]
-    check_outputs([*files.paths(), *lists, page], inputs)
-    if page is not None and page.exists() and not overwrite:
-        raise FolderError(f"{page}: exists already; --overwrite replaces it")
-    with _locked(out):
-        bundles = sorted(out.glob(f"*{SUFFIX}"))
-        if bundles and not overwrite:
-            raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
-        return _write_model(settings, sources, files, licence, candidates, page)
+    return sentence
 
 
 def _methods(
@@ -287,6 +248,31 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
             "folder"
         )
     return name
+
+
+@contextmanager
+def _folder(
+    files: ModelFiles, sources: Sequence[ImageInput], page: Path | None, overwrite: bool
+) -> Iterator[None]:
+    """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
+
+    Raises
+    ------
+    OutputError, FolderError
+        If a path is an input, the folder holds a model, or another process works there.
+    """
+    if files.name in files.exposures:
+        raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
+    lists = [files.star_list(source.name) for source in sources if source.detect]
+    inputs = [path for source in sources for path in source.files()]
+    check_outputs([*files.paths(), *lists, page], inputs)
+    if page is not None and page.exists() and not overwrite:
+        raise FolderError(f"{page}: exists already; --overwrite replaces it")
+    with _locked(files.path):
+        bundles = sorted(files.path.glob(f"*{SUFFIX}"))
+        if bundles and not overwrite:
+            raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
+        yield
 
 
 @contextmanager

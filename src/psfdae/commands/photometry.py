@@ -139,6 +139,7 @@ def _measure(
 
 def _summary(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str]:
     """Return lines on the number of stars, the light that fluxes contain, and their bias."""
+    # Stars with a flux, and how much of it the model of the PSF does not have.
     measured_count = int(np.isfinite(measured.stars["flux"]).sum())
     lines = [f"{out}: {len(measured.stars)} stars, {measured_count} measured"]
     if measured.wings is None:
@@ -173,6 +174,7 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
     from astropy.table import Table
 
     assert observation.positions is not None
+    # Each column with 0 or NaN in the rows that were not measured.
     rows = Table()
     for name in stars.colnames:
         measured = np.array(stars[name])
@@ -181,6 +183,7 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
             column[:] = np.nan
         column[~unusable] = measured
         rows[name] = column
+    # What the list says of these stars.
     rows["id"] = observation.stars.id
     rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
     rows["flags"] |= observation.stars.flags
@@ -252,6 +255,7 @@ def photometry_table(
     zero_point : float, optional
         Magnitude of a flux of 1; without it there are no magnitudes.
     """
+    # Columns of the fit; magnitudes if the zero point is known, and places on the sky.
     columns = {name: np.array(measured.stars[name]) for name in measured.stars.colnames}
     columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
     with np.errstate(all="ignore"):

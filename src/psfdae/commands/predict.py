@@ -67,96 +67,40 @@ def predict(
     quiet: Annotated[bool, "Neither progress nor summary."] = False,
     *,
     out: Annotated[File, "FITS file for PSFs, residuals, uncertainties and a table of stars."],
-) -> None:
+) -> str:
     """Predict the PSFs of the stars in INPUT.
 
     INPUT is a FITS cube of stamps, or a FITS image with --catalogue or --detect.
     Stars are flagged, never dropped. Files that cannot be used end with one line
     and exit code 2.
     """
-    job = {name: value for name, value in locals().items() if name != "all_extensions"}
-    if not all_extensions:
-        summary = predict_image(**job)
-        if not quiet:
-            print(summary)
-        return
-    # Images are worked on side by side, each by one thread.
-    jobs = {
-        name: {
-            **job,
-            "options": image_options,
-            "model": _bundle_of_image(model, name),
-            "plot": path_of_image(plot, name),
-            "threads": 1,
-            "quiet": True,
-            "out": path_of_image(out, name),
+    if all_extensions:
+        # Images are worked on side by side, each by one thread, with its own model and outputs.
+        job = dict(locals())
+        jobs = {
+            name: {
+                **job,
+                "options": image_options,
+                "all_extensions": False,
+                "model": _bundle_of_image(model, name),
+                "plot": path_of_image(plot, name),
+                "threads": 1,
+                "quiet": True,
+                "out": path_of_image(out, name),
+            }
+            for name, image_options in options_by_image(stars, options).items()
         }
-        for name, image_options in options_by_image(stars, options).items()
-    }
-    run_for_images(predict_image, jobs, stars)
-
-
-def _bundle_of_image(model: Path | None, name: str) -> Path | None:
-    """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
-
-    `from-stars` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
-    one bundle in the subfolder NAME.
-
-    Raises
-    ------
-    PredictionError
-        If the folder has no bundle of this image, or several.
-    """
-    if model is None or not model.is_dir():
-        return model
-    bundle = model / f"{name}{SUFFIX}"
-    bundles = [bundle] if bundle.is_file() else sorted((model / name).glob(f"*{SUFFIX}"))
-    if len(bundles) != 1:
-        raise PredictionError(f"{model / name}: {len(bundles)} models, expected one")
-    return bundles[0]
-
-
-def predict_image(
-    stars: Path,
-    options: ImageStatements,
-    flux_column: str | None,
-    background_column: str | None,
-    fixed_positions: bool,
-    model: Path | None,
-    plot: Path | None,
-    overwrite: bool,
-    threads: int | None,
-    quiet: bool,
-    out: Path,
-) -> str:
-    """Predict the stars of one image, and write the FITS file, the star list and the map.
-
-    Parameters are those of `predict`.
-
-    Returns
-    -------
-    str
-        Lines about the image, its star list, the model, and the number of stars with each flag.
-
-    Raises
-    ------
-    PredictionError
-        If the options do not fit the image or the model, or a file cannot be written.
-    """
+        run_for_images(predict, jobs, stars)
+        return ""
     # Check all that can be checked without reading pixels.
     source = ImageInput(
         stars, **vars(options), flux_column=flux_column, background_column=background_column
     )
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
-    model = _bundle_of_image(model, source.name)
-    check_targets((*source.files(), model), out, plot, list_path, overwrite=overwrite)
-    loaded = load_model(model)
-    observation = source.open(loaded.info.stamp_px, loaded.margin_px)
-    if loaded.info.source == "stars":
-        # A model of an image may have been trained without a known pixel scale, too.
-        observation = observation.assuming()
-    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
-    loaded.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    bundle = _bundle_of_image(model, source.name)
+    check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
+    loaded = load_model(bundle)
+    observation = _open_for(loaded, source)
     measures_centres = isinstance(loaded.method, MeasuresStars)
     if fixed_positions and not (measures_centres and observation.shape):
         raise PredictionError(
@@ -180,10 +124,12 @@ def predict_image(
     except OSError as error:
         raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
-    lines = [observation.summary(), list_note]
     instrument_note = loaded.other_instrument(observation.instrument, observation.colour_column)
-    if instrument_note:
-        lines.append(f"{source.path}: {instrument_note}")
+    lines = [
+        observation.summary(),
+        list_note,
+        instrument_note and f"{source.path}: {instrument_note}",
+    ]
     if observation.shape and isinstance(loaded.method, KnowsField) and not loaded.wings:
         lines.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
@@ -192,7 +138,48 @@ def predict_image(
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
-    return "\n".join(line for line in lines if line)
+    summary = "\n".join(line for line in lines if line)
+    if not quiet:
+        print(summary)
+    return summary
+
+
+def _bundle_of_image(model: Path | None, name: str) -> Path | None:
+    """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
+
+    `from-stars` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
+    one bundle in the subfolder NAME.
+
+    Raises
+    ------
+    PredictionError
+        If the folder has no bundle of this image, or several.
+    """
+    if model is None or not model.is_dir():
+        return model
+    # A model of this name; or the only one in the folder of this name.
+    bundle = model / f"{name}{SUFFIX}"
+    bundles = [bundle] if bundle.is_file() else sorted((model / name).glob(f"*{SUFFIX}"))
+    if len(bundles) != 1:
+        raise PredictionError(f"{model / name}: {len(bundles)} models, expected one")
+    return bundles[0]
+
+
+def _open_for(model: PsfModel, source: ImageInput) -> Observation:
+    """Open an image whose pixels must be those of a model.
+
+    Raises
+    ------
+    PredictionError
+        If its pixel scale is another one, or not known.
+    """
+    observation = source.open(model.info.stamp_px, model.margin_px)
+    if model.info.source == "stars":
+        # A model of an image may have been trained without a known pixel scale, too.
+        observation = observation.assuming()
+    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
+    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    return observation
 
 
 def check_targets(
@@ -213,6 +200,7 @@ def check_targets(
     OutputError, PredictionError
         If a path is an input, a folder or an existing file, or two outputs have the same name.
     """
+    # An output is neither an input nor another output, and replaces nothing without a word.
     targets = [out, *filter(None, other_outputs)]
     check_outputs(targets, inputs)
     for target in targets:
@@ -249,6 +237,7 @@ def _write_prediction(
     ObservationError
         If the positions of the list are far off (`list_offset`); nothing is left of the file.
     """
+    # The first stars tell the types of the columns.
     pieces = model.stream(observation, threads, fixed_positions)
     first_piece = next(pieces)
     flag_counts = np.zeros(len(StarFlag), dtype=int)
@@ -270,6 +259,7 @@ def _write_prediction(
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
     header = (first_piece[1], observation.count, cards, history)
     with prediction_file(out, model.bundle, *header) as file:
+        # Rows of the file, the number of stars with each flag, and distances to the list.
         for stamps, prediction in itertools.chain([first_piece], pieces):
             file.write(star_index, prediction)
             flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
@@ -295,6 +285,7 @@ def _list_offsets(stamps: Stamps, prediction: Prediction) -> np.ndarray:
     off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
     shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
     shift = np.where(off_centre[:, None], PsfModel.margin_px + 1.0, shift)
+    # Noise moves the brightest pixel of a faint star.
     unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
     unclear |= ~np.isfinite(stamps.listed).all(axis=1)
     offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
