@@ -25,6 +25,17 @@ def ascii_line(text: object) -> str:
     return one_line(text).encode("ascii", "replace").decode()
 
 
+def no_formula(text: str) -> str:
+    """Return the text, with an apostrophe before it if a spreadsheet would execute it."""
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return text
+    try:
+        float(text)  # numbers stay
+    except ValueError:
+        return "'" + text
+    return text
+
+
 def shorten(names: list[str], length_max: int = 20) -> str:
     """Return a list of names for a message, cut after `length_max` of them."""
     ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""

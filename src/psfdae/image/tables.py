@@ -15,7 +15,7 @@ import numpy as np
 
 from psfdae.files import atomic_path
 from psfdae.image.containers import fits_unit
-from psfdae.image.errors import ascii_line, silent
+from psfdae.image.errors import ascii_line, no_formula, silent
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU
@@ -192,8 +192,9 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
 def write_table(path: Path, table: QTable) -> None:
     """Write a table of stars to a file, in the format that the end of its name says.
 
-    FITS and ECSV have all digits, CSV those that are shown. A real number that is missing is `nan`
-    there, so that readers need no mask, and any other value that is missing an empty cell.
+    FITS and ECSV have all digits, CSV those that are shown. In CSV, no text is a formula to a
+    spreadsheet. A real number that is missing is `nan` there, so that readers need no mask, and any
+    other value that is missing an empty cell.
 
     Parameters
     ----------
@@ -213,6 +214,8 @@ def write_table(path: Path, table: QTable) -> None:
         elif path.suffix.lower() == ".ecsv":
             plain.write(temporary, format="ascii.ecsv", overwrite=True)
         else:
+            for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
+                plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
             # Formats are those of the columns; numbers that are missing are written as such.
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
