@@ -178,10 +178,11 @@ def _sky(layers: Layers) -> Sky:
     """Return the image of layers with its sky; that of the last ones is kept for more calls."""
     # The sky is measured without bad pixels, in units of the map of σ if there is one.
     image, masked, sigma = layers.read()
-    bad = layers.find_bad(image, masked).mask
+    bad_pixels = layers.find_bad(image, masked)
     with silent():
         try:
-            sky = sky_of(image, bad, sigma, layers.least_noise)
+            measured = bad_pixels.sky
+            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:

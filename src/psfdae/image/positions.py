@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
+from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
+from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import ASSUMED_SCALE_ARCSEC, Observation
 from psfdae.image.positions import list_offset
-from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.selection import Candidates, Verdict, collect
+from psfdae.image.selection_advice import advice
 from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
