@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import json
 import os
 import platform
@@ -11,8 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterable, Mapping
+import timeit
+from collections.abc import Iterable
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +21,7 @@ import numpy as np
 
 from psfdae.files import ProductError, write_csv, write_text
 from psfdae.options import File, Folder
+from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 
@@ -61,13 +60,16 @@ def runtime(
     """Collect wall time, CPU time and memory of a run's jobs.
 
     Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
-    line of its log (`workflow/rules/cpu_time.smk`), which has the name of its benchmark.
+    line of its log, which has the name of its benchmark.
     """
-    write_csv(out, _costs(results), 6)
+    write_csv(out, job_costs(results), 6)
 
 
-def _costs(results: Path) -> pd.DataFrame:
-    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job."""
+def job_costs(results: Path) -> pd.DataFrame:
+    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job.
+
+    NaN stands where Snakemake has no number, or the log of a job no CPU time.
+    """
     import pandas as pd
 
     folder = results / "benchmarks"
@@ -75,40 +77,24 @@ def _costs(results: Path) -> pd.DataFrame:
     for path in sorted(folder.rglob("*.tsv")):
         job = path.relative_to(folder).with_suffix("")
         rule, *wildcards = job.parts
-        wall_s, peak_mb = _cost(path, "s", "max_rss")
-        cpu_s = _cpu_seconds(results / "logs" / job.with_name(f"{job.name}.log"))
-        rows.append((rule, "/".join(wildcards), wall_s, cpu_s, peak_mb))
+        # The last line of a log is that of bash's `times`, 1m2.003s for user and system each
+        # (workflow/rules/cpu_time.smk).
+        log = results / "logs" / job.with_name(f"{job.name}.log")
+        last_line = log.read_text(encoding="utf-8").splitlines()[-1:] if log.is_file() else []
+        times = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", " ".join(last_line))
+        seconds = [60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in times]
+        cpu_s = sum(seconds) if len(seconds) == 2 else float("nan")
+        last_run = _last_run(path)
+        rows.append((rule, "/".join(wildcards), last_run["s"], cpu_s, last_run["max_rss"]))
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
 
 
-def _cost(path: Path, *names: str) -> list[float]:
-    """Return columns of a job's last run, NaN where Snakemake has no number.
-
-    For a damaged benchmark file these are NaN, too, with a message: its job need not be repeated.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        columns, *_, last_run = (line.split("\t") for line in lines)
-        job = dict(zip(columns, last_run, strict=True))
-        return [float("nan" if job[name] in ("-", "NA") else job[name]) for name in names]
-    except (ValueError, KeyError) as error:
-        print(f"{path}: damaged ({error}); its cost is left out", file=sys.stderr, flush=True)
-        return [float("nan")] * len(names)
-
-
-def _cpu_seconds(log: Path) -> float:
-    """Return user plus system time from the last line of a log, in the format of bash's `times`.
-
-    NaN, with a message, if the log has no such line.
-    """
-    try:
-        *_, last_line = log.read_text(encoding="utf-8").splitlines()
-        times = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", last_line)
-        user, system = (60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in times)
-        return user + system
-    except (OSError, ValueError) as error:
-        print(f"{log}: no CPU time ({error}); it is left out", file=sys.stderr, flush=True)
-        return float("nan")
+def _last_run(benchmark: Path) -> pd.Series[float]:
+    """Return Snakemake's numbers of the last run of a job; ProductError if they are damaged."""
+    table = read_table(benchmark, sep="\t", na_values=["-"])
+    if not {"s", "max_rss"} <= {*table} or table.empty:
+        raise ProductError(f"{benchmark}: damaged; delete it, and the job's cost is left out")
+    return table.iloc[-1]
 
 
 @command("reference")
@@ -143,10 +129,16 @@ def reference(
         for name in names
         if name not in renewed and MAY_STAY.fullmatch(name)
     }
+    for name, record in retained.items():
+        try:
+            git("merge-base", "--is-ancestor", record["commit"], "HEAD")
+        except subprocess.CalledProcessError:
+            raise ProductError(
+                f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
+                " make it anew, or remove it from the record"
+            ) from None
     sources = {name: results / name for name in renewed}
     sources |= {name: out / name for name in retained}
-    for name, record in retained.items():
-        _require_history(name, record)
     # The new record is complete before it replaces the earlier one.
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
@@ -185,11 +177,11 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     """
     # Snakemake's plan for every file of the run: "no update", or the reason to make it.
     plan_by_name: dict[str, str] = {}
-    for plan in plans:
-        for row in csv.DictReader(plan.read_text(encoding="utf-8").splitlines(), delimiter="\t"):
-            path = Path(row["output_file"])
-            if path.is_relative_to(results):
-                plan_by_name[path.relative_to(results).as_posix()] = row["plan"]
+    for path in plans:
+        table = read_table(path, sep="\t")
+        for name, plan in zip(table["output_file"], table["plan"], strict=True):
+            if Path(name).is_relative_to(results):
+                plan_by_name[Path(name).relative_to(results).as_posix()] = plan
     if "runtime.csv" not in plan_by_name:
         raise ProductError(
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
@@ -205,29 +197,16 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     return [name for name in recorded if name not in outdated]
 
 
-def _require_history(name: str, record: Mapping[str, str]) -> None:
-    """Raise ProductError if the commit of a recorded file is not an ancestor of this one."""
-    try:
-        git("merge-base", "--is-ancestor", record["commit"], "HEAD")
-    except subprocess.CalledProcessError:
-        raise ProductError(
-            f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
-            " make it anew, or remove it from the record"
-        ) from None
-
-
 def provenance(results: Path, config: Config) -> dict[str, object]:
     """Describe a run: date, configuration, machine, versions, and its cost."""
-    costs = _costs(results)
+    costs = job_costs(results)
     # Targets beyond `make reproduce` that belong to the record.
     targets = (
         *("benchmark", "bounds", "own_stars", "prediction"),
         *("scaling", "stability", "training_knee"),
     )
-    canonical = json.dumps(config.model_dump(), sort_keys=True)
     return {
         "date": date.today().isoformat(),
-        "config_sha256": hashlib.sha256(canonical.encode()).hexdigest(),
         "cpu": cpu_model(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
@@ -268,13 +247,8 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
     Run times of two machines are expected to be in the inverse ratio of these speeds.
     """
     a = np.ones((size, size), dtype=np.float32)
-    shortest = float("inf")
-    for _ in range(repeats):
-        start = time.perf_counter()
-        a @ a
-        shortest = min(shortest, time.perf_counter() - start)
     # A product takes 2 n³ operations.
-    return 2.0 * size**3 / shortest / 1e9
+    return 2.0 * size**3 / min(timeit.repeat(lambda: a @ a, repeat=repeats, number=1)) / 1e9
 
 
 def _busy_seconds(benchmarks: Path) -> float:
@@ -282,9 +256,9 @@ def _busy_seconds(benchmarks: Path) -> float:
 
     Pauses between jobs, such as those before a run is resumed, do not count.
     """
-    files = benchmarks.rglob("*.tsv")
-    ends = ((p.stat().st_mtime, np.nan_to_num(_cost(p, "s")[0])) for p in files)
-    spans = sorted((end - float(seconds), end) for end, seconds in ends)
+    # Start and end of each job: a benchmark is written when its job ends.
+    ends = ((path.stat().st_mtime, _last_run(path)["s"]) for path in benchmarks.rglob("*.tsv"))
+    spans = sorted((end - np.nan_to_num(seconds), end) for end, seconds in ends)
     # Length of the union of all jobs' intervals, which are sorted by their start.
     busy_seconds, covered_until = 0.0, float("-inf")
     for start, end in spans:
@@ -313,9 +287,5 @@ def _test_seconds(report: Path) -> float | None:
     """Return the wall time of the last `make test`, from its JUnit report."""
     if not report.is_file():
         return None
-    try:
-        suite = ElementTree.parse(report).getroot().find("testsuite")
-    except ElementTree.ParseError as error:
-        print(f"{report}: damaged ({error}); left out", file=sys.stderr, flush=True)
-        return None
+    suite = ElementTree.parse(report).getroot().find("testsuite")
     return None if suite is None else round(float(suite.get("time", "nan")), 1)
