@@ -7,7 +7,6 @@ so that `psfdae --help` imports none of them.
 
 from __future__ import annotations
 
-import ast
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +16,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
+from textwrap import shorten
 from typing import (
     Annotated,
     Any,
@@ -70,10 +70,6 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
     return mark
 
 
-REFUSABLE = (OSError, MemoryError, RuntimeError, ValueError, ImportError)
-"""Errors of which some are no bugs; `refusal` tells which."""
-
-
 class Careful(click.Group):
     """Group of commands in which wrong input ends in one line and exit code 2."""
 
@@ -85,7 +81,7 @@ class Careful(click.Group):
         """
         try:
             return super().invoke(ctx)
-        except REFUSABLE as error:
+        except Exception as error:
             message = refusal(error)
             if message is None:
                 raise
@@ -138,8 +134,14 @@ class Commands(Careful):
         width = formatter.width - 6 - max(map(len, words))
         for heading, commands in listed.items():
             with formatter.section(heading):
-                names = [f"{self.prefix} {word}".strip() for word in commands]
-                formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
+                rows = []
+                for word in commands:
+                    name = f"{self.prefix} {word}".strip()
+                    text = groups()[name] if name in groups() else command_modules()[name][1]
+                    sentence = text.partition(". ")[0].removesuffix(".")
+                    sentence += "." if len(sentence) < width else ""
+                    rows.append((word, shorten(sentence, width, placeholder="...")))
+                formatter.write_dl(rows)
         if absent := len(words) - sum(map(len, listed.values())):
             formatter.write_paragraph()
             formatter.write_text(f'{absent} more with the extra "paper": {install_line("paper")}')
@@ -156,19 +158,22 @@ def main() -> None:
 
 
 @cache
-def command_modules() -> dict[str, tuple[str, Path]]:
-    """Return the name of the module, and the path of its file, of each command.
+def command_modules() -> dict[str, tuple[str, str]]:
+    """Return the module of each command, and the first paragraph of its help, by its name.
 
     They are found in the text of the modules, none of which is imported.
     """
-    # Lines such as @command("from-stars", …), perhaps with the name on the next line.
-    pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
+    # Lines such as @command("from-stars", …), perhaps with the name on the next line; then the
+    # docstring of the function.
+    pattern = re.compile(
+        r'^@command\(\s*"([^"]+)".*?"""(.*?)(?:\n\n|""")', re.MULTILINE | re.DOTALL
+    )
     commands = {}
     for package in _packages():
         for folder in find_spec(package).submodule_search_locations:  # type: ignore[union-attr]
             for path in sorted(Path(folder).glob("*.py")):
-                for name in pattern.findall(path.read_text(encoding="utf-8")):
-                    commands[name] = f"{package}.{path.stem}", path
+                for name, text in pattern.findall(path.read_text(encoding="utf-8")):
+                    commands[name] = f"{package}.{path.stem}", " ".join(text.split())
     return commands
 
 
@@ -217,25 +222,6 @@ def stage(name: str) -> Callable[..., Any]:
     stages = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
     function: Callable[..., Any] = next(f for f in stages if f.stage.name == name)
     return function
-
-
-def _shortened(text: str, width: int) -> str:
-    """Return the first sentence of a text, cut after the last word that fits into the width."""
-    from textwrap import shorten
-
-    first = " ".join(text.split()).partition(". ")[0].removesuffix(".")
-    return first + "." if len(first) < width else shorten(first, width, placeholder="...")
-
-
-def _about(name: str) -> str:
-    """Return the first paragraph of a command's help from the text of its module."""
-    if name in groups():
-        return groups()[name]
-    for node in ast.parse(command_modules()[name][1].read_text(encoding="utf-8")).body:
-        for call in getattr(node, "decorator_list", []):
-            if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
-                return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
-    return ""
 
 
 def as_click(function: Callable[..., Any]) -> click.Command:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae import fits
-from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
+from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require, require_origin
 from psfdae.files import Product
 from psfdae.method import CONFIG, Method
 from psfdae.methods import method
@@ -19,7 +19,7 @@ from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae.options import AboveZero, File, Folder
 from psfdae.rng import stream
-from psfdae.settings import Reference, SplitKind, as_overrides
+from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
@@ -74,7 +74,15 @@ def bundle(
 def _fit_config(
     method_class: type[Method], place: Path, config: Config, split: str | None
 ) -> dict[str, Any]:
-    """Return the configuration of a fit; BundleError if it is not that of the stage."""
+    """Return the configuration of a fit, which must be that of the stage.
+
+    Raises
+    ------
+    BundleError
+        If a file of the fit, or a key of its configuration, is missing.
+    ProductError
+        For the first setting that differs.
+    """
     for path in fits.own_files(method_class, place):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
@@ -86,24 +94,9 @@ def _fit_config(
         raise BundleError(f"{path}: key {min(missing)!r} is missing")
     stage_config = config.model_dump(include={*SEEN_BY_TRAINING})
     stage_config |= {"split": split or fit_config["split"]}
-    _refuse_mismatch({key: fit_config[key] for key in stage_config}, stage_config, path)
+    keys = (*SEEN_BY_TRAINING, "split")
+    require(path, fit_config, keys, stage_config, "the configuration of the bundle")
     return fit_config
-
-
-def _refuse_mismatch(trained: dict[str, Any], configured: dict[str, Any], path: Path) -> None:
-    """Raise BundleError that names the first setting in which two configurations differ."""
-    trained_words, configured_words = (
-        [word.strip("+") for word in as_overrides(tree)] for tree in (trained, configured)
-    )
-    differing = sorted({*trained_words} - {*configured_words})
-    differing = differing or sorted({*configured_words} - {*trained_words})
-    if differing:
-        key = differing[0].split("=")[0]
-        same_key = (word for word in configured_words if word.startswith(f"{key}="))
-        raise BundleError(
-            f"{path}: the network was trained with {differing[0]}, "
-            f"but the configuration of the bundle has {next(same_key, f'no {key}')}"
-        )
 
 
 @command("ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
