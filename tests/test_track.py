@@ -101,9 +101,10 @@ class Site:
 
         return MlflowClient(f"sqlite:///{self.database}")
 
-    def runs(self, kind="dae"):
-        experiment = self.client.get_experiment_by_name("scene1").experiment_id
-        return self.client.search_runs([experiment], f"tags.kind = '{kind}'")
+    def runs(self, kind="dae", experiment="scene1"):
+        number = self.client.get_experiment_by_name(experiment).experiment_id
+        query = f"tags.kind = '{kind}'" if experiment == "scene1" else ""
+        return self.client.search_runs([number], query)
 
     def history(self, run, metric):
         return self.client.get_metric_history(run.info.run_id, metric)

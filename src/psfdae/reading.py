@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsFloat
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -124,20 +123,22 @@ def read_json(path: Path) -> dict[str, Any]:
     return tree
 
 
-def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; raise ProductError if it lacks a column or is damaged."""
-    try:
-        reader = csv.DictReader(_text(path).splitlines(keepends=True))
-        missing = [name for name in columns if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ProductError(f"{path}: column {missing[0]!r} is missing")
-        return list(reader)
-    except csv.Error as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
+    """Read a CSV file as a DataFrame.
 
+    Parameters
+    ----------
+    path : Path
+    *columns : str
+        Names of columns that it must have.
+    **options
+        Options of pandas.
 
-def read_table(path: Path, **options: Any) -> DataFrame:
-    """Read a CSV file as a DataFrame, with pandas' options; raise ProductError if it is damaged."""
+    Raises
+    ------
+    ProductError
+        If the file is missing or damaged, or lacks a column; the message names the file.
+    """
     import pandas as pd
 
     try:
@@ -147,12 +148,6 @@ def read_table(path: Path, **options: Any) -> DataFrame:
     except (ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
+    if missing := [name for name in columns if name not in table]:
+        raise ProductError(f"{path}: column {missing[0]!r} is missing")
     return table
-
-
-def number(path: Path, text: str | SupportsFloat) -> float:
-    """Return a cell of a table as a number; raise ProductError, which names the file, if none."""
-    try:
-        return float(text)
-    except (TypeError, ValueError):
-        raise ProductError(f"{path}: damaged ({text!r} is no number)") from None

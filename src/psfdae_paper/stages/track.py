@@ -11,13 +11,13 @@ import math
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.errors import Error
-from psfdae.files import as_yaml, write_columns
+from psfdae.files import as_csv, as_yaml, write_text
 from psfdae.method import CONFIG
 from psfdae.options import File, Folder
 from psfdae.version import __version__
@@ -39,13 +39,12 @@ from psfdae_paper.views import show
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric
-    from mlflow.entities import Run as MlflowRun
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
 
 LIVE = "live"
-"""Stands for the hash of the config of a run that is under way; the import replaces it."""
+"""Experiment of trainings that are under way; the import of the finished run deletes them."""
 
 PARENT = "mlflow.parentRunId"
 """Tag by which MLflow shows a run as a part of another."""
@@ -106,12 +105,13 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
                 "To send later, repeat the import (snakemake --forcerun track)."
             )
     outcomes += [("", "not sent")] * (len(runs) - len(outcomes))
-    ids, actions = [run_id for run_id, _ in outcomes], [action for _, action in outcomes]
-    columns = {"run_id": ids, "action": actions, "experiment": [run.experiment for run in runs]}
-    tags = [{"preset": preset, **tags_of(run)} for run in runs]
-    columns |= {key: [row[key] for row in tags] for key in (*SLOT, "config_hash")}
-    write_columns(receipt, columns)
-    counts = sorted(Counter(actions).items())
+    rows = []
+    for run, (run_id, action) in zip(runs, outcomes, strict=True):
+        tags = {"preset": preset, **tags_of(run)}
+        row = {"run_id": run_id, "action": action, "experiment": run.experiment}
+        rows.append(row | {key: tags[key] for key in (*SLOT, "config_hash")})
+    write_text(receipt, as_csv(rows))
+    counts = sorted(Counter(action for _, action in outcomes).items())
     print(f"{len(runs)} runs:", ", ".join(f"{count} {action}" for action, count in counts))
 
 
@@ -199,11 +199,11 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
     return str(experiment.experiment_id)
 
 
-def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str]) -> list[MlflowRun]:
-    """Return the active runs of a place in the results folder that this stage has made."""
-    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
-    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
-    return list(client.search_runs([experiment], query))
+def delete_live(client: MlflowClient, source: str) -> None:
+    """Delete the runs of trainings, seen live, whose model has a place in the results folder."""
+    if experiment := client.get_experiment_by_name(LIVE):
+        for run in client.search_runs([experiment.experiment_id], f"tags.source = '{source}'"):
+            client.delete_run(run.info.run_id)
 
 
 def _import_run(
@@ -216,7 +216,10 @@ def _import_run(
     run_id, action : str
         MLflow's id of the run, and what was done.
     """
-    slot = runs_of_slot(client, experiment, tags)
+    # Active runs of the same place in the results folder that this stage has made.
+    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
+    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
+    slot = client.search_runs([experiment], query)
     of_config = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
     # An import that was killed leaves a run without content_hash.
     unchanged = [r for r in of_config if r.data.tags.get("content_hash") == run.content_hash]
@@ -229,14 +232,16 @@ def _import_run(
     else:
         run_id = _create(client, experiment, run, tags)
         action = "updated" if of_config else "created"
-    # Runs of the same settings, or under way, give way; those of other settings are superseded.
+    # Other runs of the same settings give way, and so does the training as it was seen live; runs
+    # of other settings are superseded.
     for old in slot:
         if old.info.run_id == run_id:
             continue
-        if old in of_config or old.data.tags["config_hash"] == LIVE:
+        if old in of_config:
             forget(client, old.info.run_id)
         elif old.data.tags.get("superseded") != "true":
             client.set_tag(old.info.run_id, "superseded", "true")
+    delete_live(client, run.source)
     return run_id, action
 
 
