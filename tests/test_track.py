@@ -123,7 +123,8 @@ def site(tmp_path, empty_database, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(registry, "_with_bundle", lambda files, *given: files)
+    monkeypatch.setattr(registry, "bundle_of", lambda *given: None)
+    monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
     return Site(tmp_path, empty_database)
 
 
