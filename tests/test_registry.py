@@ -58,5 +58,5 @@ def test_a_registered_model_restores_as_its_bundle_does(
         mlflow.set_tracking_uri(before)
 
     stamps = np.random.default_rng(5).poisson(2e4 * gaussian_stars[:20] + 1e4).astype(np.float32)
-    registered, own = load_model(f"{folder}/mine-dae.psf.safetensors"), load_model(packed)
-    np.testing.assert_array_equal(registered.predict(stamps).psf, own.predict(stamps).psf)
+    registered, model = load_model(f"{folder}/mine-dae.psf.safetensors"), load_model(packed)
+    np.testing.assert_array_equal(registered.predict(stamps).psf, model.predict(stamps).psf)

@@ -1,4 +1,8 @@
-"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong."""
+"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong.
+
+The path of a file goes in, and plain values or a table come out. What is wrong is a `ProductError`
+that names the file and, if it is known, line and column.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +34,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(path: Path) -> Any:
-    """Return the content of a YAML file, which is of any type.
+    """Return the content of a YAML file, which is of any type: no code of a file is run.
 
     Raises
     ------
     ProductError
         If the file is missing or wrong, or has a key twice; names file, line and column.
     """
+    # Errors of PyYAML take several lines; the place and the problem are in them.
     try:
         return yaml.load(_text(path), UniqueKeyLoader)
     except yaml.MarkedYAMLError as error:
@@ -113,7 +118,13 @@ def from_tree(
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file with an object; raise ProductError, which names the file, for another."""
+    """Read a JSON file with an object.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing or damaged, or has something else.
+    """
     try:
         tree = json.loads(_text(path))
     except (ValueError, RecursionError) as error:
@@ -141,6 +152,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     """
     import pandas as pd
 
+    # pandas raises ValueError for cells that are not of the type that is asked for.
     try:
         table: DataFrame = pd.read_csv(path, **options)
     except FileNotFoundError:

@@ -1,4 +1,8 @@
-"""Models of runs in MLflow, logged with their runs and registered by dataset and method."""
+"""Models of runs in MLflow, logged with their runs and registered by dataset and method.
+
+A run goes in, and out come a model with its files in MLflow and, if it restores single stamps, a
+version of the registered models of its dataset and method. The best version has the alias "best".
+"""
 
 from __future__ import annotations
 
@@ -47,6 +51,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> s
     logged = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
     model_id: str = logged.model_id
     client.log_outputs(run_id, [LoggedModelOutput(model_id, 0)])
+    # Its files, with a bundle for all that can be put into one.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         link(files, folder, MODEL)
@@ -68,7 +73,13 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> s
 
 
 def bundle_of(run: Run) -> Bundle:
-    """Return the bundle, without errors, of a run that has a fit and the stars of its training."""
+    """Return the bundle, without errors, of a run that has a fit and the stars of its training.
+
+    Raises
+    ------
+    ProductError
+        If the fit or the stars are damaged.
+    """
     assert run.fit is not None and run.data is not None
     method_class, place = run.fit
     described, product = method_class.described(place), read_stars(run.data, run.reference)
@@ -89,6 +100,13 @@ def link(files: Mapping[str, Path], folder: Path, prefix: str = "") -> None:
     """Make links to files in a folder, by their names without a prefix.
 
     MLflow copies a folder; links save a copy of large files.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        Files by names, which may have folders.
+    folder : Path
+    prefix : str
     """
     for name, path in files.items():
         target = folder / name.removeprefix(prefix)
@@ -108,6 +126,7 @@ def choose_best(client: MlflowClient, name: str) -> None:
         if TEST_MSE in version.tags
         and client.get_run(str(version.run_id)).data.tags.get("superseded") != "true"
     ]
+    # Truths first: any version that restores realisations is before those that restore templates.
     if candidates:
         winner = min(
             candidates, key=lambda v: (v.tags["reference"] == "template", float(v.tags[TEST_MSE]))

@@ -1,4 +1,8 @@
-"""Runs as MLflow shows them, read from the files in the results folder."""
+"""Runs as MLflow shows them, read from the files in the results folder.
+
+The results folder goes in, and `Run` come out, which name files, settings and metrics. Nothing
+here knows MLflow's database.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Stages `bundle` and `ship`: a fitted method as one file, which astronomers apply to images."""
+"""Stages `bundle` and `ship`: a fitted method as one file, which astronomers apply to images.
+
+A fit and the stars that it was trained on go in. Out comes a bundle: the weights, the errors that
+the method makes of stars that were left out, and telescope, camera and noise.
+"""
 
 from __future__ import annotations
 
@@ -53,6 +57,7 @@ def bundle(
     out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
     """Pack a trained network with its errors and all that it takes to apply it."""
+    # Exactly one option names a fit; its name is that of the method.
     limit_threads(config.evaluation.threads)
     fits_by_name = {key: place for key, place in vars(models).items() if place is not None}
     if len(fits_by_name) != 1:
@@ -65,6 +70,7 @@ def bundle(
     target = fit_config.get("reference") or reference or "realisation"
     product = read_stars(stars, target)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
+    # The errors are measured now, which takes most of the time.
     fitted = method_class.load(place, target, config.evaluation)
     labels = name or out.name.removesuffix(SUFFIX), licence
     model = packing.model_of(fitted, product, target, config, fit_config, *labels, largest_mb)
@@ -110,6 +116,7 @@ def ship(
 
     Flux and sky of these stars are estimated, and every noise level counts alike.
     """
+    # The candidate with the smallest error.
     product, errors = read_stars(stars), {}
     for path in bundle:
         errors[path] = _validation_error(read_bundle(path), product, config)
@@ -146,6 +153,8 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
         weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
         bundle = replace(bundle, weights=weights)
     model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
+    # Flux and sky of the noisy stars are unknown to the model; the PSF of flux 1 is compared with
+    # the noise-free star.
     log_errors = []
     for level in data.levels:
         rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)

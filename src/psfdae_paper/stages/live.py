@@ -1,7 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
 A training logs where the environment asks for it (`psfdae.networks.training.listener`). Its run
-lasts until `psfdae track` imports the finished one.
+lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which says
+whose training it is, and a function of the rows of the history comes out.
 """
 
 from __future__ import annotations
@@ -40,12 +41,14 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
     source = os.path.relpath(checkpoint.with_suffix(""), database.with_name("checkpoints"))
     source = source.replace("alignment-", "alignment/")
     is_shown = bool(uri or "SLURM_JOB_ID" not in os.environ) and "/" in source
+    # MLflow's id of the run, and the last epoch that it has; "" before the first one.
     run_id, last_epoch = "", 0.0
 
     def log(row: Row) -> None:
         nonlocal is_shown, run_id, last_epoch
         if not is_shown:
             return
+        # The history counts seconds from the start of the training, MLflow from 1970.
         start_ms = int(1000 * (time.time() - row["seconds"]))
         try:
             with locked(database):

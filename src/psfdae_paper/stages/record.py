@@ -1,4 +1,9 @@
-"""Stages `runtime` and `reference`: the cost of a run, and the run of record."""
+"""Stages `runtime` and `reference`: the cost of a run, and the run of record.
+
+A finished run in `results` goes in. Out come `runtime.csv` with the cost of each job, and
+`results/reference` with tables and figures of the run and, in `provenance.json`, how they were
+made. The record is in git, and pages take their numbers from it.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +34,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from psfdae_paper.configuration.schema import Config
-
-VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
-"""Packages whose versions can change a number; recorded with the run."""
 
 ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
@@ -114,8 +116,9 @@ def reference(
     """
     from psfdae_paper.configuration.compose import load
 
-    commit = _current_commit()
-    renewed = _up_to_date(results, plans)
+    # What a commit does not have, and what it would make anew, is refused.
+    commit = clean_commit()
+    renewed = files_up_to_date(results, plans)
     # Files of the earlier record that stay, with its commit and date.
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
@@ -126,6 +129,7 @@ def reference(
         for name in names
         if name not in renewed and MAY_STAY.fullmatch(name)
     }
+    # A commit that is in the history can be checked out again.
     for name, record in retained.items():
         try:
             git("merge-base", "--is-ancestor", record["commit"], "HEAD")
@@ -150,10 +154,13 @@ def reference(
     staging.rename(out)
 
 
-def _current_commit() -> str:
+def clean_commit() -> str:
     """Return the commit that is checked out.
 
-    ProductError if files that decide the products of a run differ from it.
+    Raises
+    ------
+    ProductError
+        If files that decide the products of a run differ from it, or git fails.
     """
     try:
         changed = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
@@ -167,10 +174,25 @@ def _current_commit() -> str:
     return commit
 
 
-def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
+def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     """Return the files of the record that Snakemake finds up to date.
 
-    ProductError if others, which may not stay from an earlier record, are not.
+    Parameters
+    ----------
+    results : Path
+        Folder of the run.
+    plans : iterable of Path
+        Tables of `snakemake --summary`.
+
+    Returns
+    -------
+    list of str
+        Names of files, relative to the folder.
+
+    Raises
+    ------
+    ProductError
+        If others, which may not stay from an earlier record, are not up to date.
     """
     # Snakemake's plan for every file of the run: "no update", or the reason to make it.
     plan_by_name: dict[str, str] = {}
@@ -183,6 +205,7 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
         raise ProductError(
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
+    # A record is of one commit, but for files that take too long to be made for each.
     recorded = {name: plan for name, plan in plan_by_name.items() if RECORDED.fullmatch(name)}
     outdated = {name for name, plan in recorded.items() if plan != "no update"}
     refused = sorted(name for name in outdated if not MAY_STAY.fullmatch(name))
@@ -195,19 +218,25 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
 
 
 def provenance(results: Path, config: Config) -> dict[str, object]:
-    """Describe a run: date, configuration, machine, versions, and its cost."""
+    """Describe a run: date, machine, versions, threads, and its cost.
+
+    Times are in seconds, sizes in MB. `wall_s` is the time during which a job of `make reproduce`
+    ran, `on_request_s` that of each target beyond it.
+    """
     costs = job_costs(results)
-    # Targets beyond `make reproduce` that belong to the record.
-    targets = (
-        *("benchmark", "bounds", "own_stars", "prediction"),
-        *("scaling", "stability", "training_knee"),
-    )
+    # Jobs of targets beyond `make reproduce`, such as the bounds.
+    on_request = sorted(path for path in (results / ON_REQUEST).glob("*") if path.is_dir())
+    # The last `make test` leaves its time in a report of JUnit's form.
+    report = results / "tests.xml"
+    tests = ElementTree.parse(report).getroot().find("testsuite") if report.is_file() else None
+    # Packages whose versions can change a number.
+    packages = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
     return {
         "date": date.today().isoformat(),
         "cpu": cpu_model(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in VERSIONED},
+        "versions": {name: metadata.version(name) for name in packages},
         "threads": {
             "simulation": config.optics.threads,
             "training": config.train.threads,
@@ -215,14 +244,10 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         },
         "matrix_product_gflops": round(matrix_product_speed(), 1),
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
-        "on_request_s": {
-            name: round(_busy_seconds(results / ON_REQUEST / name), 1)
-            for name in targets
-            if (results / ON_REQUEST / name).is_dir()
-        },
+        "on_request_s": {path.name: round(_busy_seconds(path), 1) for path in on_request},
         **_installation(),
         "results_mb": round(_size_mb(results), 1),
-        "tests_s": _test_seconds(results / "tests.xml"),
+        "tests_s": None if tests is None else round(float(tests.get("time", "nan")), 1),
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
@@ -230,6 +255,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
 def cpu_model() -> str:
     """Return the model of the processor as the operating system names it."""
+    # Linux; others say it to Python.
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text().splitlines():
@@ -266,6 +292,7 @@ def _busy_seconds(benchmarks: Path) -> float:
 
 def _installation() -> dict[str, float]:
     """Return time and disk space of the environment that `make` created, from its files."""
+    # venv writes pyvenv.cfg first, and make the other file last.
     environment = Path(sys.prefix)
     start, end = environment / "pyvenv.cfg", environment / ".complete"
     if not (start.is_file() and end.is_file()):
@@ -275,14 +302,6 @@ def _installation() -> dict[str, float]:
 
 
 def _size_mb(folder: Path) -> float:
-    """Return the size of all files of a folder in MB."""
+    """Return the size of all files of a folder in MB, links left out."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return sum(path.stat().st_size for path in files) / 1e6
-
-
-def _test_seconds(report: Path) -> float | None:
-    """Return the wall time of the last `make test`, from its JUnit report."""
-    if not report.is_file():
-        return None
-    suite = ElementTree.parse(report).getroot().find("testsuite")
-    return None if suite is None else round(float(suite.get("time", "nan")), 1)
