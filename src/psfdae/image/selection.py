@@ -18,7 +18,7 @@ import numpy as np
 
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
-from psfdae.image.bad_pixels import interpolated_stamps
+from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation, central_pixel
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around, softened
 from psfdae.moments import FWHM_OF_SIGMA, robust_scatter, shift_stamps, windowed_centres

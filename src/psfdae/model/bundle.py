@@ -71,20 +71,36 @@ class ModelErrors(NamedTuple):
     Attributes
     ----------
     flux : float
-        Error of the flux, over the flux.
+        Error of the flux, over the flux, RMS over the field.
     sky : float
         Error of the sky in a pixel, over the flux.
     centre : float
         Error of the centre along each axis, in pixels.
     fitted_flux : float
-        Error of the flux over the flux, where the PSF is fitted on a sky that is known from the
-        whole image.
+        Error of the flux over the flux, RMS over the field, where the PSF is fitted on a sky that
+        is known from the whole image.
+    growth : tuple of 6 floats, or of none
+        (x₀, y₀, a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² + c w² +
+        d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. Without
+        them, it is the same at all places.
     """
 
     flux: float = 0.0
     sky: float = 0.0
     centre: float = 0.0
     fitted_flux: float = 0.0
+    growth: tuple[float, ...] = ()
+
+    def flux_factor(self, place: np.ndarray) -> np.ndarray:
+        """Return √v: errors of fluxes at places (n, 2), x and y, over those of the field, (n,).
+
+        1 where the place is not known (NaN).
+        """
+        if not self.growth:
+            return np.ones(len(place))
+        u2, w2 = np.square(place - np.array(self.growth[:2])).T
+        terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
+        return np.where(np.isfinite(u2 + w2), np.sqrt(np.array(self.growth[2:]) @ terms), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +167,12 @@ class Bundle:
         """Errors of measured stars due to errors of the model; BundleError if damaged."""
         tree = self.info.config.get("model_errors", {})
         try:
-            errors = ModelErrors(**{name: float(value) for name, value in tree.items()})
-            if not all(0.0 <= error < 1e3 for error in errors):
+            numbers = {name: value for name, value in tree.items() if name != "growth"}
+            growth = tuple(float(value) for value in tree.get("growth", ()))
+            errors = ModelErrors(**{k: float(v) for k, v in numbers.items()}, growth=growth)
+            # Places are pixels; a variance is not below 0.
+            sizes = [*errors[:4], *growth[2:]]
+            if not (all(0.0 <= size < 1e3 for size in sizes) and len(growth) in (0, 6)):
                 raise ValueError("numbers that are no errors")
         except (TypeError, ValueError, AttributeError) as error:
             raise BundleError(f"{self.info.name}: damaged (model_errors: {error})") from None

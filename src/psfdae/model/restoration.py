@@ -235,9 +235,9 @@ class Restorer:
         )
         measured = estimate.measured
         assert measured is not None and estimate.sigma is not None
-        covariance = _with_model_errors(
-            measured.covariance, measured.flux, self.bundle.model_errors
-        )
+        errors = self.bundle.model_errors
+        place_factor = errors.flux_factor(np.stack([stars.x, stars.y], axis=1))
+        covariance = _with_model_errors(measured.covariance, measured.flux, errors, place_factor)
         flux_error = np.sqrt(covariance[:, 0, 0])
         flux = np.where(has_flux, stars.flux, measured.flux)
         has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
@@ -461,13 +461,17 @@ def _error_widths(
     return half_width, ratio95 * scale95 / scale68, flux_error_scale
 
 
-def _with_model_errors(covariance: np.ndarray, flux: np.ndarray, errors: ModelErrors) -> np.ndarray:
+def _with_model_errors(
+    covariance: np.ndarray, flux: np.ndarray, errors: ModelErrors, place_factor: np.ndarray
+) -> np.ndarray:
     """Return covariances (n, 4, 4) of flux, sky, row and column with the errors of the model too.
 
-    A number that is known, whose variance is almost 0, stays so.
+    These are `place_factor` (n,) times those of the field. A number that is known, whose
+    variance is almost 0, stays so.
     """
     unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
     model_sigma = np.concatenate([unit * [errors.flux, errors.sky], zeros + errors.centre], axis=1)
+    model_sigma *= place_factor[:, None]
     variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
     known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
     model_sigma[np.sqrt(variance) < known_sigma] = 0.0

@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -27,13 +28,8 @@ from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
 from psfdae.telescope.settings import Seeing
 
-MAX_ROUNDS = 4
-"""Rounds in which stars choose the mode nearest to the state and the state follows them, and in
-which stamps are computed again for a fitted seeing."""
-
-MAX_SEEING_CHANGE = 0.5
-"""Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM that
-the telescope's file states."""
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,27 @@ class Joint:
     star: np.ndarray
     disagrees: np.ndarray
 
+    @property
+    def table(self) -> Table:
+        """Table with a row for each number: name, unit, prior, fitted value, errors, correlation.
 
+        `correlation` (Q,) is that of the error with the errors of all numbers.
+        """
+        from astropy.table import Table
+
+        columns = {
+            "name": np.array(self.model.names, "U20"),
+            "unit": np.array(self.model.units, "U8"),
+            "prior": self.model.mean,
+            "prior_error": self.model.sd,
+            "value": self.value,
+            "error": self.error,
+            "correlation": self.correlation,
+        }
+        return Table(columns)
+
+
+@dataclass(frozen=True, eq=False)
 class TelescopePosterior:
     """Posterior of the numbers of a telescope, and of the places, fluxes and skies of its stars.
 
@@ -73,7 +89,7 @@ class TelescopePosterior:
     place (x, y), flux and sky of each star in turn. If the FWHM of the seeing is one of the
     numbers, stamps are linear in it about the seeing of `optics`.
 
-    Parameters
+    Attributes
     ----------
     search : WavefrontSearch
     model : TelescopeModel
@@ -82,36 +98,43 @@ class TelescopePosterior:
     optics : StarOptics
     """
 
-    def __init__(
-        self, search: WavefrontSearch, model: TelescopeModel, stars: np.ndarray, optics: StarOptics
-    ) -> None:
-        self.search, self.model, self.stars, self.optics = search, model, stars, optics
-        self.number_count = model.sd.size
+    search: WavefrontSearch
+    model: TelescopeModel
+    stars: np.ndarray
+    optics: StarOptics
+    max_seeing_change: ClassVar[float] = 0.5
+    """Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM
+    that the telescope's file states."""
+
+    @property
+    def number_count(self) -> int:
+        """Number Q of numbers of the telescope."""
+        return self.model.sd.size
 
     @cached_property
-    def _broadening(self) -> SampledStamps:
+    def broadening(self) -> SampledStamps:
         """Propagation to derivatives of the stamps by the logarithm of the FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
-    def _seeing(self) -> Seeing:
-        assert self.optics.telescope.seeing is not None, "the model has one"
+    def seeing(self) -> Seeing:
+        """Seeing of the optics; a model with a seeing has one."""
+        assert self.optics.telescope.seeing is not None
         return self.optics.telescope.seeing
 
     def relative_seeing(self, t: np.ndarray) -> float:
         """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
         # The FWHM is the last number of the model.
         fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
-        return float(fwhm / self._seeing.fwhm_arcsec)
+        return float(fwhm / self.seeing.fwhm_arcsec)
 
     def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
-        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._seeing.fwhm_arcsec
+        fwhm = max(self.relative_seeing(t), 1.0 - self.max_seeing_change) * self.seeing.fwhm_arcsec
         # The same telescope but for its seeing.
-        seeing = self._seeing.model_copy(update={"fwhm_arcsec": fwhm})
+        seeing = self.seeing.model_copy(update={"fwhm_arcsec": fwhm})
         telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
-        optics = replace(self.optics, telescope=telescope)
-        return TelescopePosterior(self.search, self.model, self.stars, optics)
+        return replace(self, optics=replace(self.optics, telescope=telescope))
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
         """Return the coefficients of the stars (m, K) in waves at standardised numbers t (Q,)."""
@@ -161,10 +184,10 @@ class TelescopePosterior:
         stamps, slopes = optics.derivatives(modes, directions)
         if self.model.has_seeing:
             # p(w) = p(1) + (w − 1) ∂p/∂ln w about w = 1, the relative FWHM of the seeing.
-            broadened = self._broadening.stamps(modes).reshape(len(self.stars), -1)
+            broadened = self.broadening.stamps(modes).reshape(len(self.stars), -1)
             broadened = broadened.astype(np.float64)
             stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
-            slopes[:, q - 1] = self.model.sd[-1] / self._seeing.fwhm_arcsec * broadened
+            slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadened
         expected = self.search.expected_counts(self.stars, stamps, slopes, star_parameters)
         return poisson_information(self.search.photons.counts[self.stars], *expected)
 
@@ -204,35 +227,33 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     posterior = TelescopePosterior(search, model, stars, optics)
     # Two starts: near the prior's mean, and near the twin of that, unless no telescope is there.
     q = posterior.number_count
-    starts = [_start_near(posterior, modes, np.zeros(q))]
+    starts = [start_near(posterior, modes, np.zeros(q))]
     with suppress(RayTracingError):
-        starts.append(_start_near(posterior, modes, _twin(posterior, starts[0][:q])))
+        starts.append(start_near(posterior, modes, twin_numbers(posterior, starts[0][:q])))
     # Limits of the numbers, and of the places of the stars.
     limit = np.full(starts[0].size, np.inf)
     limit[:q] = MAX_Z
     if model.has_seeing:
-        limit[q - 1] = MAX_SEEING_CHANGE * model.mean[-1] / model.sd[-1]
+        limit[q - 1] = posterior.max_seeing_change * model.mean[-1] / model.sd[-1]
     limit[q:].reshape(-1, 4)[:, :2] = optics.reach_px
     steps = Steps(max_steps=30, min_gain=0.005, relative_rounding=1e-7)
     peaks = climb(posterior.evaluate, np.stack(starts), limit, steps)
     # Stamps are linear in the seeing: they are computed again at the fitted FWHM until it changes
-    # by less than 0.2 %.
-    for _ in range(MAX_ROUNDS if model.has_seeing else 0):
+    # by less than 0.2 %, at most four times.
+    for _ in range(4 if model.has_seeing else 0):
         t = peaks.parameters[peaks.height.argmax(), :q]
         if abs(posterior.relative_seeing(t) - 1.0) < 2e-3:
             break
         posterior = posterior.with_seeing_of(t)
         peaks = climb(posterior.evaluate, peaks.parameters, limit, steps)
-    return _summarise(posterior, peaks)
+    return summarise_peaks(posterior, peaks)
 
 
-def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
+def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     """Return the most probable state with its errors, and its twin if there is another peak."""
     model, stars = posterior.model, posterior.stars
     t = peaks.parameters[:, : posterior.number_count]
-    # Laplace's approximation: mass = height of the peak × √|covariance|.
-    covariance = np.linalg.inv(peaks.information)
-    evidence = peaks.height + 0.5 * np.linalg.slogdet(covariance)[1]
+    covariance, evidence = peaks.laplace()
     best_peak = int(evidence.argmax())
     state_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
     sigma = np.sqrt(np.diagonal(state_covariance))
@@ -253,7 +274,7 @@ def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     )
 
 
-def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
+def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
     """Return parameters that agree with the modes of the single stars, near t (Q,).
 
     In each round every star chooses the mode nearest to the telescope, and the numbers are fitted
@@ -267,7 +288,8 @@ def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) 
     covariance = sd[:, :, None] * modes.covariance[:, :count, :count] * sd[:, None]
     covariance = covariance + 1e-6 * np.eye(count)
     row = np.searchsorted(posterior.stars, modes.star)
-    for _ in range(MAX_ROUNDS):
+    # Four rounds: a star may choose another mode as the numbers move.
+    for _ in range(4):
         # Squared Mahalanobis distance of each mode; the first of each star in this order is the
         # nearest.
         gap = measured - posterior.coefficients(t)[row]
@@ -283,7 +305,7 @@ def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) 
     return np.concatenate([t, modes.parameters[nearest, count:].ravel()])
 
 
-def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
+def twin_numbers(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
     """Return standardised numbers whose stars have the even coefficients of t (Q,) negated.
 
     A least-squares solution by Gauss–Newton steps: often no telescope has exactly these.
@@ -291,7 +313,8 @@ def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
     is_even = posterior.search.optics.terms.is_even
     # Coefficients that the twin should have; those of odd terms stay.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
-    for _ in range(MAX_ROUNDS):
+    # Few steps do: coefficients are linear in the numbers, or nearly so.
+    for _ in range(4):
         # All coefficients of all stars are equations for the numbers; singular values below 1e-9
         # are combinations of numbers that no coefficient shows.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)

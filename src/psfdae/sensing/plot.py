@@ -1,4 +1,8 @@
-"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars."""
+"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars.
+
+In: `psfdae.sensing.results.Wavefronts`. Out: a figure with three panels, in which each star has
+its pupil, or its stamp, at its field angle.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.figures import WIDTH_IN, new_figure, styled
-from psfdae.sensing.results import Wavefronts
+from psfdae.sensing.results import Wavefronts, flat_modes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-CELLS = 8
-"""Pupils along a side of the field, at most."""
 
 
 @styled
@@ -21,16 +22,25 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     """Draw wavefronts of bright stars at their places, those of the model, and residual stamps.
 
     The model is the telescope's state if it was fitted, else the mean of the prior.
+
+    Parameters
+    ----------
+    wavefronts : Wavefronts
+    title : str
+        Title above the three panels.
     """
-    stars = _bright_separate_stars(wavefronts)
+    # At most 8 pupils along a side of the field: each is drawn in a cell.
+    low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
+    cell_deg = (high - low).max() / 8
+    stars = bright_separate_stars(wavefronts, cell_deg)
     # OPD of the most probable mode of each star, and of the model.
     summary, joint = wavefronts.summary, wavefronts.joint
     first = np.searchsorted(summary["star"], stars)
-    measured = _pupil_opd(wavefronts, stars, summary["mean"][first])
+    measured = pupil_opd(wavefronts, stars, summary["mean"][first])
     expected = wavefronts.terms.mean
     if joint is not None:
         expected = joint.model.coefficients(joint.value)
-    model = _pupil_opd(wavefronts, stars, expected[stars])
+    model = pupil_opd(wavefronts, stars, expected[stars])
     # Residuals in units of the sky's noise, less the median of each stamp.
     stamps, photons = wavefronts.stamps, wavefronts.search.photons
     residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
@@ -48,11 +58,12 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    # Each image fills a cell about the place of its star, with a gap to the next one.
-    low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
-    cell = 0.92 * ((high - low).max() or 1.0) / CELLS
+    # Each image fills its cell about the place of the star, but for a gap to the next one. If all
+    # stars have one place, any cell will do.
+    cell = 0.92 * (cell_deg or 0.125)
     half = 0.5 * cell
     for panel, (name, images, limit, colours, unit) in zip(axes, panels, strict=True):
+        # Rows of images run along +y, as the field angles do.
         for (x, y), image in zip(wavefronts.field_deg[stars], images, strict=True):
             mappable = panel.imshow(
                 image,
@@ -70,6 +81,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
             xlabel="x (deg)",
             title=name,
         )
+        # Without stars there is nothing that a colour bar could explain.
         if len(stars):
             figure.colorbar(mappable, ax=panel, location="bottom", shrink=0.8, label=unit)
     axes[0].set_ylabel("y (deg)")
@@ -77,37 +89,29 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     return figure
 
 
-def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
-    """Return the brightest explained stars that are a cell or more from each other."""
+def bright_separate_stars(wavefronts: Wavefronts, cell_deg: float) -> np.ndarray:
+    """Return the numbers of the brightest explained stars, a cell or more from each other."""
     stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
     # Brightest first: of stars in one cell, the brightest is drawn.
     stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
     # Rounding must not part stars of a regular grid.
-    cell = (1.0 - 1e-6) * np.ptp(wavefronts.field_deg, axis=0).max() / CELLS
+    distance_deg = (1.0 - 1e-6) * cell_deg
     separate = []
     while stars.size:
         separate.append(stars[0])
         offset = np.abs(wavefronts.field_deg[stars] - wavefronts.field_deg[stars[0]])
-        stars = stars[offset.max(axis=1) >= cell] if cell > 0 else stars[:0]
+        is_separate = (offset.max(axis=1) >= distance_deg) & (cell_deg > 0)
+        stars = stars[is_separate]
     return np.array(separate, int)
 
 
-def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return the OPD in waves over the pupil, without piston and tilts, (m, 48, 48).
+def pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return the OPD in waves over the pupil, without piston and tilts, (m, 50, 50).
 
-    NaN where the pupil is not lit. `coefficients` (m, K) are in waves.
+    NaN where less than half of a sample is lit. `coefficients` (m, K) are in waves.
     """
-    # The lit annulus on a grid.
-    axis = np.linspace(-1.0, 1.0, 48)
-    x, y = axis[None, :], axis[:, None]
-    radius = np.hypot(x, y)
-    is_lit = (radius <= 1.0) & (radius >= wavefronts.telescope.obscuration)
     # OPD Σ c_k T_kj M_j of each star.
-    modes = wavefronts.terms.modes(x, y)[:, is_lit]
-    opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ modes
-    # Take out the plane that fits best.
-    planes = np.stack([np.broadcast_to(term, is_lit.shape)[is_lit] for term in (1.0, x, y)], axis=1)
-    opd -= (planes @ np.linalg.lstsq(planes, opd.T, rcond=None)[0]).T
-    images = np.full((len(star), *is_lit.shape), np.nan)
-    images[:, is_lit] = opd
-    return images
+    images, weight = flat_modes(wavefronts.terms, wavefronts.telescope.obscuration, 48)
+    opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ images
+    opd[:, weight < 0.5 * weight.max()] = np.nan
+    return np.asarray(opd.reshape(len(star), 50, 50))

@@ -44,14 +44,6 @@ STARS_AT_ONCE = 128
 """Stars of 16 × 16 px that are worked on together, to bound the memory."""
 
 
-ROUNDS = ((48, 4), (100, 6), (400, 12), (1000, 12))
-"""Rounds of the search: candidates drawn for a star, and those of them that are followed to modes.
-
-Rounds after the first are for stars that no mode explains yet, or for which the round before found
-another mode.
-"""
-
-
 class SensingError(Error, ValueError):
     """Stars, or a telescope, from which no wavefronts can be measured."""
 
@@ -327,7 +319,9 @@ class WavefrontSearch:
         count = self.optics.coefficient_count
         modes: list[StarModes] = []
         likely_modes = np.ones(len(self.flux), int)
-        for number, sizes in enumerate(ROUNDS):
+        # Candidates drawn for a star in each round, and those of them that are followed to modes.
+        rounds = ((48, 4), (100, 6), (400, 12), (1000, 12))
+        for number, sizes in enumerate(rounds):
             if not stars.size:
                 break
             # Climbs from the candidates that match best.
@@ -430,12 +424,9 @@ class WavefrontSearch:
         steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
         with task("modes", steps.max_steps + 1) as advance:
             peaks = climb(evaluate, start, limit, steps, star)
-        # Laplace's approximation: mass = height of the peak × √|covariance|.
-        covariance = np.linalg.inv(peaks.information)
-        sign, log_determinant = np.linalg.slogdet(covariance)
-        evidence = np.where(sign > 0, peaks.height + 0.5 * log_determinant, -np.inf)
+        # Height = −½ (deviance + penalty of the prior).
         deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
-        return StarModes(star, peaks.parameters, covariance, evidence, deviance)
+        return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
 
     def _draw_parameters_of(self, modes: StarModes) -> np.ndarray:
         """Draw from the posteriors of all stars that the modes belong to."""
