@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require
 from psfdae.files import Column, Product, read_product, write_csv, write_product
@@ -209,8 +210,6 @@ def telescope(
     They say how well the model reproduces rays, how far the telescope is out of focus, how well
     images separate the four numbers of a state, and how much light the stamps hold.
     """
-    import pandas as pd
-
     # The model, and the two sets that serve as tests.
     quadratic = read_product(model, "alignment_model")
     sets = {

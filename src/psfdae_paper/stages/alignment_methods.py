@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require, require_origin, write_origin
 from psfdae.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
@@ -357,8 +358,6 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
     rows : sequence of (str, float, str, float, int)
         Test set, noise level, name of the method, seconds and number of states.
     """
-    import pandas as pd
-
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
     table = pd.DataFrame(rows, columns=columns)
     write_csv(path, table, digits=6)
