@@ -14,8 +14,9 @@ from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
 from psfdae.image.observation import Source
-from psfdae.image.selection import Verdict, completed, sharper_than_stars, wider_than_stars
+from psfdae.image.selection import Verdict, completed
 from psfdae.image.sky_level import noise_correlation, sky_level, sky_steps
+from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
 from psfdae.image.trails import find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
