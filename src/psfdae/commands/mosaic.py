@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.cli import REFUSABLE, refusal
+from psfdae.cli import refusal
 from psfdae.errors import Error
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
@@ -113,7 +113,7 @@ def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool
     with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:
             return True, work(**job)
-        except REFUSABLE as error:
+        except Exception as error:
             message = refusal(error)
             if message is None:
                 raise
