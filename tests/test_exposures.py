@@ -179,6 +179,7 @@ def night(tmp_path_factory):
     return folder, folder / "m"
 
 
+@pytest.mark.slow
 def test_a_poor_exposure_of_a_night_has_a_field_as_of_a_hundred_stars(night, hundred):
     _, out = night
     models = {name: load_model(out / f"{name}.psf.safetensors") for name in ("all", *NIGHT)}
@@ -201,6 +202,7 @@ def test_predict_takes_the_exposure_s_own_model_from_the_folder(night, tmp_path)
     assert "other: 0 models, expected one" in refused("predict", *words)
 
 
+@pytest.mark.slow
 def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night, shipped):
     folder, out = night
     images = [folder / f"{name}.fits" for name in NIGHT]

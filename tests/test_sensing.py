@@ -265,6 +265,7 @@ def test_noise_free_stars_come_back():
     assert found.explained.all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_chains")
 def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     telescope, rng = three_terms(), np.random.default_rng(5)

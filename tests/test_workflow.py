@@ -132,6 +132,7 @@ def jobs(smoke, tree):
     return repeated
 
 
+@pytest.mark.slow
 def test_another_place_comments_formats_and_checkpoints_repeat_nothing(jobs, tree):
     overrides = ["train.lr=0.0060", "noise.kappa=4.980"]
     for group in ("train", "dae_train", "train_original", "train_dae_retrained"):
@@ -176,6 +177,7 @@ def test_code_repeats_what_is_made_with_it_and_nothing_before(jobs, module, repe
     assert not left.keys() & plan.keys()
 
 
+@pytest.mark.slow
 def test_keys_of_one_scene_leave_the_others_alone(smoke):
     jobs = planned(smoke, "scene1", "scene2", overrides="wavefront.r0_m=0.15")
     assert (jobs["templates"], jobs["stars"]) == (1, 1)
