@@ -152,7 +152,7 @@ def from_stars(
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
     settings = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
-    stem, sentence = _model_name(image, name), ""
+    stem, sentence = model_name(image, name), ""
     if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
     if all_extensions:
@@ -173,21 +173,21 @@ def from_stars(
         run_for_images(from_stars, jobs, image[0])
     else:
         sources = ImageInput(image[0], **vars(options)).of_each(image)
-        exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
+        exposures = [model_name((path,), None) for path in image] if len(image) > 1 else []
         if exposures and method_name is None and "field" in settings.methods:
             # Validation stars would judge the field of all exposures, but each gets its own.
             method_name = "field"
-        settings, methods, candidates = _methods(settings, method_name)
+        settings, methods, candidates = compared_methods(settings, method_name)
         files = ModelFiles(out, stem, methods, exposures)
-        with _folder(files, sources, page, overwrite):
-            sentence = _write_model(settings, sources, files, licence, candidates, page)
+        with reserved_folder(files, sources, page, overwrite):
+            sentence = write_model(settings, sources, files, licence, candidates, page)
         print(sentence)
     # The command that applies the model to all stars of the image, or of the first exposure. A
     # list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
     if several and options.catalogue:
         options = replace(options, on_image=True)
-    stem = _model_name(image[:1], None if several else name)
+    stem = model_name(image[:1], None if several else name)
     model = out if several or all_extensions else ModelFiles(out, stem, ()).bundle
     words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
     words += ["--all-extensions"] * all_extensions
@@ -196,7 +196,7 @@ def from_stars(
     return sentence
 
 
-def _methods(
+def compared_methods(
     settings: Settings, method_name: str | None
 ) -> tuple[Settings, tuple[type[Method], ...], list[type[Method]]]:
     """Choose the methods that are compared, that are fitted, and that may become the model.
@@ -231,7 +231,7 @@ def _methods(
     return settings.model_copy(update={"methods": names}), fitted, candidates
 
 
-def _model_name(image: tuple[Path, ...], name: str | None) -> str:
+def model_name(image: tuple[Path, ...], name: str | None) -> str:
     """Return the name of a model, with which the names of its files begin.
 
     Raises
@@ -251,7 +251,7 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
 
 
 @contextmanager
-def _folder(
+def reserved_folder(
     files: ModelFiles, sources: Sequence[ImageInput], page: Path | None, overwrite: bool
 ) -> Iterator[None]:
     """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
@@ -268,7 +268,7 @@ def _folder(
     check_outputs([*files.paths(), *lists, page], inputs)
     if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
-    with _locked(files.path):
+    with locked_folder(files.path):
         bundles = sorted(files.path.glob(f"*{SUFFIX}"))
         if bundles and not overwrite:
             raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
@@ -276,7 +276,7 @@ def _folder(
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Refuse a folder in which another process works; the lock ends with the process.
 
     A folder that is left empty is removed again.
@@ -302,7 +302,7 @@ def _locked(folder: Path) -> Iterator[None]:
             folder.rmdir()
 
 
-def _write_model(
+def write_model(
     settings: Settings,
     sources: list[ImageInput],
     files: ModelFiles,
@@ -331,7 +331,7 @@ def _write_model(
     # Fit the candidates, and the other methods that the report compares with them. With few
     # stars only one candidate is tried.
     tried_methods = worth_trying(stars, candidates)
-    fitted = _fit_methods(
+    fitted = fit_methods(
         stars, files, [m for m in files.methods if m in tried_methods or m not in candidates]
     )
     # The method with the smallest MSE on validation stars becomes the model.
@@ -371,7 +371,7 @@ def _write_model(
     return str(report)
 
 
-def _fit_methods(
+def fit_methods(
     stars: Stars, files: ModelFiles, methods: Sequence[type[Method]]
 ) -> dict[str, Method]:
     """Fit methods to the training stars, write each fit to its file, and return them by name."""
