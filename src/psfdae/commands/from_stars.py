@@ -144,8 +144,8 @@ def from_stars(
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
-    # The three options of the selection are settings of the configuration by shorter names.
     job = dict(locals())
+    # The three options of the selection are settings of the configuration by shorter names.
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
@@ -172,6 +172,7 @@ def from_stars(
         }
         run_for_images(from_stars, jobs, image[0])
     else:
+        # One image, or exposures that share a model; the same is stated of all.
         sources = ImageInput(image[0], **vars(options)).of_each(image)
         exposures = [model_name((path,), None) for path in image] if len(image) > 1 else []
         if exposures and method_name is None and "field" in settings.methods:
@@ -220,9 +221,11 @@ def compared_methods(
     """
     # Methods that need the field position on the grid of a simulation cannot use an image.
     names = [n for n in settings.methods if method(n).packing or not method(n).needs.position]
+    # A method that the user names replaces all others that are fitted.
     if method_name is not None:
         names = [n for n in names if method(n).storage is None and n != method_name]
         names.append(method(method_name).name)
+    # Some methods with a fit make no models: they are only compared.
     fitted = tuple(m for m in map(method, names) if m.storage is not None)
     candidates = [m for m in fitted if makes_models(m.name)]
     if not candidates:
@@ -263,6 +266,7 @@ def reserved_folder(
     """
     if files.name in files.exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
+    # No output may be an input, such as the star list of an earlier run.
     lists = [files.star_list(source.name) for source in sources if source.detect]
     inputs = [path for source in sources for path in source.files()]
     check_outputs([*files.paths(), *lists, page], inputs)
@@ -289,6 +293,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
+    # The lock is that of the folder itself, so that no file is left of it.
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
@@ -320,6 +325,7 @@ def write_model(
     # Choose bright stars without neighbours, and cut them out.
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
+    # What the stars are, and why others are not used: lists, and the product of all later steps.
     for image_stars in stars.images:
         if image_stars.observation.detections is not None:
             write_list(image_stars.observation, files.star_list(image_stars.name))
@@ -341,6 +347,7 @@ def write_model(
         model_method = method(best_name)
         for name, error in errors.items():
             print(f"{method(name).look.label}: MSE {error:.3g} on validation stars")
+    # The fit with all that predictions need: photometry, and errors from stars held out.
     print(f"packing {model_method.look.label}")
     model = pack_model(stars, fitted[model_method.name], files.name, licence)
     for fact in facts_of(fitted[model_method.name]):
@@ -351,6 +358,7 @@ def write_model(
     # means that everything is done.
     with ExitStack() as stack:
         model.save(stack.enter_context(atomic_path(files.bundle)))
+        # The field of each exposure, by its own stars.
         exposure_models = for_exposures(model, stars)
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]

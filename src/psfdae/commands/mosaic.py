@@ -46,6 +46,7 @@ def options_by_image(path: Path, options: ImageStatements) -> dict[str, ImageSta
     excluded = [f"--{name}" for name in one_image_options if getattr(options, name) is not None]
     if excluded:
         raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
+    # Pixels of a list are those of one image.
     if options.catalogue is not None:
         require_sky(options.catalogue, "--all-extensions")
     # An image is named by its number, since names of extensions may repeat.

@@ -92,7 +92,7 @@ def predict(
         }
         run_for_images(predict, jobs, stars)
         return ""
-    # Check all that can be checked without reading pixels.
+    # Check all that can be checked without reading pixels: inputs, outputs, and the model.
     source = ImageInput(
         stars, **vars(options), flux_column=flux_column, background_column=background_column
     )
@@ -101,6 +101,7 @@ def predict(
     check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
     loaded = load_model(bundle)
     observation = open_for_model(loaded, source)
+    # Options that only some images and models have.
     measures_centres = isinstance(loaded.method, MeasuresStars)
     if fixed_positions and not (measures_centres and observation.shape):
         raise PredictionError(
@@ -135,6 +136,7 @@ def predict(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{loaded.stamp_px} px; flux is the light in the stamp"
         )
+    # Stars are flagged, never dropped.
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
@@ -249,6 +251,7 @@ def write_prediction(
         ("INFILE", source.path.name, "stars"),
         ("PIXSCALE", scale, f"[arcsec] width of a pixel{assumed}"),
     ]
+    # What is not known has no card.
     if observation.catalogue is not None:
         cards.append(("CATALOG", observation.catalogue.name, "star list"))
     if observation.gain is not None:

@@ -99,6 +99,7 @@ def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[
 
 def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
     """Return the first finite number above 0 under one of the keys, in the order of the keys."""
+    # Its own header goes before that of the file; a truth value is no number.
     for key in keys:
         for header in image.headers:
             value = card_value(header, key)
@@ -137,6 +138,7 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
     per second, or of a calibrated brightness, the gain of the camera is not that of the pixels.
     """
+    # By the unit of the pixels, whose writing differs.
     unit = image.unit.lower().replace(" ", "")
     if unit in {"electron", "electrons", "e-", "e"}:
         return CameraValue(1.0, "BUNIT")
@@ -205,6 +207,7 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
         for start in range(0, image.shape[0], 8 * BLOCK_PX):
             band = pixels[start : start + 8 * BLOCK_PX]
+            # The largest value so far; a larger one starts the count anew.
             top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
             if top > largest:
                 largest, count, pairs = top, 0, 0
@@ -295,6 +298,7 @@ def gain_contradiction(
         return None
     photons = np.sqrt(max(sky.level, 0.0) / gain.value)
     electronics = read_noise.value / gain.value if read_noise.value else 0.0
+    # The larger of the two alone is a lower limit of the noise.
     least_sigma = max(photons, electronics)
     cause = f"{gain.origin} = {gain.value:g}"
     # A mean of two frames has 0.71 of the noise of one; resampling leaves about 0.8.
@@ -319,6 +323,7 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
             f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
             "coordinates, and the pixel scale is that of other keys"
         ]
+    # astropy applies a polynomial that the projection does not announce.
     distorted = image.wcs is not None and image.wcs.sip is not None
     if distorted and not projection.endswith("-SIP"):
         return [
