@@ -270,7 +270,7 @@ def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert not made.exists() and page.exists()
-    assert f"{page}: exists already" in refused(*words)
+    assert f"{page}: exists already" in refused("from-stars", *words)
     done = run(*words, "--overwrite")
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == training.bundle.read_bytes()
