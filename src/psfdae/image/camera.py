@@ -52,13 +52,6 @@ class CameraValue(NamedTuple):
     origin: str
 
 
-class CheckedCamera(NamedTuple):
-    """Camera values that fit the pixels, and a sentence on each that does not."""
-
-    values: dict[str, CameraValue]
-    remarks: list[str]
-
-
 @dataclass(frozen=True)
 class SkySample:
     """Sky of an image from squares spread over it, in the image's unit.
@@ -222,7 +215,9 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     return (largest, count) if clipped else None
 
 
-def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> CheckedCamera:
+def checked_camera(
+    image: ImageFile, camera: Mapping[str, CameraValue]
+) -> tuple[dict[str, CameraValue], list[str]]:
     """Leave out header values that the pixels contradict; those that are given stay, with a word.
 
     Parameters
@@ -232,6 +227,13 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     camera : mapping
         Values by the names of `HEADER_KEYS`.
 
+    Returns
+    -------
+    values : dict of str to CameraValue
+        Those that fit the pixels.
+    remarks : list of str
+        A sentence on each that does not.
+
     Raises
     ------
     ObservationError
@@ -239,15 +241,15 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     """
     sky, values = sky_sample(image), dict(camera)
     if sky is None:
-        return CheckedCamera(values, [])
+        return values, []
     values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
-        return CheckedCamera(values, remarks)
+        return values, remarks
     origin = camera["gain"].origin
     if origin == "given":
-        return CheckedCamera(values, [*remarks, f"{image.path}: {problem}: used as stated"])
+        return values, [*remarks, f"{image.path}: {problem}: used as stated"]
     values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
     remarks.append(
         f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
@@ -257,7 +259,7 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     level, origin = values["saturation"]
     if level is not None and origin != "given" and sky.highest <= 1.0 < level:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
-    return CheckedCamera(values, remarks)
+    return values, remarks
 
 
 def checked_saturation(
