@@ -26,7 +26,7 @@ from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import as_markdown, paper_table
+from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -192,4 +192,4 @@ def paper_tables(
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)
-        write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
+        write_text(path.with_suffix(".md"), paper_table_markdown(table, dataset, metric))
