@@ -55,7 +55,7 @@ Efficiency = Annotated[File, "CSV of the stage efficiency."]
 
 @command("figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
-    """Draw the static PSFs at their field positions."""
+    """Draw the static PSFs at their field positions, without the margin for centring errors."""
     product = read_product(templates, "templates", ("psf", "grid", "field"))
     psf = without_margin(product)
     title = (
@@ -211,7 +211,7 @@ def figure_curves(
     histories: Annotated[tuple[File, ...], {"argument": True}],
     out: Png,
 ) -> None:
-    """Draw training and validation error of networks."""
+    """Draw training and validation error of networks against the optimiser's steps."""
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
@@ -248,7 +248,7 @@ def without_margin(templates: Product) -> np.ndarray:
 
 @command("figure bounds")
 def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
-    """Draw the methods' errors above the bounds."""
+    """Draw the methods' errors above the bounds, against the noise level."""
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
     write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
 

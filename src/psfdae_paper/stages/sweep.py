@@ -80,7 +80,11 @@ def sweep_point(
     out: Annotated[Folder, "Folder for the point's files; its name is the point's."],
     overrides: Overrides = (),
 ) -> None:
-    """Train one point of a sweep and measure it."""
+    """Train one point of a sweep and measure it.
+
+    A point is named by the hash of all that decides its result, and found by the name of OUT; give
+    the overrides with which the sweep was planned. `psfdae sweep list NAME` prints the points.
+    """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
     if out.name not in plan.points:
