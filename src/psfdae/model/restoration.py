@@ -41,7 +41,7 @@ from psfdae.model.bundle import Bundle, ModelErrors, at_noise, brightest, mahala
 from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
 from psfdae.model.photometry import Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
-from psfdae.model.wings import Wings, outer_light
+from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
@@ -404,7 +404,7 @@ class Restorer:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
-        outer_part = outer_light(self.method.psf_at, place)
+        outer_part = outer_shares(self.method.psf_at, place)
         factor, factor_error = self.wings.total(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
