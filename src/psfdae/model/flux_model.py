@@ -4,8 +4,9 @@
 stamps, which may have bad pixels, and repairs these.
 
 Equation 8 of the paper divides a stamp by its own sum. On a noisy stamp, that sum is itself
-uncertain by κλ√P of the flux (P pixels), and one bad pixel ruins it. Here flux F and sky b come from
-one generalised least-squares fit (Aitken 1935, Proc. R. Soc. Edinb. 55, 42) of m and a constant,
+uncertain by κλ√P of the flux (P pixels), and one bad pixel ruins it. Here flux F and sky b come
+from one generalised least-squares fit (Aitken 1935, Proc. R. Soc. Edinb. 55, 42) of m and a
+constant,
 
     x ~ N(F m + b, S),   S = F²C + σ²I,
 
