@@ -83,12 +83,12 @@ def test_batoid_s_own_zernike_fit(tracer):
 
     state = np.array([0.7, -1.0, 0.4, 0.9])
     optic = misalign(tracer.optic, state * tracer.misalignment_range)
-    ours = tracer(state[None])[0]
+    zernikes = tracer(state[None])[0]
     for field in (0, 3, 6):
-        theirs = zernike(
+        expected = zernike(
             optic, *tracer.field_rad[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
         )
-        assert ours[field] == pytest.approx(theirs[4:], abs=2e-6)
+        assert zernikes[field] == pytest.approx(expected[4:], abs=2e-6)
 
 
 def test_weights_of_the_annulus_integrate_zernike_products():
