@@ -6,7 +6,6 @@ here knows MLflow's database.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
-from psfdae.files import ProductError, read_product
+from psfdae.files import ProductError, read_product, sha256_of
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
@@ -108,6 +107,7 @@ class Run:
     fit: tuple[type[Method], Path] | None = None
 
     def __post_init__(self) -> None:
+        # A run is read as a whole or not at all.
         for path in (*self.files.values(), self.last_file):
             if path is not None and not path.is_file():
                 raise ProductError(f"{path}: no such file")
@@ -133,6 +133,7 @@ class Run:
     @property
     def start_ms(self) -> int:
         """Time of the start in ms since 1970, from the end and the duration."""
+        # The history counts seconds from the start of the training.
         seconds = self.seconds
         if seconds is None:
             seconds = max((row["seconds"] for row in self.epochs), default=0.0)
@@ -162,6 +163,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
     runs = []
     for dataset, stars in datasets.items():
         folder = results / "evaluation" / dataset
+        # A table of errors for each split and reference.
         evaluations = sorted(folder.glob("*-*.csv"))
         if not evaluations:
             raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
@@ -199,10 +201,11 @@ def _run_of_fit(
     model = results / fits.place_of(kind, *key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
+    # The settings of the model are beside it, those of its stars in their product.
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
-    # Value and standard error at each noise level, then means over the levels.
+    # Value and standard error of each metric at each noise level λ, then means over the levels.
     table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
     rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
@@ -268,9 +271,10 @@ def runs_of_alignment(results: Path) -> list[Run]:
     runs = []
     for kind, weights in WEIGHTS.items():
         folder = results / "alignment" / kind
+        # As for datasets, the number of the start that succeeded is no setting.
         config = read_yaml(folder / CONFIG)
         config.pop("attempt", None)
-        # Errors of the state in units of the range.
+        # Errors of the state parameters in units of their range, by test set and noise level.
         rows = table[(table.method == kind) & (table.unit == "range")]
         if rows.empty:
             raise ProductError(f"{errors}: no rows of method {kind!r}")
@@ -319,7 +323,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
-    # A row of the summary for each point.
+    # A row of the summary for each point, and a run of its own.
     table = read_table(summary, "point", "status", dtype=str)
     points = [_run_of_point(results, name, point) for point in table.point]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
@@ -361,6 +365,7 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
         model_files = _model_files(method(model), fit_in(method(model), folder))
         with suppress(KeyError):
             data = results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
+    # A point that was stopped or failed lacks some of these.
     tables = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
     files = {file: folder / file for file in tables} | model_files
     history = folder / HISTORY
@@ -391,6 +396,7 @@ def settings_of(run: Run, preset: str) -> dict[str, str]:
     These are its method, those by which datasets differ, and those that are not the
     configuration's for this dataset and preset. The choice does not depend on other runs.
     """
+    # Always shown: what tells the paper's datasets from each other.
     dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
     defaults = {}
     # Stars that are none of the datasets, such as those of a user, have no defaults.
@@ -409,14 +415,8 @@ def flatten(tree: Mapping[str, Any]) -> dict[str, str]:
     return {key: v if isinstance(v, str) else json.dumps(v) for key, v in leaves(tree)}
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _epochs(history: Path) -> list[dict[str, float]]:
-    """Read the rows of a training history."""
+    """Read the rows of a training history, whose columns are all numbers."""
     rows = read_table(history, "epoch", "seconds", dtype=float).to_dict("records")
     return [{str(name): value for name, value in row.items()} for row in rows]
 

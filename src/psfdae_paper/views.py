@@ -59,6 +59,7 @@ def note(experiment: str, tags: set[str]) -> str:
 
     `tags` are the names of all tags of the experiment.
     """
+    # Addresses of MLflow's pages begin with # and are relative to its server.
     links = []
     for name in sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW)):
         # The workflow type hides pages that are for language models.

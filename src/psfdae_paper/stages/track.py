@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.errors import Error
-from psfdae.files import as_csv, as_yaml, write_text
+from psfdae.files import as_csv, as_yaml, sha256_of, write_text
 from psfdae.method import CONFIG
 from psfdae.options import File, Folder
 from psfdae.version import __version__
@@ -34,7 +34,6 @@ from psfdae_paper.tracking import (
     runs_of_datasets,
     runs_of_sweep,
     settings_of,
-    sha256_of,
 )
 from psfdae_paper.views import show
 
