@@ -1,7 +1,7 @@
 """Runs as MLflow shows them, read from the files in the results folder.
 
-The results folder goes in, and `Run` come out, which name files, settings and metrics. Nothing
-here knows MLflow's database.
+The results folder goes in, and each `TrackedRun` that comes out names its files, settings and
+metrics. Nothing here knows MLflow's database.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ MODEL = "model/"
 
 
 @dataclass(frozen=True)
-class Run:
+class TrackedRun:
     """Run of a method, a network or a sweep.
 
     Attributes
@@ -140,7 +140,7 @@ class Run:
         return self.end_ms - int(1000 * seconds)
 
 
-def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
+def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
     """Read the finished runs of datasets.
 
     An evaluation is the last file of a run, so that models still in training have none. A method
@@ -181,7 +181,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
 
 def _run_of_fit(
     results: Path, kind: type[Method], key: tuple[str, str, str], stars: Path, evaluation: Path
-) -> Run:
+) -> TrackedRun:
     """Read a fit to the stars of a dataset, and its evaluation.
 
     Its config is that of the model together with that of its stars: a network trained on
@@ -227,7 +227,7 @@ def _run_of_fit(
     storage = fits.storage_of(kind)
     history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
     run_kind = storage.run or kind.name
-    return Run(
+    return TrackedRun(
         kind=run_kind,
         dataset=dataset,
         split=split,
@@ -252,7 +252,7 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
 
-def runs_of_alignment(results: Path) -> list[Run]:
+def runs_of_alignment(results: Path) -> list[TrackedRun]:
     """Read the trained networks of scene 3.
 
     Raises
@@ -286,7 +286,7 @@ def runs_of_alignment(results: Path) -> list[Run]:
         # The set of states on which it was trained.
         states = "grid" if kind == "dae" else ALIGNERS[kind].states
         runs.append(
-            Run(
+            TrackedRun(
                 kind=kind,
                 dataset="alignment",
                 split="uniform and grid",
@@ -311,7 +311,7 @@ def _network_files(folder: Path, weights: str) -> dict[str, Path]:
     return model | {HISTORY: folder / HISTORY}
 
 
-def runs_of_sweep(results: Path, name: str) -> list[Run]:
+def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
     """Read a sweep and the points in its summary, the parent first.
 
     Raises
@@ -333,7 +333,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     metrics = {f"best_{key}": value for key, value in best_point.get("metrics", {}).items()}
     for status in ("finished", "stopped", "failed"):
         metrics[f"points_{status}"] = float((table.status == status).sum())
-    parent = Run(
+    parent = TrackedRun(
         kind="sweep",
         **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}",
@@ -349,7 +349,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     return [parent, *points]
 
 
-def _run_of_point(results: Path, name: str, point: str) -> Run:
+def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
     from psfdae_paper.sweeps.measured import fit_in, read_cost
 
@@ -371,7 +371,7 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
     history = folder / HISTORY
     # The run is named by the values of the point on the axes of the sweep.
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
-    return Run(
+    return TrackedRun(
         kind=model,
         **{key: result[key] for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}/points/{point}",
@@ -390,7 +390,7 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
     )
 
 
-def settings_of(run: Run, preset: str) -> dict[str, str]:
+def settings_of(run: TrackedRun, preset: str) -> dict[str, str]:
     """Return the settings that distinguish a run from others, by their dotted names.
 
     These are its method, those by which datasets differ, and those that are not the
@@ -438,6 +438,6 @@ def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[
     # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
     errors = [m for m in metrics if m.key == "validation_mse" and math.isfinite(m.value)]
     if errors:
-        best = min(errors, key=lambda m: m.value)
-        metrics.append(Metric("best_validation_mse", best.value, best.timestamp, best.step))
+        stored = min(errors, key=lambda m: m.value)
+        metrics.append(Metric("best_validation_mse", stored.value, stored.timestamp, stored.step))
     return metrics

@@ -132,7 +132,7 @@ def estimators(
             place = models.get(name)
             if place is None:
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
-            fits.require(method_class, place, stars, config, split, reference)
+            fits.require_fit(method_class, place, stars, config, split, reference)
             places[name] = place
     fitted: dict[str, Method] = {}
     for method_class in classes:

@@ -54,7 +54,7 @@ def fit(
             raise click.UsageError(
                 "--start: only fits to templates by a method with a warm start take it"
             )
-        fits.require(method_class, start, product, config, split, "realisation")
+        fits.require_fit(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
     described = fits.described_by(method_class, config.model_dump(), split, reference)
     fitted = method_class.fit(data, **method_class.settings(config))

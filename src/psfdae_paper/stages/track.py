@@ -28,7 +28,7 @@ from psfdae_paper.registry import choose_best, forget, link, log_model, register
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
-    Run,
+    TrackedRun,
     epoch_metrics,
     runs_of_alignment,
     runs_of_datasets,
@@ -82,12 +82,12 @@ def track(
     import_runs(runs, preset, database, out)
 
 
-def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
+def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt: Path) -> None:
     """Import runs, and write what was done with each.
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of TrackedRun
         A parent before its children.
     preset : str
         Goes into the tags.
@@ -157,13 +157,13 @@ def locked(database: Path) -> Iterator[None]:
 
 
 def _import(
-    runs: Sequence[Run], import_tags: dict[str, str], uri: str, database: Path
+    runs: Sequence[TrackedRun], import_tags: dict[str, str], uri: str, database: Path
 ) -> Iterator[tuple[str, str]]:
     """Import one run after the other; yield MLflow's id of each, and what was done.
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of TrackedRun
     import_tags : dict of str
         Tags that all runs of this import have.
     uri : str
@@ -239,7 +239,7 @@ def delete_live(client: MlflowClient, source: str) -> None:
 
 
 def import_run(
-    client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]
+    client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]
 ) -> tuple[str, str]:
     """Leave exactly one active run with the files and settings of a run.
 
@@ -248,7 +248,7 @@ def import_run(
     client : MlflowClient
     experiment : str
         Id of the experiment.
-    run : Run
+    run : TrackedRun
     tags : dict of str
         All tags of the run.
 
@@ -288,7 +288,7 @@ def import_run(
     return run_id, action
 
 
-def create_run(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]) -> str:
+def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]) -> str:
     """Create a run in MLflow with all that belongs to it, and return its id.
 
     These are its tags, data, model, metrics, parameters and files. The parameters are the settings
@@ -334,7 +334,7 @@ def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) ->
         client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
 
 
-def tags_of(run: Run) -> dict[str, str]:
+def tags_of(run: TrackedRun) -> dict[str, str]:
     """Return the tags of a run in MLflow, but for those of the whole import.
 
     A run with other settings that takes the place of this one sets `superseded` to "true".
