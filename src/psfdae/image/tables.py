@@ -94,6 +94,7 @@ def star_table(
     from astropy.table import QTable
     from astropy.units import Quantity, Unit
 
+    # Columns with units, as they are shown, and what they mean.
     table = QTable()
     for name, values in columns.items():
         unit, form, meaning = COLUMNS.get(name, ("", "", ""))
@@ -106,6 +107,7 @@ def star_table(
             table[name].info.format = form
     if of_list is None:
         return table
+    # Columns of the list behind them, under names of their own.
     for name in of_list.colnames:
         column_name, names = name, {column.lower() for column in table.colnames}
         while column_name.lower() in names:
@@ -129,13 +131,16 @@ def fits_values(column: Column) -> np.ndarray:
     Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
     that are missing are NaN, whole ones the least of their type.
     """
+    # Values without mask and unit, and which of them are missing.
     unmasked = getattr(column, "unmasked", column)
     values = np.ma.getdata(np.asarray(getattr(unmasked, "value", unmasked)))
     is_missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
+    # Characters of four bytes become one byte each.
     if values.dtype.kind in "US":
         width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
         texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
-        return np.array([ascii_bytes(text) for text in texts], dtype=f"S{width}")
+        encoded = [v if isinstance(v, bytes) else v.encode("ascii", "replace") for v in texts]
+        return np.array(encoded, dtype=f"S{width}")
     # FITS has 16, 32 and 64 bits of whole numbers with a sign, 32 and 64 of real ones.
     if values.dtype.kind == "u" or values.dtype == np.int8:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
@@ -153,16 +158,12 @@ def _missing(dtype: np.dtype) -> Any:
     return np.iinfo(dtype).min if dtype.kind == "i" else False
 
 
-def ascii_bytes(text: str | bytes) -> bytes:
-    """Return a text as FITS holds it, question marks in place of characters that it has not."""
-    return text if isinstance(text, bytes) else text.encode("ascii", "replace")
-
-
 def as_fits(table: QTable, name: str) -> BinTableHDU:
     """Return a table as an extension of a FITS file, with units, meanings and missing values."""
     from astropy.io import fits
     from astropy.table import Table
 
+    # A table of FITS's types; astropy keeps the formats in which columns are shown.
     plain = Table({column: fits_values(table[column]) for column in table.colnames})
     for column in table.colnames:
         if isinstance(form := table[column].info.format, str):
@@ -170,6 +171,7 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
     with silent():
         hdu = fits.table_to_hdu(plain)
     hdu.name = name
+    # Unit, value that stands for a missing one, and meaning of each column.
     for number, column in enumerate(table.colnames, start=1):
         info = table[column].info
         if info.unit is not None and str(info.unit):
@@ -210,6 +212,7 @@ def write_table(path: Path, table: QTable) -> None:
         else:
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
+            # Formats are those of the columns; numbers that are missing are written as such.
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
                     plain[column.name] = column.filled(np.nan)

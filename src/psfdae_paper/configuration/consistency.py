@@ -34,7 +34,7 @@ class Consistent(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _derive(cls, tree: object) -> object:
+    def derive_values(cls, tree: object) -> object:
         """Fill in derived values before the groups are checked."""
         if not isinstance(tree, Mapping):
             return tree
@@ -42,7 +42,7 @@ class Consistent(Group):
         return with_derived_values(tree)
 
     @model_validator(mode="after")
-    def _check_jitter(self) -> Consistent:
+    def check_jitter(self) -> Consistent:
         """Refuse a jitter of aberrations for stars that have no random aberrations."""
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
@@ -57,9 +57,10 @@ class Consistent(Group):
         return self
 
     @model_validator(mode="after")
-    def _check_scene_groups(self) -> Consistent:
+    def check_scene_groups(self) -> Consistent:
         """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
+        # Groups that a stage does not read are absent, and are not checked.
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
             if prescription is not None and prescription.secondary is None:
                 raise ValueError("prescription: secondary: missing, it is what is misaligned")
@@ -111,6 +112,7 @@ def _check_scene(tree: Mapping[str, Any]) -> None:
 
     The aberrations are settings of the scene or of the telescope: exactly one of them has some.
     """
+    # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
     scene, telescope = tree.get("scene"), tree.get("telescope")
     if scene is None and "alignment" in tree:
         scene = {"name": "alignment"}

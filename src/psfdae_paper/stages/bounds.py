@@ -1,5 +1,8 @@
 """Stages `bank`, `bounds`, `optics`, `efficiency`, `paper-rows`: bounds of the error of estimates.
 
+In go simulated stars and the errors of methods; out come the least errors that any method can have
+on them, and tables that set the errors of all methods beside these.
+
 They simulate stars, bound the error of any estimate of the test stars, and compare the errors of
 methods with these bounds.
 """
@@ -45,8 +48,13 @@ def bank(
     config: Config,
     out: Annotated[File, "HDF5 product with fresh stars, framed so that they can be mirrored."],
 ) -> None:
-    """Simulate the bank of fresh stars behind the posterior mean."""
+    """Simulate the bank of fresh stars behind the posterior mean.
+
+    They are other draws of the simulator that made the test stars, with a margin, so that one
+    propagated star stands for all eight of its mirror images and rotations.
+    """
     limit_threads(1)  # batches run in parallel
+    # Two draws of the simulator, one after the other: the second has its own random streams.
     parts = [
         fresh_stars(config, name, count, config.bounds.threads)
         for name, count in (
@@ -74,7 +82,12 @@ def bounds(
         File | None, "Product of the stage bank; needed where stars have random aberrations."
     ] = None,
 ) -> None:
-    """Bound the error that any estimator can reach on the test stars."""
+    """Bound the error that any estimator can reach on the test stars.
+
+    The posterior mean over the simulator's stars has the least mean squared error; its tables say
+    where the bank suffices for it. The local floor is the error if field and centring are known.
+    """
+    # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
     framed = read_product(templates, "templates", ("psf",))
@@ -82,6 +95,7 @@ def bounds(
     require(templates, framed.config, STATIC, config)
     static = jittered_templates(framed["psf"], config.framing.jitter_px)
     bound = tables.Tables(dataset, bounded_stars(config, product))
+    # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
         tables.add_exact(config, static, bound)
     elif bank is None:
@@ -116,7 +130,10 @@ def optics(
     per_star: Annotated[File, "Parquet with every star."],
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure the methods that are given the telescope, on the test stars that are bounded."""
+    """Measure the methods that are given the telescope, on the test stars that are bounded.
+
+    They estimate the wavefront of each star; one of them is given its position, too.
+    """
     limit_threads(1)
     product = read_product(stars, "stars")
     require(stars, product.config, STARS, config)
@@ -124,6 +141,7 @@ def optics(
     require(bank, bank_product.config, STARS, product.config, stars)
     bounded = bounded_stars(config, product)
     position = field_positions(product)[bounded.star]
+    # Without, then with the position of the star in the field.
     summary, stars_table = [], []
     for name in ("wavefront", "wavefront_position"):
         method_class = cast("type[Wavefront]", method(name))
@@ -152,7 +170,7 @@ def optics(
 def collect_bounds(
     out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
 ) -> None:
-    """Join the tables of several datasets' bounds."""
+    """Join the tables of several datasets' bounds; all must have the columns of the first."""
     write_csv(out, read_tables(parts))
 
 

@@ -1,4 +1,8 @@
-"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars."""
+"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars.
+
+In go the product "stars" and the fitted methods; out come the errors of every star (Parquet) and
+their means with standard errors (CSV). The other stages make tables of these errors.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import as_markdown, paper_table
+from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -67,7 +71,12 @@ def evaluate(
     per_star: Annotated[File, "Parquet with every star."],
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure every method on the test stars at each noise level."""
+    """Measure every method on the test stars at each noise level.
+
+    Metrics are the MSE per pixel and the SSIM against the reference. All methods restore the same
+    noisy images; standard errors are clustered by field, whose stars have a PSF in common.
+    """
+    # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), split, reference)
@@ -134,6 +143,7 @@ def estimators(
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
             fits.require_fit(method_class, place, stars, config, split, reference)
             places[name] = place
+    # Methods without a file are fitted here.
     fitted: dict[str, Method] = {}
     for method_class in classes:
         if method_class.storage:
@@ -151,7 +161,10 @@ Metric = Literal["mse", "ssim"]
 
 @command("collect")
 def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
-    """Join evaluations into one tidy table, with the scatter of each method between seeds."""
+    """Join evaluations into one tidy table, with the scatter of each method between seeds.
+
+    The scatter, where it was measured, is that of a repeated fit with other random numbers.
+    """
     table = comparison.with_seed_stderr(
         read_tables(evaluations, COLUMNS), comparison.seed_scatter()
     )
@@ -180,9 +193,13 @@ def paper_tables(
         tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
     ],
 ) -> None:
-    """Write the paper's tables, with measured errors beside the published ones."""
+    """Write the paper's tables, with measured errors beside the published ones.
+
+    Rows are methods, columns noise levels; measured errors are given for each reference.
+    """
+    # Each table as CSV, and beside it as Markdown.
     measured = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)
-        write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
+        write_text(path.with_suffix(".md"), paper_table_markdown(table, dataset, metric))
