@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 from contextlib import contextmanager
 
 import pytest
@@ -23,7 +24,7 @@ from psfdae_paper.alignment.telescope import (
     grid_states,
 )
 from psfdae_paper.configuration.alignment import CHOICE
-from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.compose import clear_caches, config_dir, load
 from workflow_runs import PATH, snakemake
 
 
@@ -160,6 +161,16 @@ def network(shipped):
 def field_psfs(tmp_path_factory):
     """384 noise-free stars of the shipped model's scene, 16 × 16, flux 1."""
     return fresh_psfs(tmp_path_factory.mktemp("field"), 384)
+
+
+@pytest.fixture
+def config_folder(tmp_path, monkeypatch):
+    """A copy of the configuration that commands take instead, and that a test may change."""
+    shutil.copytree(config_dir(), tmp_path / "config")
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
+    clear_caches()
+    yield tmp_path / "config"
+    clear_caches()
 
 
 @pytest.fixture(scope="session")
