@@ -119,17 +119,27 @@ def fit_stars(
     return fit.result(len(place), fit.design(), prior, moving, middle, range_px)
 
 
+def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
+    """Return the pairs of stars that are nearer to each other than a distance, (k, 2), by number.
+
+    Stars of which no place (n, 2) is known are in no pair.
+    """
+    from scipy.spatial import cKDTree
+
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    pairs = cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")
+    return np.asarray(located[pairs])
+
+
 def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
-    """Numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
+    """Return the numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
 
     A star of which no place (n, 2) is known is a chain of its own.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
 
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
-    pairs = located[cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")]
+    pairs = pairs_within(place, distance_px)
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])
 
