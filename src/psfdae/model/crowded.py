@@ -96,6 +96,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
+    # The image with its sky; saturated pixels are not fitted.
     sky = observation.sky()
     image, bad = sky.flat + sky.level, sky.bad
     if observation.saturate is not None:
@@ -113,6 +114,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
+        # Sky and light beyond the stamps, from the image without the light of stars.
         outer_parts = outer_shares(model.on_pixels, place)
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, place, flux, outer_parts, side, wings
@@ -132,6 +134,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             if real.all() or turn == 2:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
+    # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
     result = _described(model, fit, 2.4 * fwhm, sky.flat, fit.light + wing_light, wings_used)
     stars = result.stars
@@ -214,6 +217,7 @@ def _with_hidden(
         residual_stars = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
     if not len(residual_stars["id"]):
         return place, flux
+    # X_IMAGE counts from 1. Those at a star that was fitted are its residuals.
     candidates = np.stack([residual_stars["X_IMAGE"], residual_stars["Y_IMAGE"]], axis=1) - 1.0
     located = place[np.isfinite(place).all(axis=1)]
     is_alone = cKDTree(located).query(candidates)[0] > SAME_FWHM * fwhm
@@ -262,6 +266,7 @@ def _described(
         total, _ = wings.total(outer_shares(model.on_pixels, fit.place))
     stars["flux"], stars["flux_error"] = total * fit.flux, total * excess * fit.flux_error
     stars["flux_model"] = fit.flux
+    # Chains of neighbours, numbered from 1.
     group = chains(fit.place, group_px)
     stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
     stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags

@@ -75,6 +75,7 @@ def measure_gain(
     PredictionError
         If the model knows no PSF of a place.
     """
+    # Stars alone in a box of about 1.6 FWHM, and without a neighbour within 3 FWHM.
     fwhm = model.fwhm_px()
     half = min(int(np.ceil(0.8 * fwhm)), model.stamp_px // 2 - 1)
     axis = np.arange(-half, half + 1)
@@ -86,6 +87,7 @@ def measure_gain(
     if len(place) < 10:
         return None
     pixels = row[:, None, None] + axis[:, None], column[:, None, None] + axis
+    # Pixels (n, P) in units of a typical σ of the sky.
     data, sigma = (image[pixels].reshape(len(place), -1) for image in (flat, noise))
     unit = float(np.median(sigma))
     data, sigma = data / unit, sigma / unit
@@ -117,6 +119,7 @@ def measure_gain(
         move = np.clip(fitted[:, 1:3] / np.maximum(fitted[:, :1], 1e-12), -0.2, 0.2)
         middle = np.stack([column, row], axis=1)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
+    # g = 1 / (photons · unit), and σ_g = g σ_photons / photons.
     if not photons > 5.0 * error:
         return None
     return 1.0 / (photons * unit), error / (photons**2 * unit)
@@ -135,6 +138,7 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     is_alone = np.zeros(len(place), dtype=bool)
     if len(located) < 2:
         return is_alone
+    # The nearest star of the list but the star itself.
     distance = cKDTree(place[located]).query(place[located], k=2)[0][:, 1]
     # Beyond its edges, an image has only bad pixels.
     masked = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
@@ -155,6 +159,7 @@ def _slopes_of_variance(
     """
     from scipy.optimize import nnls
 
+    # Bins of pixels in the order of L/σ²; pixels where it is below 0.02 show no photon noise.
     light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
     scaled = light / sigma**2
     order = np.argsort(scaled, kind="stable")
@@ -177,6 +182,7 @@ def _slopes_of_variance(
             strict=True,
         )
     )
+    # Weighted least squares; weights follow from the variances that the last fit expects.
     expected = np.maximum(variance, 1.0)
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected)
