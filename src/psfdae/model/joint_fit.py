@@ -177,7 +177,7 @@ class _Fit:
         self.stars, self._middle, self.pixels = (
             values[fitted] for values in (self.stars, self._middle, pixels)
         )
-        # Pixels of the boxes, which decide on a star, and of its whole stamp. The rows of the design
+        # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
         # are the pixels of all boxes.
         self.boxes, self._stamps = map(self._pixel_numbers, (box_px, side))
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
