@@ -1,4 +1,8 @@
-"""`BrightStars`: stars of an image that are bright enough to learn the PSF from."""
+"""`BrightStars`: stars of an image that are bright enough to learn the PSF from.
+
+In: stamps and measurements of stars (`image.selection`), or a product "stars". Out: the same stars
+aligned, framed, or as places on which the PSF may depend.
+"""
 
 from __future__ import annotations
 
@@ -77,15 +81,17 @@ class BrightStars:
         """Read the bright stars of a product "stars" of an image, which has no centroids."""
         names = ("peak", "position", "snr", "row", "listed", "flux", "colour", "bad")
         arrays = {name: stars[name] for name in names}
-        flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
         # The product has stamps and noise of stars of flux 1.
-        stamps, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
-        return cls(**arrays, centre=centre, wide=stamps, noise=noise)
+        flux = arrays["flux"]
+        arrays["wide"], arrays["noise"] = stars["wide"] * flux[:, None, None], stars["noise"] * flux
+        return cls(**arrays, centre=np.full(arrays["position"].shape, np.nan))
 
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
         """Return several sets with the same margin as one."""
-        return cls(*(np.concatenate([getattr(s, f.name) for s in several]) for f in fields(cls)))
+        return cls(
+            *(np.concatenate([getattr(stars, f.name) for stars in several]) for f in fields(cls))
+        )
 
     def __len__(self) -> int:
         return len(self.wide)
@@ -124,8 +130,8 @@ class BrightStars:
 
         The second array is True for pixels that were measured. Pixels outside of `wide` are 0.
         """
-        # Rows and columns of each frame in stamps with a margin as wide as a frame, NaN in the
-        # images and False among the bad pixels.
+        # Rows and columns of each frame in stamps with a margin as wide as a frame, in which images
+        # are NaN and no pixel is bad.
         margin = ((0, 0), (side, side), (side, side))
         start = side + self.wide.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))

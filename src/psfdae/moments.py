@@ -1,5 +1,7 @@
 """Robust scatter, centroids, shifts by parts of a pixel, and sizes and shapes of PSFs.
 
+In: stamps of stars, (n, s, s). Out: one value for each star, or shifted stamps.
+
 Sizes and shapes are the moments of a PSF under an elliptical Gaussian weight that is matched to
 them (Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the
 ellipse of the Gaussian that fits the PSF best. Unlike plain second moments they do
@@ -53,6 +55,7 @@ def shift_stamps(
 
     # A margin of 12 px, beyond which an edge has no influence on a spline inside.
     side, margin = stamps.shape[-1], 12
+    # Each stamp has one set of splines, however often it is shifted.
     stamp = np.arange(len(stamps)) if stamp is None else stamp
     used, stamp = np.unique(stamp, return_inverse=True)
     # Coefficients of the splines through the pixels of each stamp.
@@ -96,6 +99,7 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
     first = np.floor(knot_place)
     t = knot_place - first
     if slope:
+        # Their derivatives by the place.
         parts = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
         values = np.stack(parts, axis=-1) / spacing
     else:
@@ -113,6 +117,7 @@ def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
     """Return matrices (n, s, s) that shift the pixels of an axis by n steps; 0 beyond its ends."""
     from scipy import ndimage
 
+    # Each pixel alone, shifted: a column of the matrix.
     impulses = np.eye(side)
     return np.array([ndimage.shift(impulses, (s, 0.0), order=SPLINE_ORDER) for s in steps])
 
@@ -140,12 +145,14 @@ def windowed_centres(
     ndarray, shape (n, 2)
         (row, column) from index (s//2, s//2).
     """
+    # A Gaussian window is the product of one along rows and one along columns.
     axis = np.arange(stamps.shape[-1]) - stamps.shape[-1] // 2
     centre = start.astype(np.float64)
     for _ in range(rounds):
         rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
         along = [np.exp(-0.5 * (a / window_px[:, None]) ** 2) for a in (rows, columns)]
         light = along[0][:, :, None] * along[1][:, None, :] * stamps
+        # First moments of the light under the window.
         total = light.sum(axis=(1, 2))
         moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
         # A window as wide as the star halves the distance of the centroid, hence the 2.
@@ -198,6 +205,7 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     lit = np.isfinite(peak) & (peak > 0)
     light /= np.where(lit, peak, 1.0)[:, None]
     light[~lit] = 1.0
+    # Unweighted moments to start with.
     terms = _monomials(side)
     x, y, moments = _centre_and_moments(light @ terms.T)
     moments = _bounded(*moments, side)

@@ -1,5 +1,8 @@
 """Photon noise of a star on a bright sky.
 
+In: noise-free PSFs of sum 1, (n, d, d), and noise levels. Out: variances and noisy images of
+pixels; for bright stars, the noise in the scatter of their images.
+
 The paper's noise level λ is the RMS of a flux-normalised image's pixels up to
 a factor, σ = κλ, and larger for smaller stars. A star of flux F photons on a
 sky of B photons per pixel gives exactly that,
@@ -38,10 +41,8 @@ class NoiseModel:
 
     def flux(self, level: np.ndarray | float) -> np.ndarray:
         """Return the flux F in photons inside the stamp of a star of noise level λ."""
-        photons: np.ndarray = np.sqrt(self.background) / (
-            self.kappa * np.asarray(level, np.float64)
-        )
-        return photons
+        noise = self.kappa * np.asarray(level, np.float64)
+        return np.asarray(np.sqrt(self.background) / noise)
 
     def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
         """Return the pixel variance of a normalised image; `level` broadcasts against `psf`."""
@@ -61,6 +62,7 @@ class NoiseModel:
         -------
         ndarray, shape (B, ...), float32
         """
+        # n ~ Poisson(F p + B), and the image (n − B)/F.
         flux = _per_image(self.flux(level), psf)
         # A pixel of a measured star may lie so far below the sky that no rate of photons is left.
         photons = rng.poisson(np.maximum(flux * psf + self.background, 0.0))
@@ -74,8 +76,8 @@ class NoiseModel:
         With 1e4 photons of sky in a pixel the two distributions differ by 1 % in skewness,
         and the draw takes a tenth of the time.
         """
-        sigma: np.ndarray = np.sqrt(self.variance(psf, _per_image(level, psf)))
-        noisy = sigma.astype(np.float32)
+        # p + σ z, in place and in single precision: training draws millions of pixels.
+        noisy = np.sqrt(self.variance(psf, _per_image(level, psf))).astype(np.float32)
         noisy *= rng.standard_normal(psf.shape, dtype=np.float32)
         noisy += psf
         return noisy
