@@ -323,6 +323,16 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     return settings
 
 
+def typed_words(options: Any) -> list[str]:
+    """Return the fields of a dataclass that differ from their defaults, as options are typed."""
+    words = []
+    for name, hint, default in _parameters(type(options)):
+        if (value := getattr(options, name)) != default:
+            flag = _option(name, hint, default).opts[0]
+            words += [flag] if value is True else [flag, str(value)]
+    return words
+
+
 def program(*functions: Callable[..., Any]) -> None:
     """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
     Careful(commands=[as_click(function) for function in functions])()

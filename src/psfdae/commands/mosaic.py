@@ -19,18 +19,18 @@ from psfdae.cli import refusal
 from psfdae.errors import Error
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.image.observation import require_sky
+from psfdae.image.positions import require_sky
 from psfdae.threads import available_cores
 
 if TYPE_CHECKING:
-    from psfdae.commands.predict import ImageOptions
+    from psfdae.image.image_input import ImageStatements
 
 
 class MosaicError(Error, RuntimeError):
     """Failure for some images of a file; the others are done."""
 
 
-def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOptions]:
+def options_by_image(path: Path, options: ImageStatements) -> dict[str, ImageStatements]:
     """Return the options of each image of a file by the image's name (`science_images`).
 
     A star list is that of all images: each image takes the stars that are on it.
@@ -48,7 +48,7 @@ def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOption
         raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
     if options.catalogue is not None:
         require_sky(options.catalogue, "--all-extensions")
-    one_image = replace(options, all_extensions=False, on_image=options.catalogue is not None)
+    one_image = replace(options, on_image=options.catalogue is not None)
     return {name: replace(one_image, extension=n) for name, n in science_images(path).items()}
 
 
