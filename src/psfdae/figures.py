@@ -184,6 +184,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     # Stamps fill 97 % of their cells.
     middle = margin_left + step * (np.arange(len(columns)) + 0.5 * 0.97)
     y = height - top
+    # From top to bottom: headings, and each row with its errors below.
     peak = rows[0].images.max(axis=(1, 2))
     for x, name in zip(middle, columns, strict=True):
         axes.text(x, y + 0.02, name, ha="center", va="bottom", fontsize=8)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return the mean squared error of every stamp, shape (n,)."""
+    # ⟨(x̂ − x)²⟩, in double precision: errors of 1e-8 are squared.
     difference = estimates.astype(np.float64) - references
     return np.asarray((difference**2).mean(axis=(1, 2)))
 
@@ -102,6 +103,7 @@ def all_metrics(
         `mse`; `ssim` with the calibrated range, `ssim_unit` with range 1 and
         `ssim_peak` with each reference's own maximum minus minimum.
     """
+    # Three dynamic ranges share the moving sums.
     peak = references.max(axis=(1, 2)) - references.min(axis=(1, 2))
     similar = ssim(estimates, references, data_range, 1.0, peak)
     names = ("ssim", "ssim_unit", "ssim_peak")
@@ -133,6 +135,7 @@ def summarised(
 
     Each is added to a copy of `row`.
     """
+    # A row for each metric.
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)

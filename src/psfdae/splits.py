@@ -81,7 +81,7 @@ def held_out_split(
     # Fields of the test, and the other ones in random order.
     test_field = held_out_fields(grid)
     training_field = stream(seed, "split", "held_out").permutation(np.flatnonzero(~test_field))
-    # At least one field is left for validation.
+    # At least one field is left for validation; whole fields go to each part.
     validation_count = max(1, round(validation_fraction * training_field.size))
     is_test = test_field[star_field]
     is_validation = np.isin(star_field, training_field[:validation_count])

@@ -80,10 +80,12 @@ class Catalogue:
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
+        # Numbers; masked ones are missing.
         if column.dtype.kind in "iuf":
             return np.ma.filled(np.ma.array(column).astype(np.float64), np.nan)
         if column.dtype.kind not in "SUO":
             raise ObservationError(self.path, f"column {name!r} does not hold numbers")
+        # Numbers written as text, as when one row has a word.
         numbers = np.full(len(column), np.nan)
         for row, text in enumerate(_texts(column)):
             try:
@@ -108,6 +110,7 @@ class Catalogue:
         """Return a column of pixel positions, as `coordinates`; units but pixels are refused."""
         from astropy import units
 
+        # No unit is as good as pixels.
         unit = getattr(self._column(name), "unit", None)
         pixel_unit = units.Unit(unit or "", parse_strict="silent")
         # A unit that astropy does not know may be a word for pixels.
@@ -137,6 +140,7 @@ class Catalogue:
         sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
         off the sphere are NaN, and an error if all are.
         """
+        # Angles beyond a pole are no place on the sky.
         ra = self._angles(positions.first, "hourangle")
         dec = self._angles(positions.second, "deg")
         on_sphere = np.abs(dec) <= 90
@@ -153,6 +157,7 @@ class Catalogue:
         from astropy import units
         from astropy.coordinates import Angle
 
+        # Sexagesimal text.
         column = self._column(name)
         is_text = column.dtype.kind in "SUO"
         texts = _texts(column) if is_text and column.ndim == 1 else []
@@ -168,6 +173,7 @@ class Catalogue:
             with reading(self.path):
                 angles[rows] = Angle([texts[row] for row in rows], unit=sexagesimal_unit).deg
             return angles
+        # Numbers, in degrees unless the column has a unit.
         numbers = self.coordinates(name)
         unit = getattr(column, "unit", None)
         if unit is None or is_text:
@@ -195,6 +201,7 @@ class Catalogue:
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
+        # Whole numbers stay numbers, also if they are written as 12.0; all else is text.
         column = self._column(name)
         values = np.ma.getdata(column)
         if values.dtype.kind in "iuf" and not np.ma.getmaskarray(column).any():
@@ -208,6 +215,7 @@ class Catalogue:
 
     def _identifier(self) -> str | None:
         """Return the name of the column that identifies the stars; None without one."""
+        # The first that the list has; of two that differ by their case only, none.
         names = ("id", "source_id", "number", "star_id", "objid", "obj_id")
         for alias in (*names, "object_id", "label", "name"):
             try:
@@ -301,6 +309,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
         return star_list
     if isinstance(star_list, str | Path):
         return read_catalogue(Path(star_list))
+    # What is no table becomes columns of one.
     path = Path("catalogue")
     with reading(path):
         if isinstance(star_list, SkyCoord):
@@ -341,6 +350,7 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
 
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
+    # A table may have SkyCoord in place of two columns of numbers.
     sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     if len(sky) == 1:
         # In degrees of the ICRS, NaN where a coordinate is masked.

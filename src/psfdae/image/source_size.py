@@ -71,7 +71,7 @@ class SourceSize:
 
 
 def measure_size(
-    flat: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, most: int = 60
+    flat: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, stars_max: int = 60
 ) -> SourceSize | None:
     """Measure the size of the stars of an image.
 
@@ -85,7 +85,7 @@ def measure_size(
         (x, y) of stars, of which the brightest count; NaN where unknown.
     reach_px : int
         Radius of the windows in which stars are measured.
-    most : int
+    stars_max : int
         Number of stars that are measured.
 
     Returns
@@ -102,7 +102,7 @@ def measure_size(
         return None
     clean = np.where(bad, 0.0, flat)
     light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(place.T)]
-    brightest = place[np.argsort(-light, kind="stable")[:most]]
+    brightest = place[np.argsort(-light, kind="stable")[:stars_max]]
     # Windows (n, s, s) about them; pixels off the image were not measured.
     rows, columns = (brightest[:, i, None] + np.arange(2 * reach_px + 1) for i in (0, 1))
     pixels = rows[:, :, None], columns[:, None, :]
@@ -111,17 +111,19 @@ def measure_size(
     # The centre under a window as wide as the star, of which the first profile knows the width.
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):
-        size = _size_of(windows, measured, centre)
+        size = size_of_windows(windows, measured, centre)
         if size is None:
             return None
         # A ring has no light in its middle: a window narrower than its radius would leave it.
         sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
         visible = np.where(measured, windows, 0.0)
         centre = windowed_centres(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
-    return _size_of(windows, measured, centre)
+    return size_of_windows(windows, measured, centre)
 
 
-def _size_of(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> SourceSize | None:
+def size_of_windows(
+    windows: np.ndarray, measured: np.ndarray, centre: np.ndarray
+) -> SourceSize | None:
     """Return the size by the median profile of stars; None if they have no light.
 
     Parameters
@@ -171,16 +173,18 @@ def _size_of(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> S
         return None
     # Light beyond the end, if the profile p falls on by the power law of its outer half:
     # ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k at least 4; a tenth at most.
-    outer_light, middle = 0.0, 0.5 * (edges[:end] + edges[1 : end + 1])
-    outer = (middle > 0.5 * end_px) & (profile > 0)
-    if np.count_nonzero(outer) >= 3:
-        slope, height = np.polyfit(np.log(middle[outer] / end_px), np.log(profile[outer]), 1)
-        outer_light = float(2.0 * np.pi * np.exp(height) * end_px**2 / (max(-slope, 4.0) - 2.0))
+    light_beyond, middle = 0.0, 0.5 * (edges[:end] + edges[1 : end + 1])
+    is_outer = (middle > 0.5 * end_px) & (profile > 0)
+    if np.count_nonzero(is_outer) >= 3:
+        slope, height = np.polyfit(np.log(middle[is_outer] / end_px), np.log(profile[is_outer]), 1)
+        light_beyond = float(2.0 * np.pi * np.exp(height) * end_px**2 / (max(-slope, 4.0) - 2.0))
     radius = np.append(edges[1 : end + 1], 2.0 * end_px)
-    light = np.append(light, light[-1] + min(outer_light, 0.1 * light[-1]))
+    light = np.append(light, light[-1] + min(light_beyond, 0.1 * light[-1]))
     # The inner 49 × 49 px of the median star say how fine its structure is.
-    core = slice(reach_px - 24, reach_px + 25)
-    stamp = np.median(windows[usable][:, core, core] / flux[usable][:, None, None], axis=0)
+    middle_px = slice(reach_px - 24, reach_px + 25)
+    stamp = np.median(
+        windows[usable][:, middle_px, middle_px] / flux[usable][:, None, None], axis=0
+    )
     rows, columns = np.gradient(stamp)
     gradient = float(np.square(rows).sum() + np.square(columns).sum())
     sharpness = float(np.sqrt(np.square(stamp).sum() / gradient)) if gradient > 0 else 1.0

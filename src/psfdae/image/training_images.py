@@ -172,13 +172,13 @@ def make_images(
     reach = int(np.abs(stars.peak).max()) + 1
     # 512 images at a time, which bounds the memory.
     for rows in (slice(start, start + 512) for start in range(0, star.size, 512)):
-        star_rows, stamps = star[rows], stars.wide[star[rows]]
+        star_rows, stamps = star[rows], stars.stamps[star[rows]]
         # Move the star by its phase. Splines ring beside what is left of a saturated
         # neighbour.
         is_moved = subpixel[rows]
         floor = -DEFECT * stars.noise[star_rows[is_moved], None, None]
         stamps[is_moved] = np.maximum(
-            shift_stamps(stars.wide, phase[rows][is_moved], star_rows[is_moved]), floor
+            shift_stamps(stars.stamps, phase[rows][is_moved], star_rows[is_moved]), floor
         )
         # The brightest pixel goes to the middle, off by the jitter; the template likewise.
         offset = brightest_pixels(stamps, reach, centring_px)[0] - jitter[rows]
@@ -212,7 +212,7 @@ def training_columns(
         bright, template, star, framing, subpixel, rng, centring_px
     )
     # The bright stars themselves, of flux 1.
-    wide = (bright.wide / bright.flux[:, None, None]).astype(np.float32)
+    bright_stamps = (bright.stamps / bright.flux[:, None, None]).astype(np.float32)
     return {
         "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
         "realisation": Column(images, "1", "the star itself, sum 1"),
@@ -226,7 +226,7 @@ def training_columns(
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
         "row": Column(bright.row, "1", "row of every star in the catalogue"),
-        "wide": Column(wide, "1", "the bright stars with a margin, of flux 1"),
+        "wide": Column(bright_stamps, "1", "the bright stars with a margin, of flux 1"),
         "peak": Column(bright.peak, "pixel", "brightest pixel (row, column) from the middle's"),
         "listed": Column(bright.listed, "pixel", "centre by the catalogue, likewise"),
         "bad": Column(bright.bad, "1", "pixels of `wide` that were not measured"),
