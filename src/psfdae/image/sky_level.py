@@ -160,7 +160,7 @@ def noise_correlation(deviation: np.ndarray) -> float:
     lags = [
         (0, 1),
         (0, 2),
-        *((rows_apart, columns_apart) for rows_apart in (1, 2) for right in range(-2, 3)),
+        *((rows_apart, columns_apart) for rows_apart in (1, 2) for columns_apart in range(-2, 3)),
     ]
     excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
@@ -241,7 +241,7 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
 
     pairs = [
         0.5 * (shifted(rows_apart, columns_apart) + shifted(-rows_apart, -columns_apart))
-        for rows_apart, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+        for rows_apart, columns_apart in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
