@@ -142,6 +142,7 @@ class BrightStars:
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
         frame = np.arange(len(self))[:, None, None], rows[:, :, None], columns[:, None, :]
         images = np.pad(self.stamps, margin, constant_values=np.nan)[frame]
+        # Pixels outside of the stamps were not measured.
         is_inside = np.isfinite(images)
         bad = np.pad(self.bad, margin)[frame]
         return np.where(is_inside, images, 0.0).astype(np.float64), is_inside & ~bad

@@ -66,6 +66,7 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    # A canvas of its own draws it without a screen.
     figure = Figure(figsize=(WIDTH_IN, height_in), **kwargs)
     FigureCanvasAgg(figure)
     return figure
@@ -177,8 +178,10 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     longest = max(len(line) for row in rows for line in row.lines)
     margin_left, margin_right = max(1.0, 0.07 * longest), 0.1
     top, bottom, cell, text = 0.85, 0.35, 0.86, 0.17
+    # Numbers stand below the rows that have errors.
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
+    # Cells of equal width from the labels to the right margin.
     axes = in_inches(figure)
     step = (WIDTH_IN - margin_left - margin_right) / len(columns)
     # Stamps fill 97 % of their cells.
@@ -191,6 +194,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     for row in rows:
         y -= cell
         draw_row(axes, row, (margin_left, y), (step, cell), peak)
+        # Three digits of the MSE in units of 1e-6.
         if row.mse is not None:
             for x, error in zip(middle, row.mse, strict=True):
                 number = f"{1e6 * error:#.3g}".rstrip(".")
@@ -241,6 +245,7 @@ def draw_row(
     side = min(width, height)
     lower = corner[1] + 0.5 * (height - side)
     for column, image in enumerate(row.images):
+        # From 0 to the brightest pixel; a square root shows faint wings, too.
         scale = image.max() if row.own_scale else peak[column]
         x = corner[0] + column * cell[0] + 0.5 * (width - side)
         axes.imshow(

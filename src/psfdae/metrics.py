@@ -55,6 +55,7 @@ def ssim(
     count, side, _ = references.shape
     if side < window_px:
         raise ValueError(f"stamps of {side} px are smaller than the SSIM window, {window_px} px")
+    # One range for each star.
     ranges = np.array([np.broadcast_to(r, count) for r in data_ranges], np.float64)
     if not (ranges > 0).all():
         raise ValueError(f"SSIM data_range must be positive, got {ranges.min()}")
@@ -165,6 +166,7 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
     _, member = np.unique(cluster, return_inverse=True)
     sums = np.bincount(member, weights=values - mean)
     groups = sums.size
+    # One cluster says nothing of the scatter between clusters.
     if groups < 2:
         return mean, float("nan")
     variance = groups / (groups - 1) * float((sums**2).sum()) / values.size**2

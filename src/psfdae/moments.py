@@ -25,6 +25,7 @@ FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 def robust_scatter(values: np.ndarray) -> np.ndarray:
     """Return the standard deviation along the first axis, from the median absolute deviation."""
+    # 1.4826 times the median deviation is σ of a normal distribution.
     middle = np.median(values, axis=0)
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
@@ -201,6 +202,7 @@ def measure_shapes(psf: np.ndarray) -> Shapes:
 
 def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     """Return the moments M_xx, M_xy, M_yy under a matched Gaussian weight, shape (3, n)."""
+    # In single precision, with the brightest pixel 1.
     count, side = len(psf), psf.shape[-1]
     light = np.maximum(psf.reshape(count, -1), 0.0).astype(np.float32)
     peak = light.max(axis=1, initial=0.0)
@@ -241,6 +243,7 @@ Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matrix]:
     """Return x, y and central second moments from the sums over `_monomials`, shape (n, 6)."""
+    # Means of x, y and their products; the central ones follow.
     total = np.maximum(sums[:, 0].astype(np.float64), 1e-30)
     x, y, xx, xy, yy = sums[:, 1:].T / total
     return x, y, (xx - x * x, xy - x * y, yy - y * y)
@@ -251,6 +254,7 @@ def _without_weight(weighted: Matrix, weight: Matrix) -> Matrix:
 
     Twice the moments T where no Gaussian does: the PSF is flat.
     """
+    # Elements of W − T, and T (W − T)⁻¹ T written out.
     a, b, c = (w - t for w, t in zip(weight, weighted, strict=True))
     determinant = a * c - b * b
     gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
@@ -273,6 +277,7 @@ def _without_weight_centre(
     Its centre under a weight about c is c₁ = (x1, y1), with the moments T = `weighted`.
     """
     xx, xy, yy = weighted
+    # (u, v) = T⁻¹ (c₁ − c).
     determinant = np.maximum(xx * yy - xy * xy, 1e-12)
     u = (yy * (x1 - x) - xy * (y1 - y)) / determinant
     v = (xx * (y1 - y) - xy * (x1 - x)) / determinant

@@ -103,6 +103,7 @@ def noise_equivalent_px(psf: np.ndarray) -> float:
     mean of their images would be wider than each of them, because they lie at different places in
     their stamps.
     """
+    # n/Σp² over all images is 1 over the mean of Σp².
     count = len(psf) if psf.ndim == 3 else 1
     return count / float(np.square(psf, dtype=np.float64).sum())
 

@@ -77,6 +77,7 @@ class Catalogue:
         ObservationError
             If there is no such column, or it does not hold one number for each star.
         """
+        # One value for each star.
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
@@ -101,6 +102,7 @@ class Catalogue:
     def coordinates(self, name: str) -> np.ndarray:
         """Return a column of finite numbers, (n,), NaN elsewhere; an error if all are NaN."""
         numbers = self.numbers(name, strict=False)
+        # Infinite numbers are as good as none.
         finite = np.isfinite(numbers)
         if not finite.any():
             raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
@@ -168,6 +170,7 @@ class Catalogue:
             ]
             if max(whole_parts, default=0) > 24:
                 sexagesimal_unit = "deg"
+            # Rows without a text stay NaN.
             angles = np.full(len(texts), np.nan)
             rows = [row for row, text in enumerate(texts) if text]
             with reading(self.path):
@@ -198,6 +201,7 @@ class Catalogue:
 
     def identifiers(self) -> np.ndarray:
         """Return one identifier per star, int64 or str, shape (n,); row numbers from 0 without."""
+        # Without a column, the number of the row.
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
@@ -238,6 +242,7 @@ class Catalogue:
         """
         from astropy.table import Table
 
+        # Positions on the sky stay, as those in pixels are written anew.
         further_columns, positions = Table(), self.positions()
         read = {self._identifier(), *(() if positions.sky else (positions.first, positions.second))}
         for name in self.table.colnames[:900]:
@@ -267,6 +272,7 @@ class Catalogue:
             raise ObservationError(
                 self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
             )
+        # Coordinates and times are objects of astropy, not arrays.
         column = self.table[resolved]
         if not isinstance(column, np.ndarray):
             raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
@@ -275,6 +281,7 @@ class Catalogue:
 
 def _texts(column: Column) -> list[str]:
     """Return the values of a column as text without blanks around it, "" where there is none."""
+    # FITS has text as bytes.
     values = np.where(np.ma.getmaskarray(column), "", np.ma.getdata(column).astype(object))
     return [
         (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
@@ -312,6 +319,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
     # What is no table becomes columns of one.
     path = Path("catalogue")
     with reading(path):
+        # A table of sky coordinates; an array or a sequence of pairs; else a table.
         if isinstance(star_list, SkyCoord):
             star_list = {"sky": star_list.reshape(-1)}
         elif isinstance(star_list, np.ndarray):
@@ -329,6 +337,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
 
 def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
     """Return the columns of positions (n, 2), x and y, NaN where they are masked."""
+    # Positions with another unit than pixels are on the sky, and have no WCS with them.
     values, mask, unit = parts_of_array(star_list)
     if unit not in ("", "pix", "pixel"):
         raise ObservationError(

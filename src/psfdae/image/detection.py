@@ -61,6 +61,7 @@ class Sky:
 
         if not self.bad.any():
             return self.bad
+        # Part of the 5 × 5 pixels that is bad.
         around = ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
         return np.asarray(self.bad & (around > 0.5))
 
@@ -136,6 +137,7 @@ class Sky:
             np.atleast_1d(v)
             for v in (catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux)
         )
+        # Sources of which the centroid is not a number are left out.
         finite = np.isfinite(x) & np.isfinite(y)
         x, y, flux = x[finite], y[finite], flux[finite]
         # Level of the sky at the pixel of each source.
@@ -172,6 +174,7 @@ class Sky:
         # Connected pixels that are enough for a source.
         source = np.bincount(parts.ravel()) >= self.least_px
         source[0] = False
+        # Pixels of the list that are on the image.
         height, width = self.flat.shape
         inside: np.ndarray = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         inside[inside] = source[parts[row[inside], column[inside]]]

@@ -34,6 +34,7 @@ def read_table(path: Path) -> Table:
     # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
     if content.startswith((b"SIMPLE  =", *UNPACK)):
         return _fits_table(path)
+    # Text may begin with a mark of its encoding; a byte 0 is in no text.
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -95,6 +96,7 @@ def _text_table(path: Path, lines: Sequence[str]) -> Table:
         options = {"format": "sextractor"}
     else:
         lines = plain_rows(lines)
+        # The first mark that the line of names has.
         delimiter = next((mark for mark in ",;\t" if mark in lines[0]), " ") if lines else ","
         options = {"format": "basic", "delimiter": delimiter}
     if not lines:
@@ -110,6 +112,7 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
     A comment right before numbers without names is the names. VizieR writes two lines of units and
     of dashes below the names, which are left out.
     """
+    # Rows that are no comments, and the comments above the first of them.
     rows = [line for line in lines if not line.lstrip().startswith("#")]
     if not rows:
         return []
@@ -165,6 +168,7 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     for line in lines:
         if line.lstrip().startswith(("#", "global")):
             continue
+        # Behind the # stand text, colour and the like.
         body, _, properties = line.partition("#")
         # Coordinates hold for what follows, or stand before a shape: "fk5; circle(…)".
         for part in filter(None, map(str.strip, body.split(";"))):
@@ -191,6 +195,7 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
             f"regions in coordinates {', '.join(sorted(s or 'not stated' for s in systems))}; "
             f"expected one of {', '.join(systems_known)}: save them so in DS9",
         )
+    # No region at all is an empty list, of which the caller says so.
     names = systems_known[systems.pop() if systems else "image"]
     table = Table(rows=centres or None, names=names, dtype=["U40", "U40"])
     if labels and all(labels):

@@ -129,6 +129,7 @@ class Candidates:
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
         """Return columns of every star of the list, and which good ones are held out, (n,) each."""
+        # Stars that are not good are in no part.
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row[held_out]] = "held out"
         part[self.bright.row[~held_out]] = "training"
@@ -178,6 +179,7 @@ def collect(
     ]
     measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
     bright = BrightStars.joined([stars for _, stars in parts])
+    # Stars that no criterion of a single star refuses, with their rows in the list.
     verdict, position = measured["verdict"], measured["position"]
     bright = replace(bright, row=np.flatnonzero(verdict == Verdict.GOOD))
     # Saturation that the pixels show.
@@ -194,6 +196,7 @@ def collect(
         settings.neighbour_ratio,
     )
     verdict[is_crowded & (verdict == Verdict.GOOD)] = Verdict.CROWDED
+    # Without a position, no other reason counts; without light, the star is no star.
     verdict[observation.without_position()] = Verdict.NO_POSITION
     verdict[bright.row[bright.flux <= 0]] = Verdict.MISFIT
     centring = settings.centring_px or 0.0
@@ -206,9 +209,11 @@ def collect(
 
     # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
     bright = refuse(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
+    # Bad pixels of the others get the values of stars nearby, before sizes are compared again.
     bright, missing = completed(bright, framing.stamp_px, settings.search_px, centring)
     # A star with more than a fifth of its light in bad pixels is not learnt from.
     bright = refuse(bright, missing > 0.2, Verdict.INCOMPLETE)
+    # Galaxies and blends, which are wider than the stars around them.
     bright = refuse(bright, wider_than_stars(bright.area(), bright.position), Verdict.EXTENDED)
     # Stars that are unlike their neighbours.
     aligned = cut(bright.aligned(), framing.stamp_px)
@@ -239,7 +244,8 @@ def measure_stamps(
     shape : tuple of int, optional
         Shape of the image, None for a cube.
     """
-    # Sky around each star, and the star above it.
+    # Sky around each star, and the star above it. The noise is that of the observation where it
+    # has a map of it.
     side = framing.stamp_px
     level, noise = sky_around(stamps.data, stamps.bad, side)
     noise = np.where(np.isfinite(stamps.noise), stamps.noise, np.maximum(noise, least_noise))
@@ -257,6 +263,7 @@ def measure_stamps(
     peak, is_centred = brightest_pixels(light, reach_px, centring)
     flux = cut(light, side, peak).sum(axis=(1, 2))
     snr = signal_to_noise(cut(light, side), noise)
+    # A star that is smoothed to be centred has its brightest pixel anywhere.
     if centring:
         highest_light = cut(light, side).max((1, 2))
     else:
@@ -283,6 +290,7 @@ def measure_stamps(
         (Verdict.INCOMPLETE, incomplete | is_flagged(StarFlag.TRUNCATED)),
     ):
         verdict[stars] = reason
+    # Columns for all stars, in counts with the sky where pixels are compared with saturation.
     position = np.stack([stamps.x, stamps.y], axis=1)
     columns = {
         "id": stamps.id,
@@ -295,6 +303,7 @@ def measure_stamps(
         "highest": cut(np.where(stamps.bad, -np.inf, stamps.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
+    # Only good stars keep their stamps; centres come later, when fewer are left.
     good = verdict == Verdict.GOOD
     return columns, BrightStars(
         stamps=light[good],
@@ -331,6 +340,7 @@ def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     The window is a Gaussian with the noise-equivalent area of the star, A = 4π σ², but at least as
     wide as 0.7 px and as the Gaussian of FWHM `centring_px`.
     """
+    # σ of the window from the area of each star.
     sigma = np.maximum(np.sqrt(stars.area() / (4.0 * np.pi)), 0.7)
     window_px = np.maximum(sigma, centring_px / FWHM_OF_SIGMA)
     return replace(
@@ -373,6 +383,7 @@ def completed(
     incomplete = np.flatnonzero(stars.bad.any(axis=(1, 2)))
     if not incomplete.size or len(stars) < 4:
         return stars, missing
+    # The nearest stars, itself among them, which is left out below.
     place = stars.position
     if not np.isfinite(place).all():  # all stars are as near then
         place = np.arange(len(stars))[:, None] * np.ones(2)

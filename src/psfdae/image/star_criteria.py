@@ -166,11 +166,13 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial import cKDTree
 
+    # With fewer than eight sources there is no locus to see.
     is_wide = np.zeros(len(area), dtype=bool)
     if len(area) < 8:
         return is_wide
     size = np.log(area)
     for _ in range(10):
+        # The locus is searched among those that are not yet known to be wide.
         star = np.flatnonzero(~is_wide)
         if len(star) < 8:
             break
@@ -182,6 +184,7 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
         # A quarter of a normal distribution about its middle has the width 0.637 σ.
         ordered, count = np.sort(excess[star]), -(-len(star) // 4)
         width = ordered[count:] - ordered[:-count]
+        # The shortest interval, its middle and the scatter that it implies.
         first = int(width.argmin())
         local_area, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
         is_wider = excess > local_area + max(np.log(1.5), 5.0 * float(scatter))
@@ -228,6 +231,7 @@ def misfit(
         return np.median(stars, axis=0), scatter**2 + np.median(scatter) ** 2
 
     local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
+    # Neighbours of each star; all stars where there are few, or positions are not known.
     if np.isfinite(position).all() and count > companions:
         neighbours = cKDTree(position).query(position, k=companions + 1)[1]
         local_medians = (

@@ -64,6 +64,7 @@ def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
     So many images are wanted to train and to test, but at least one of each star; each
     star of a part comes as often as the others, or once more.
     """
+    # Stars of each part in turn, until there are enough images.
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
     return np.concatenate(
         [np.resize(stars, max(image_count, stars.size)) for stars, image_count in parts]
@@ -114,6 +115,7 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     ndarray, shape (n, s, s)
         Centre at index (s//2, s//2), flux 1 inside the stamp.
     """
+    # Stars that are held out get the stack of the training stars around them.
     part = bins_of(stars.position, bins)
     training = stars.of(~held_out)
     return np.asarray(stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part])
@@ -169,6 +171,7 @@ def make_images(
     phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
     jitter = draw_jitter(star.size, framing.jitter_px, rng)
     realisations, templates = np.empty((2, star.size, side, side), np.float32)
+    # A moved star may have its brightest pixel one px farther off.
     reach = int(np.abs(stars.peak).max()) + 1
     # 512 images at a time, which bounds the memory.
     for rows in (slice(start, start + 512) for start in range(0, star.size, 512)):
