@@ -45,7 +45,11 @@ def fit(
     *,
     out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
 ) -> None:
-    """Fit METHOD, a name of the list `methods` in config.yaml."""
+    """Fit METHOD, a name of the list `methods` in config.yaml.
+
+    It learns from the training stars of the split, with noise as its settings say. The same
+    settings give the same bytes, whether the fit was interrupted or not.
+    """
     # Stars of the split with their noise; training state goes to a file beside the fit.
     method_class = method(name)
     limit_threads(method_class.threads(config))
