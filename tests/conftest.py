@@ -16,6 +16,7 @@ from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
 from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import annular_pupil
+from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     StateTracer,
     design_states,
@@ -94,10 +95,28 @@ def noise():
 
 
 @pytest.fixture(scope="session")
-def tracer():
+def scene3():
+    """Configuration of scene 3, as the workflow uses it."""
+    return load(CHOICE)
+
+
+@pytest.fixture(scope="session")
+def tracer(scene3):
     """Ray tracer of scene 3."""
-    config = load(CHOICE)
-    return StateTracer(config.telescope, config.prescription, config.alignment)
+    return StateTracer(scene3.telescope, scene3.prescription, scene3.alignment)
+
+
+@pytest.fixture(scope="session")
+def operator(scene3):
+    """Propagation to the stamps of scene 3."""
+    return AlignmentStamps(scene3.telescope, scene3.optics, scene3.alignment)
+
+
+@pytest.fixture(scope="session")
+def exact_operator(scene3):
+    """The same on a finer pupil, in double precision."""
+    optics = scene3.optics.model_copy(update={"pupil_samples": [254], "precision": "complex128"})
+    return AlignmentStamps(scene3.telescope, optics, scene3.alignment)
 
 
 @pytest.fixture(scope="session")
