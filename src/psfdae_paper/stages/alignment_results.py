@@ -255,6 +255,7 @@ def time_table(
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
+    # An estimate's time, and that of the trainings on which it rests.
     for method in ESTIMATORS:
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
@@ -271,6 +272,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
 
     The first two states of the set are shown, without noise and at every noise level.
     """
+    # The DAE must be that of these stamps.
     product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
@@ -405,6 +407,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
     measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)
     methods = [method for method in ALIGNERS.values() if method.short]
+    # Methods with a short name have a panel; those of the paper have its values beside them.
     in_paper = [method for method in methods if method.look.paper]
     not_in_paper = [method for method in methods if not method.look.paper]
     panels = []

@@ -141,7 +141,7 @@ def estimators(
             place = models.get(name)
             if place is None:
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
-            fits.require(method_class, place, stars, config, split, reference)
+            fits.require_fit(method_class, place, stars, config, split, reference)
             places[name] = place
     # Methods without a file are fitted here.
     fitted: dict[str, Method] = {}

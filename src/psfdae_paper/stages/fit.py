@@ -63,7 +63,7 @@ def fit(
             raise click.UsageError(
                 "--start: only fits to templates by a method with a warm start take it"
             )
-        fits.require(method_class, start, product, config, split, "realisation")
+        fits.require_fit(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
     # Fit, store with its configuration, and forget the state of the training.
     described = fits.described_by(method_class, config.model_dump(), split, reference)
