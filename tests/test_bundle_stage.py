@@ -24,7 +24,7 @@ from psfdae.model.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.model.photometry import FluxModel
+from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
 from psfdae.noise import NoiseModel
