@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.field_psf import SLOPE_PX
+from psfdae.methods.field_spline import SLOPE_PX
 from psfdae.moments import SIGMA_OF_MAD
 
 if TYPE_CHECKING:

@@ -1,0 +1,164 @@
+"""Normal distributions with a covariance of low rank, seen through noise of any variance.
+
+A stamp with noise of variance s per pixel has the covariance G = C + s, where C is that of the
+stars without noise. Few directions have a variance that noise does not hide: C is diagonal along
+its leading axes V and a multiple of 1 beyond them, so that G⁻¹ is known for every s at once. The
+equations are numbered as on the pages docs/field_model.md and docs/mixture.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class NodeAxes(NamedTuple):
+    """Principal axes of the residual covariance C in a node; beyond them, C is a multiple of 1.
+
+    With this, G = C + s is diagonal along the axes for stars of every noise variance s (eq. 6).
+    Noise variances, shape (n, 1), are those of a pixel of n stars of flux 1. `prior_sigma`, shape
+    (n, 3), is the standard deviation of the nuisance parameters before the star is measured.
+
+    Attributes
+    ----------
+    basis : ndarray, shape (3 + m, P)
+        The derivatives of the node; then the m axes V, orthonormal, by descending variance.
+    variance : ndarray, shape (m,)
+        Variance λ along each axis.
+    variance_beyond : float
+        Mean variance λ₀ per dimension beyond the axes.
+    images : ndarray, shape (K + 1, m)
+        Images of the node along the axes.
+    derivatives : ndarray, shape (3, m)
+        Derivatives of the node along the axes.
+    derivative_products : ndarray, shape (m + 1, 9)
+        Products of the derivatives with each other, along each axis and beyond all.
+    """
+
+    basis: np.ndarray
+    variance: np.ndarray
+    variance_beyond: float
+    images: np.ndarray
+    derivatives: np.ndarray
+    derivative_products: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        rows: np.ndarray,
+        diagonal: np.ndarray,
+        derivatives: np.ndarray,
+        images: np.ndarray,
+        min_axes: int,
+    ) -> NodeAxes:
+        """Return the principal axes of C = RᵀR + diag(D) (eq. 6).
+
+        They are those of C within the space that its rows and the pixels of the largest diagonal
+        span (method of Rayleigh and Ritz), which needs no eigenvectors of P x P.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (r, P)
+            R.
+        diagonal : ndarray, shape (P,)
+            D.
+        derivatives : ndarray, shape (3, P)
+        images : ndarray, shape (K + 1, P)
+        min_axes : int
+            Number of axes that are kept, at least; there are never fewer than rows.
+        """
+        pixels = len(diagonal)
+        axis_count = min(max(min_axes, len(rows)), pixels)
+        # Orthonormal basis of the space.
+        large = np.argsort(-diagonal, kind="stable")[: axis_count - len(rows)]
+        space = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
+        # Eigenvectors of C in this space, and the mean variance that is left outside of it.
+        projected = rows @ space
+        variance, rotation = np.linalg.eigh((space.T * diagonal) @ space + projected.T @ projected)
+        beyond = diagonal.sum() + np.square(rows).sum() - variance.sum()
+        basis = np.vstack([derivatives, (space @ rotation[:, ::-1]).T])
+        # Products of the derivatives, which every star needs: over all pixels less along the axes.
+        along = derivatives @ basis[3:].T
+        products_along = (along[:, None] * along).reshape(9, -1).T
+        products_beyond = derivatives @ derivatives.T - along @ along.T
+        return cls(
+            basis=basis,
+            variance=variance[::-1].copy(),
+            variance_beyond=float(beyond / (pixels - axis_count)) if axis_count < pixels else 1.0,
+            images=images @ basis[3:].T,
+            derivatives=along,
+            derivative_products=np.vstack([products_along, products_beyond.ravel()]),
+        )
+
+    def inverse(self, noise_variance: np.ndarray) -> np.ndarray:
+        """Return G⁻¹ along the axes and, last, beyond them, shape (n, m + 1) (eq. 6)."""
+        return np.asarray(1.0 / (np.append(self.variance, self.variance_beyond) + noise_variance))
+
+    def noise_fractions(self, noise_variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the fraction s G⁻¹ of a residual that is noise (eq. 11).
+
+        The first array, (n, 1), is the fraction beyond the axes; the second one, (n, m), by how
+        much the fraction along each axis differs from it.
+        """
+        fraction = noise_variance * self.inverse(noise_variance)
+        return fraction[:, -1:], fraction[:, :-1] - fraction[:, -1:]
+
+    def nuisance_precision(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
+        """Return Λ = 1 + σ L G⁻¹ Lᵀ σ, the inverse covariance of t/σ, (n, 3, 3) (eq. 7)."""
+        products = self.inverse(noise_variance) @ self.derivative_products
+        products = products.reshape(-1, 3, 3)
+        return np.asarray(np.eye(3) + products * (prior_sigma[:, :, None] * prior_sigma[:, None]))
+
+    def leading_terms(
+        self, residual: np.ndarray, noise_variance: np.ndarray, prior_sigma: np.ndarray, count: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what the leading axes alone, so many, contribute to a fit (eq. 14).
+
+        Parameters
+        ----------
+        residual : ndarray, shape (n, m)
+            Residuals r of stars along the axes.
+        noise_variance : ndarray, shape (n, 1)
+        prior_sigma : ndarray, shape (n, 3)
+        count : int
+            Number of leading axes.
+
+        Returns
+        -------
+        chi2 : ndarray, shape (n,)
+            r G⁻¹ rᵀ.
+        gradient : ndarray, shape (n, 3)
+            σ L G⁻¹ rᵀ.
+        precision : ndarray, shape (n, 3, 3)
+            σ L G⁻¹ Lᵀ σ, their part of the inverse covariance of t/σ.
+        """
+        residual = residual[:, :count]
+        total_variance = self.variance[:count] + noise_variance
+        derivatives = prior_sigma[:, :, None] * self.derivatives[:, :count]
+        weighted = derivatives / total_variance[:, None]
+        gradient = np.einsum("nij,nj->ni", weighted, residual)
+        chi2 = (residual**2 / total_variance).sum(axis=1)
+        return chi2, gradient, weighted @ derivatives.transpose(0, 2, 1)
+
+    def pixel_variance(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
+        """Return the posterior variance of a star's pixels if its flux is known (eq. 12).
+
+        Shape (n, P), of stars of flux 1 without noise and sky.
+        """
+        beyond, along = self.noise_fractions(noise_variance)
+        covariance = np.linalg.inv(self.nuisance_precision(noise_variance, prior_sigma))
+        derivatives, axes = self.basis[:3], self.basis[3:]
+        # σ L s G⁻¹: how the noise that is subtracted changes with the nuisance parameters.
+        rows = ((self.derivatives * along[:, None]).reshape(-1, len(axes)) @ axes).reshape(
+            len(noise_variance), 3, -1
+        )
+        rows = (rows + beyond[:, None] * derivatives) * prior_sigma[:, :, None]
+        pull = covariance @ rows
+        # diag(C − C G⁻¹ C) = s diag(1 − s G⁻¹); then what the nuisance parameters leave open. The
+        # sky itself is no part of the star: its row is σ L s G⁻¹ − σ_sky.
+        variance = noise_variance * (1.0 - beyond - along @ axes**2) + (rows * pull).sum(axis=1)
+        variance += (
+            prior_sigma[:, :1] ** 2 * covariance[:, :1, 0] - 2 * prior_sigma[:, :1] * pull[:, 0]
+        )
+        return np.asarray(np.maximum(variance, 0.0))
