@@ -331,10 +331,8 @@ class FieldFitter:
         weight, noise = self._weight(fit.flux, star_images), self._variance(fit.flux, star_images)
         weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
         fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
-        axis, box = (
-            self.axis[self.in_stamp],
-            np.ix_(range(len(terms)), self.in_stamp, self.in_stamp),
-        )
+        axis = self.axis[self.in_stamp]
+        box = np.ix_(np.arange(len(terms)), self.in_stamp, self.in_stamp)
         for left_out in range(settings.folds):
             used = weight * ((fold != left_out) & fit.good)[:, None, None]
             coefficients = self._splines(

@@ -84,7 +84,7 @@ class FieldStamps(NamedTuple):
 
     def noise_variance(self) -> np.ndarray:
         """Return s, the variance of the noise of a pixel over the guessed flux, (n, 1)."""
-        return np.square(self.noise / self.unit)[:, None]
+        return np.asarray(np.square(self.noise / self.unit)[:, None])
 
 
 class Photometry(NamedTuple):

@@ -17,10 +17,10 @@ import numpy as np
 from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.model.flux_model import FAINT_SNR
 from psfdae.model.joint_fit import JointFit, chains, fit_stars
-from psfdae.model.photometry import FAINT_SNR
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_light
+from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_shares
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -115,13 +115,13 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
-        outer_parts = outer_light(model.on_pixels, place)
+        outer_parts = outer_shares(model.on_pixels, place)
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, place, flux, outer_parts, side, wings
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = _pixel_error(sky.noise, fit.light + wing_light, observation.gain)
-        if turn == 0 and observation.found is not None:
+        if turn == 0 and observation.detections is not None:
             place, flux = _with_hidden(sky, sigma, place, flux, threshold, fwhm)
             origin = np.concatenate([origin, place[len(origin) :]])
         elif turn > 0:
@@ -134,7 +134,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             if real.all() or turn == ROUNDS - 1:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
-    wings_used = wings if wings is not None and wings.seen else model.wings
+    wings_used = wings if wings is not None and wings.is_measured else model.wings
     result = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + wing_light, wings_used)
     stars = result.stars
     # The error of the PSF is no noise, and is as large a part of each flux.
@@ -149,9 +149,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     sigma_px = np.hypot(stars["x_error"], stars["y_error"])
     is_far = distance_px > np.maximum(SAME_FWHM * fwhm, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
-    if observation.found is None:
-        stars["id"] = observation.identifiers
-        stars["flags"] |= observation.list_flags
+    if observation.detections is None:
+        stars["id"] = observation.stars.id
+        stars["flags"] |= observation.stars.flags
     return result
 
 
@@ -274,7 +274,7 @@ def _described(
     stars["x_error"], stars["y_error"] = excess * fit.place_error.T
     total: np.ndarray | float = 1.0
     if wings is not None:
-        total, _ = wings.total(outer_light(model.on_pixels, fit.place))
+        total, _ = wings.total(outer_shares(model.on_pixels, fit.place))
     stars["flux"], stars["flux_error"] = total * fit.flux, total * excess * fit.flux_error
     stars["flux_model"] = fit.flux
     group = chains(fit.place, group_px)

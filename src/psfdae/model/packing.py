@@ -47,7 +47,7 @@ from psfdae.model.bundle import (
     estimator,
     mahalanobis,
 )
-from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.flux_model import FluxModel, signal_to_noise
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.restoration import SNR_TOLERANCE
 from psfdae.model.star_sets import (

@@ -38,9 +38,10 @@ from psfdae.method import (
     with_free_flux,
 )
 from psfdae.model.bundle import Bundle, ModelErrors, at_noise, brightest, mahalanobis
-from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
+from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
+from psfdae.model.photometry import Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
-from psfdae.model.wings import Wings, outer_light
+from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
@@ -212,7 +213,7 @@ class Restorer:
         data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
         # Stamps without anything to measure: bad, constant, or beyond any number.
         modulus = np.abs(data).max(axis=(1, 2))
-        has_pixels = bad.mean(axis=(1, 2)) <= 1 - KEPT
+        has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
         is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
         is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
         data = np.where(is_unusable[:, None, None], 0.0, data)
@@ -403,7 +404,7 @@ class Restorer:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
-        outer_part = outer_light(self.method.psf_at, place)
+        outer_part = outer_shares(self.method.psf_at, place)
         factor, factor_error = self.wings.total(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
