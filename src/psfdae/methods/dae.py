@@ -76,7 +76,7 @@ class Dae(Method):
 
     @classmethod
     def continues(cls, config: Config) -> bool:
-        """Whether a training on templates goes on from one on the realisations."""
+        """Return True if training on templates starts from the network trained on realisations."""
         return bool(config.train.continued_epochs)
 
     @classmethod

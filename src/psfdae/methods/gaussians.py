@@ -9,6 +9,7 @@ docs/field_model.md). For one s alone, Woodbury's formula is faster (`WoodburyIn
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -101,6 +102,41 @@ class AxesInverse(NamedTuple):
         return np.asarray(0.5 * (along + beyond))
 
 
+class ClusterAxes(NamedTuple):
+    """Eigenvectors of the covariance C_k of a cluster in the leading w coordinates.
+
+    Attributes
+    ----------
+    vectors : ndarray, shape (w, w), float32
+        Columns, by descending variance.
+    variance : ndarray, shape (w,)
+        Variance along each.
+    total_variance : float
+        Sum of the variances.
+    """
+
+    vectors: np.ndarray
+    variance: np.ndarray
+    total_variance: float
+
+    @classmethod
+    def of(cls, covariance: np.ndarray) -> ClusterAxes:
+        """Return the eigenvectors of a covariance (w, w)."""
+        variance, vectors = np.linalg.eigh(covariance)
+        return cls(
+            vectors=np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
+            variance=np.maximum(variance[::-1], 0.0),
+            total_variance=float(np.trace(covariance)),
+        )
+
+    def inverse(self, least_variance: float) -> AxesInverse:
+        """Return G_k⁻¹ by the axes of a larger variance, with the mean of the others (eq. 4)."""
+        variance = self.variance[self.variance > least_variance]
+        dimensions = len(self.variance) - len(variance)
+        beyond = (self.total_variance - variance.sum()) / dimensions if dimensions else np.inf
+        return AxesInverse(self.vectors[:, : len(variance)], variance, float(beyond))
+
+
 class WoodburyInverse(NamedTuple):
     """G_k⁻¹ for one noise variance, which takes far less to compute than axes (eq. 5).
 
@@ -119,6 +155,25 @@ class WoodburyInverse(NamedTuple):
     diagonal: np.ndarray
     rows: np.ndarray
     half_log: float
+
+    @classmethod
+    def of_stack(cls, diagonal: np.ndarray, rows: np.ndarray) -> Iterator[WoodburyInverse]:
+        """Return G⁻¹ of D + UᵀU for a stack of K covariances (eq. 5).
+
+        Parameters
+        ----------
+        diagonal : ndarray, shape (K, m)
+            D.
+        rows : ndarray, shape (K, r, m)
+            U.
+        """
+        # U D⁻¹, then L with L Lᵀ = 1 + U D⁻¹ Uᵀ, and ln det G = ln det D + 2 ln det L.
+        weighted = rows / diagonal[:, None]
+        lower = np.linalg.cholesky(np.eye(rows.shape[1]) + weighted @ rows.transpose(0, 2, 1))
+        half_log = 0.5 * np.log(diagonal).sum(axis=1)
+        half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
+        return map(cls, 1.0 / diagonal, solved, half_log)
 
     def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return the product of rows (n, m) with G⁻¹, (n, m)."""

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from psfdae.method import Estimate
-from psfdae.methods.gaussians import AxesInverse, NoisyCovariance, WoodburyInverse
+from psfdae.methods.gaussians import ClusterAxes, NoisyCovariance, WoodburyInverse
 from psfdae.mixing import mixing_weights
 from psfdae.noise import NoiseModel
 
@@ -73,24 +73,6 @@ class Cluster(NamedTuple):
     position_whitening: np.ndarray
     common_factor: float
     residual_factor: float
-
-
-class ClusterAxes(NamedTuple):
-    """Eigenvectors of C_k in the leading w coordinates.
-
-    Attributes
-    ----------
-    vectors : ndarray, shape (w, w), float32
-        Columns, by descending variance.
-    variance : ndarray, shape (w,)
-        Variance along each.
-    total_variance : float
-        Sum of the variances.
-    """
-
-    vectors: np.ndarray
-    variance: np.ndarray
-    total_variance: float
 
 
 class StarBatch(NamedTuple):
@@ -268,12 +250,8 @@ class MixtureLaw:
                 if self._restores_images:
                     mean += ((flux[part] - 1.0) / mean.shape[1])[:, None]
             psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (mean, mean_sigma))
-        return Estimate(
-            psf,
-            sigma if with_sigma else None,
-            evidence,
-            flux if self.flux_sigma else None,
-        )
+        flux_or_none = flux if self.flux_sigma else None
+        return Estimate(psf, sigma if with_sigma else None, evidence, flux_or_none)
 
     def _weights(self, batch: StarBatch, near: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the weight of each cluster for each image, (n, K), and the evidence (eq. 6)."""
@@ -508,11 +486,7 @@ class MixtureLaw:
         s, width = batch.least_variance, self._modelled_count(batch.least_variance)
         if batch.common_variance is not None:
             return self._woodbury_inverses(width, batch.common_variance)[k]
-        axes = self._axes(k, width)
-        width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
-        dimensions = width - len(variance)
-        beyond = (axes.total_variance - variance.sum()) / dimensions if dimensions else np.inf
-        return AxesInverse(axes.vectors[:, : len(variance)], variance, float(beyond))
+        return self._axes(k, width).inverse(LEAST_VARIANCE * s)
 
     def _woodbury_inverses(self, width: int, s: float) -> list[WoodburyInverse]:
         """Return G_k⁻¹ of all clusters for one noise variance; those of the last one are kept."""
@@ -527,16 +501,10 @@ class MixtureLaw:
             clusters = [self._clusters[k] for k in numbers]
             common = np.array([[cluster.common_factor] for cluster in clusters])
             factor = np.array([[cluster.residual_factor] for cluster in clusters])
-            # Eq. 5: D, U, U D⁻¹, L, ½ ln det G and L⁻¹ U D⁻¹.
+            # D and U of G_k = D + UᵀU.
             diagonal = common * self.variance[:width] + s
             rows = np.stack([c.residuals[:, :width] for c in clusters])
-            rows = rows * np.sqrt(factor)[..., None]
-            weighted = rows / diagonal[:, None]
-            lower = np.linalg.cholesky(np.eye(size) + weighted @ rows.transpose(0, 2, 1))
-            half_log = 0.5 * np.log(diagonal).sum(axis=1)
-            half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-            solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
-            parts = map(WoodburyInverse, 1.0 / diagonal, solved, half_log)
+            parts = WoodburyInverse.of_stack(diagonal, rows * np.sqrt(factor)[..., None])
             inverses |= dict(zip(numbers, parts, strict=True))
         self._inverse_cache.clear()
         self._inverse_cache[width, s] = [inverses[k] for k in range(len(self.count))]
@@ -550,12 +518,7 @@ class MixtureLaw:
             rows = cluster.residuals[:, :width].astype(np.float64)
             covariance = cluster.residual_factor * (rows.T @ rows)
             covariance[np.diag_indices(width)] += cluster.common_factor * self.variance[:width]
-            variance, vectors = np.linalg.eigh(covariance)
-            self._axes_cache[k, width] = ClusterAxes(
-                np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
-                np.maximum(variance[::-1], 0.0),
-                float(np.trace(covariance)),
-            )
+            self._axes_cache[k, width] = ClusterAxes.of(covariance)
         return self._axes_cache[k, width]
 
     def _distinct_count(self, s: float) -> int:

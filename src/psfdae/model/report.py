@@ -18,7 +18,6 @@ from psfdae.figures import SERIES_COLORS, as_png, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.image.tables import html_table
-from psfdae.method import facts_of
 from psfdae.methods import method as method_of
 from psfdae.model.plot import UNUSABLE_FLAGS
 from psfdae.moments import measure_shapes, shift_stamps
@@ -286,7 +285,7 @@ def quality_page(
         "<h2>Flux, centre and their errors</h2>",
         _photometry_table(report.found),
         "<h2>The PSF over the field</h2>",
-        *(f"<p>{escape(fact)}.</p>" for fact in facts_of(report.model.method)),
+        *(f"<p>{escape(fact)}.</p>" for fact in report.model.method.facts().values()),
         _image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         "<h2>Residuals of held-out stars</h2>",
         "<p>Above: mean and RMS of restored minus bright image, over all held-out stars. Below: "
