@@ -21,7 +21,7 @@ from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
-from psfdae.commands.from_stars import _locked
+from psfdae.commands.from_stars import locked_folder
 from psfdae.files import read_product, write_product
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
@@ -151,7 +151,7 @@ def test_held_out_stars_are_the_truth_but_for_their_noise(made, candidates):
     framing = SimpleNamespace(stamp_px=16, jitter_px=0)
     still = np.zeros(len(bright), dtype=bool)
     images, *_ = make_images(
-        bright, bright.wide, np.arange(len(bright)), framing, still, stream(1, "t")
+        bright, bright.stamps, np.arange(len(bright)), framing, still, stream(1, "t")
     )
     for image, row, noise in zip(images, bright.row, bright.noise / bright.flux, strict=True):
         error = best_match(made.psf[row], image)
@@ -270,7 +270,7 @@ def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert not made.exists() and page.exists()
-    assert f"{page}: exists already" in refused(*words)
+    assert f"{page}: exists already" in refused("from-stars", *words)
     done = run(*words, "--overwrite")
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == training.bundle.read_bytes()
@@ -290,8 +290,8 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.from_stars import _locked\n"
-        "with _locked(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+        "from psfdae.commands.from_stars import locked_folder\n"
+        "with locked_folder(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
@@ -300,14 +300,14 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         message = refused("from-stars", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
-    with _locked(out):
+    with locked_folder(out):
         assert list(out.iterdir()) == []
     assert not out.exists()
 
 
 def test_a_cube_of_stamps_will_do(candidates, tmp_path):
     sky = np.random.default_rng(1).normal(100, 1, (len(candidates.bright), 32, 32))
-    stamps = (candidates.bright.wide + sky).astype(np.float32)
+    stamps = (candidates.bright.stamps + sky).astype(np.float32)
     write_cube(tmp_path / "cube.fits", stamps[:, 3:29, 3:29], PIXSCALE=1.2)
     with few_draws():
         result = run(tmp_path / "cube.fits", "--out", tmp_path / "m", *WORDS, "--method", "gmm")

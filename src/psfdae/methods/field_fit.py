@@ -244,7 +244,7 @@ class FieldFitter:
             place=stars.place,
             axis=np.arange(frame_px) - frame_px // 2.0,
             stamp_px=stamp_px,
-            around_px=max(stars.wide[0].size - stamp_px**2, 1),
+            around_px=max(stars.stamps[0].size - stamp_px**2, 1),
             window_px=1.4 * sigma if sigma > 3.0 else FitSettings.window_px,
             low=low,
             high=high,
