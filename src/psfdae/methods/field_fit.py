@@ -33,7 +33,7 @@ from psfdae.progress import Advance
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What a fit of the field may vary; the search compares fits that differ in one of these.
+    """Options of a fit of the field; the search compares fits that differ in one of these.
 
     Attributes
     ----------

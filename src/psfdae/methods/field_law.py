@@ -39,7 +39,7 @@ MARGIN_PX = 2
 
 @dataclass(frozen=True)
 class PosteriorLimits:
-    """What the posterior of a star leaves out because it hardly counts, to save time and memory.
+    """Limits of the posterior of a star, which save time and memory where more hardly counts.
 
     Attributes
     ----------
