@@ -26,7 +26,7 @@ from psfdae.files import (
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
-from psfdae.method import Method, facts_of
+from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
@@ -363,7 +363,7 @@ def write_model(
     # The fit with all that predictions need: photometry, and errors from stars held out.
     print(f"packing {model_method.look.label}")
     model = pack_model(stars, fitted[model_method.name], files.name, licence)
-    for fact in facts_of(fitted[model_method.name]):
+    for fact in fitted[model_method.name].facts().values():
         print(f"{model_method.look.label}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")

@@ -34,7 +34,6 @@ from psfdae.method import (
     MeasuresStars,
     Method,
     ScoresOutliers,
-    with_free_flux,
 )
 from psfdae.methods import method
 from psfdae.model.bundle import (
@@ -413,7 +412,7 @@ def measure_errors(
     noise = np.repeat(nodes, len(draws[0][1]))
     level = noise / stars.noise.kappa
     estimate = fitted.estimate(noisy, level, stars.position[star])
-    score, free_flux = estimate.outlier_score, with_free_flux(fitted)
+    score, free_flux = estimate.outlier_score, fitted.free_flux()
     if score is None and isinstance(free_flux, ScoresOutliers):
         score = free_flux.outlier_score(noisy, level)
     error = errors_of(estimate, stars, star).astype(np.float32)

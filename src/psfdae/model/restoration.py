@@ -35,7 +35,6 @@ from psfdae.method import (
     Method,
     Packing,
     ScoresOutliers,
-    with_free_flux,
 )
 from psfdae.model.bundle import Bundle, ModelErrors, at_noise, brightest, mahalanobis
 from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
@@ -120,7 +119,7 @@ class Restorer:
 
     def __init__(self, bundle: Bundle, method: Method) -> None:
         self.bundle, self.method = bundle, method
-        self.free_flux = with_free_flux(method)
+        self.free_flux = method.free_flux()
         packing = method.packing or Packing()
         # Stamps of more than 32 px come in smaller blocks.
         pixels = bundle.info.stamp_px**2
