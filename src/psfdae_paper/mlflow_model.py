@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.model.bundle import SUFFIX, write_bundle
-from psfdae.model.packing import StarFacts, without_errors
+from psfdae.model.packing import uncalibrated
 from psfdae.model.psf_model import PsfModel, load_model
 from psfdae.model.star_sets import read_stars
 from psfdae.rng import stream
@@ -47,12 +47,12 @@ def write_model(fit: Fit, stars: Path, reference: str, name: str, folder: Path) 
     """
     described, product = fit.kind.described(fit.place), read_stars(stars, reference)
     config = part(READS, {group: described[group] for group in READS})
-    facts = StarFacts.of(product, reference, config, described)
     fitted = fit.kind.load(fit.place, reference)
-    write_bundle(
-        without_errors(fitted, facts, reference, name, "not stated"), folder / f"{name}{SUFFIX}"
+    bundle, held_out = uncalibrated(
+        fitted, product, reference, config, described, name, "not stated"
     )
-    noise, rng = facts.held_out.noise, stream(facts.seed, "noise", "example")
-    flux = noise.flux(float(np.median(facts.levels)))
-    counts = rng.poisson(flux * facts.held_out.images[:1] + noise.background)
+    write_bundle(bundle, folder / f"{name}{SUFFIX}")
+    noise, rng = held_out.noise, stream(config.seed, "noise", "example")
+    flux = noise.flux(float(np.median(config.noise.levels)))
+    counts = rng.poisson(flux * held_out.images[:1] + noise.background)
     return np.asarray(counts, np.float32)

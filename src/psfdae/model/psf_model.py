@@ -250,13 +250,14 @@ class PsfModel(FieldPsfs):
                 x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
                 y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
                 sky = observation.on_sky(x, y)
-                ra, dec = (None, None) if sky is None else sky
-                list_rows = None if list_columns is None else list_columns[rows]
-                unit = observation.unit
-                yield (
-                    stamps,
-                    replace(prediction, ra=ra, dec=dec, list_columns=list_rows, unit=unit),
+                columns = {} if sky is None else dict(zip(("ra", "dec"), sky, strict=True))
+                placed = replace(
+                    prediction,
+                    columns=prediction.columns | columns,
+                    list_columns=None if list_columns is None else list_columns[rows],
+                    unit=observation.unit,
                 )
+                yield stamps, placed
                 advance(len(prediction))
 
     @property
@@ -278,7 +279,7 @@ class PsfModel(FieldPsfs):
     def flux_error(self) -> float:
         """Standard error over the flux that model and wings make of every star on a known sky."""
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
-        return float(np.hypot(self.bundle.model_errors.fitted_flux, error / (1.0 + light)))
+        return float(np.hypot(self.bundle.errors.measured.fitted_flux, error / (1.0 + light)))
 
     @property
     def image_px(self) -> tuple[int, int] | None:
