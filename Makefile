@@ -98,6 +98,7 @@ reproduce: env ## Build everything of the preset: datasets, models, tables, repo
 	@case "$$TRACK" in '') ;; live) export PSFDAE_EPOCHS=psfdae_paper.stages.live:logger ;; \
 	    *) echo "TRACK=$$TRACK: live, or nothing"; exit 2;; esac; \
 	  $(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
+	@psfdae manifest "$$PSFDAE_RESULTS"
 	@$(MAKE) --no-print-directory report
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
 	  psfdae compare results results/reference || true

@@ -146,14 +146,12 @@ def field_psfs(tmp_path_factory):
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory):
     """A migrated database without runs; the migrations take seconds."""
-    from psfdae_paper.stages import track
+    from mlflow import MlflowClient
 
     path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
-    patch = pytest.MonkeyPatch()
-    patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
-    track.client_of("", path)
-    patch.undo()
-    assert [p.name for p in path.parent.iterdir()] == ["mlflow.db"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+        MlflowClient(f"sqlite:///{path}").search_experiments(max_results=1)
     return path
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
@@ -11,19 +9,16 @@ from torch import nn
 
 from psfdae.networks.training import train
 from psfdae_paper.alignment.emulator import StampEmulator
-from psfdae_paper.alignment.fisher import (
+from psfdae_paper.alignment.likelihood import (
+    Likelihood,
+    StateOptics,
     bound_covariances,
-    coma_free_decentre,
     deviance_and_information,
     expected_abs_error,
-    parameters_of,
-    stamps_and_slopes,
-    twin_states,
+    refit_twins,
 )
-from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
 from psfdae_paper.alignment.networks import (
     AlignmentCnn,
-    MixedNoise,
     NetworkTraining,
     TrainingStates,
     predict_states,
@@ -31,16 +26,17 @@ from psfdae_paper.alignment.networks import (
     training_of,
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.alignment.telescope import mirror_symmetries, uniform_states
+from psfdae_paper.alignment.telescope import (
+    coma_free_decentre,
+    mirror_symmetries,
+    twin_states,
+    uniform_states,
+)
 from psfdae_paper.configuration.alignment import CHOICE, Cnn, Perceptron
 from psfdae_paper.configuration.compose import load
 
 FIT = load(CHOICE).fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
-
-
-def _likelihood(model, operator, noise, level, emulator=None):
-    return Likelihood(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
 
 
 @pytest.fixture(scope="module")
@@ -202,9 +198,9 @@ def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, st
     """A perceptron learns from components that its network would find in the stamps."""
     network = config.perceptron.model_copy(update={"components": 20})
     settings = config.train_noise_trained.model_copy(update={"epochs": 1, "batch": 5})
-    law, level = MixedNoise(noise, np.array([0.005])), 0.005
+    level = 0.005
     draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
-    for data in (TrainingStates(states, draws), TrainingStates(states, stamps, law)):
+    for data in (TrainingStates(states, draws), TrainingStates(states, stamps, noise, [level])):
         training = training_of(network, data, settings, 1, "x")
         scaled = scale_stamps(np.asarray(stamps, np.float32))
         parts = training.parts[0].sum(axis=1)
@@ -222,7 +218,7 @@ def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, st
 
 def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     state = np.array([[0.3, -0.5, 0.4, 0.2]])
-    stamps, slopes = stamps_and_slopes(model, exact_operator, state)
+    stamps, slopes = StateOptics(model, exact_operator)(state)
     _, _, fisher = deviance_and_information(noise, 0.002, stamps, stamps, slopes)
     step = 1e-4
     plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
@@ -235,7 +231,8 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
     model, operator, noise, states
 ):
     """More decentre along x is hidden by less tilt about y, along y by more tilt about x."""
-    bounds = bound_covariances(model, operator, noise, [0.002], states, [False])[0, 0]
+    optics = StateOptics(model, operator)
+    bounds = bound_covariances(optics, noise, [0.002], states, [False])[0, 0]
     sigma = np.sqrt(np.diagonal(bounds, axis1=1, axis2=2))
     matrix = (bounds / (sigma[:, :, None] * sigma[:, None, :])).mean(axis=0)
     assert -0.9 < matrix[0, 3] < -0.6
@@ -246,15 +243,15 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 @pytest.mark.parametrize("movable", [False, True])
 def test_noise_free_parameters_are_recovered(model, config, noise, movable):
     """The start is 0.08 of the range aside; with flux and place unknown, they are found, too."""
-    operator = _optics(config, movable, "complex128")
+    optics = StateOptics(model, _optics(config, movable, "complex128"))
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
-    parameters = parameters_of(model, operator, truth)
+    parameters = optics.parameters_of(truth)
     parameters[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, parameters[:, 4:].shape)
-    images, _ = stamps_and_slopes(model, operator, parameters)
+    images, _ = optics(parameters)
     flux = 1 + parameters[:, 4::3] if movable else np.ones((2, 9))
     assert images.sum(axis=(2, 3)) == pytest.approx(flux)
-    start = parameters_of(model, operator, truth + 0.08)
-    fit = fit_states(_likelihood(model, operator, noise, 0.002), images, start, EXACT)
+    likelihood = Likelihood(optics, noise, 0.002, images)
+    fit = likelihood.maximise(optics.parameters_of(truth + 0.08), EXACT)
     assert fit.converged.all()
     assert fit.parameters == pytest.approx(parameters, abs=1e-6)
     assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
@@ -263,12 +260,11 @@ def test_noise_free_parameters_are_recovered(model, config, noise, movable):
 @pytest.mark.parametrize("movable", [False, True])
 def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
     """The estimator is efficient at low noise: χ² of 20 × 4 errors within its 99.9 % range."""
-    operator = _optics(config, movable)
+    optics = StateOptics(model, _optics(config, movable))
     level, truth = 2e-4, states[:20]
     images = noise.draw(stamps[:20], level, np.random.default_rng(7))
-    likelihood = _likelihood(model, operator, noise, level)
-    fit = fit_states(likelihood, images, parameters_of(model, operator, truth + 0.01), FIT)
-    covariances = bound_covariances(model, operator, noise, [level], truth, [movable])[0, 0]
+    fit = Likelihood(optics, noise, level, images).maximise(optics.parameters_of(truth + 0.01), FIT)
+    covariances = bound_covariances(optics, noise, [level], truth, [movable])[0, 0]
     error = fit.parameters[:, :4] - truth
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
     assert 45 < chi2 < 128
@@ -281,11 +277,10 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
 
 def test_free_flux_and_place_cost_precision(model, config, operator, noise, states):
     """Errors grow by a quarter to a third, and shrink in no direction."""
-    covariances = bound_covariances(
-        model, _optics(config, True), noise, [0.002], states[:12], [False, True]
-    )
+    movable, fixed = StateOptics(model, _optics(config, True)), StateOptics(model, operator)
+    covariances = bound_covariances(movable, noise, [0.002], states[:12], [False, True])
     known_flux, unknown = covariances[:, 0]
-    without_flux = bound_covariances(model, operator, noise, [0.002], states[:12], [False])[0, 0]
+    without_flux = bound_covariances(fixed, noise, [0.002], states[:12], [False])[0, 0]
     assert known_flux == pytest.approx(without_flux, rel=1e-3)
     ratio = expected_abs_error(unknown).mean() / expected_abs_error(known_flux).mean()
     assert 1.2 < ratio < 1.35
@@ -295,7 +290,7 @@ def test_free_flux_and_place_cost_precision(model, config, operator, noise, stat
 def test_emulator_of_few_states(model, operator, states, stamps):
     """Stamps that it was given come back, in all mirror images; derivatives are differences."""
     settings = FIT.model_copy(update={"outer_states": 5})
-    emulator = StampEmulator(model, operator, states, stamps, settings)
+    emulator = StampEmulator(StateOptics(model, operator), states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
     emulated, slopes = emulator(mirror.states(states))
     assert emulated == pytest.approx(mirror.stamps(stamps), abs=2e-3)
@@ -308,18 +303,16 @@ def test_emulator_of_few_states(model, operator, states, stamps):
 
 @pytest.mark.parametrize("movable", [False, True])
 def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, movable):
-    operator, noll = _optics(config, movable), np.arange(4, 23)
+    optics = StateOptics(model, _optics(config, movable))
     tilt = np.array([[0.1, 0.12]])
-    truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
-    images, _ = stamps_and_slopes(model, operator, parameters_of(model, operator, truth))
-    likelihood = _likelihood(model, operator, noise, 0.002)
+    truth = np.hstack([coma_free_decentre(model, tilt), tilt])
+    images, _ = optics(optics.parameters_of(truth))
+    likelihood = Likelihood(optics, noise, 0.002, images)
     settings = FIT.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
-    twin = parameters_of(model, operator, twin_states(model, truth, noll))
-    once = settings.model_copy(update={"iterations": 1})
-    stuck = fit_states(likelihood, images, twin, once)
-    twins = twin_states(model, stuck.parameters, noll)
-    fit, in_range = refit_twins(likelihood, images, stuck, twins, settings)
+    twin = optics.parameters_of(twin_states(model, truth))
+    stuck = likelihood.maximise(twin, settings.model_copy(update={"iterations": 1}))
+    fit, in_range = refit_twins(likelihood, stuck, model, settings)
     assert in_range.all()
     assert fit.parameters[:, :4] == pytest.approx(truth, abs=2e-3)
     assert (-2 * fit.height)[0] < (-2 * stuck.height)[0]

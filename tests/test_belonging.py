@@ -14,7 +14,7 @@ from psfdae.cli import stage
 from psfdae.files import Column, ProductError, write_product
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load, load_stage
-from psfdae_paper.stages.alignment_results import require_one_test
+from psfdae_paper.stages.alignment_results import products_of_one_test
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1")
@@ -194,14 +194,14 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
         return [tmp_path / f"{name}.h5"]
 
     estimates, fit = written("e", "estimate", states), written("f", "fit", states)
-    require_one_test(estimates, fit, written("b", "bound", states))
+    products_of_one_test(estimates, fit, written("b", "bound", states))
     bound = written("o", "bound", states, "telescope.diameter_m=2")
     with pytest.raises(ProductError, match=r"o\.h5: telescope\.diameter_m = 2\.0, but .* 1\.5"):
-        require_one_test(estimates, fit, bound)
+        products_of_one_test(estimates, fit, bound)
     for message, other, *override in (
         (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, "seed=2"),
         (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states),
         (r"number of states = 2, but .*e\.h5 has 3", states[:2]),
     ):
         with pytest.raises(ProductError, match=message):
-            require_one_test(estimates, written("o", "fit", other, *override), [])
+            products_of_one_test(estimates, written("o", "fit", other, *override), [])

@@ -47,18 +47,9 @@ def test_a_mistake_is_one_short_line_with_its_place(folder, name, content, words
         assert refusal("fit", "dae", "--stars=x", "--out=y") == line
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("3: x", "key 3"),
-        ("- x", "no mapping"),
-        ("a: 2024-01-02", "neither text"),
-        ("!!python/object/apply:os.getpid []", "python"),
-    ],
-)
-def test_a_network_s_configuration_is_texts_and_numbers(tmp_path, text, words):
-    (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(ProductError, match=rf"config\.yaml: .*{words}"):
+def test_a_configuration_runs_no_code(tmp_path):
+    (tmp_path / "config.yaml").write_text("!!python/object/apply:os.getpid []")
+    with pytest.raises(ProductError, match=r"config\.yaml: line 1, .*python"):
         read_yaml(tmp_path / "config.yaml")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import itertools
 import json
@@ -13,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from command_line import refused
+from command_line import psfdae, refused
 from psfdae import progress
 from psfdae.files import (
     Column,
@@ -21,6 +22,7 @@ from psfdae.files import (
     atomic_path,
     read_product,
     write_product,
+    write_text,
 )
 
 
@@ -72,6 +74,39 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_killed_writer_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    code = (
+        "import os, sys; from psfdae.files import atomic_path\n"
+        "with atomic_path(sys.argv[1]) as new: new.write_text('half'); os.kill(os.getpid(), 9)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
+    assert path.read_text() == "old"
+    assert [p.name[:10] for p in tmp_path.iterdir() if p != path] == [".file.txt."]
+
+
+def test_a_full_disk_is_named_with_the_file_that_has_no_space(tmp_path):
+    with pytest.raises(OSError, match="No space left") as refusal, atomic_path(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert refusal.value.filename == str(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_manifest_of_a_run_shows_which_files_have_changed(tmp_path):
+    names = ("data/a.h5", "tables/b.csv", "logs/a.log", "smoke/data/c.h5", "reference/b.csv")
+    for name in (*names, "runtime.csv", "tables/.b.csv.0.tmp"):
+        write_text(tmp_path / name, f"content of {name}\n")
+    for _ in range(2):  # the second time there is a manifest, which is no product
+        assert psfdae("manifest", tmp_path).exit_code == 0
+    line = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["data/a.h5: OK", "tables/b.csv: OK"]
+    (tmp_path / "data/a.h5").write_text("content of data/a.h4\n")
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "data/a.h5: FAILED" in done.stdout
 
 
 LIGHT = """

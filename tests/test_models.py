@@ -242,9 +242,11 @@ def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
     assert same(whole.result, train(contrary, tmp_path, quick).result)
 
 
-def test_another_training_s_checkpoint_is_ignored(data, tmp_path):
-    save_checkpoint(tmp_path / "checkpoint.pt", "another", {})
-    epochs = []
+@pytest.mark.parametrize("change", [lambda raw: raw, lambda raw: raw[:-1] + b"x"])
+def test_another_training_s_or_a_damaged_checkpoint_is_ignored(data, tmp_path, change):
+    path, epochs = tmp_path / "checkpoint.pt", []
+    save_checkpoint(path, "another", {})
+    path.write_bytes(change(path.read_bytes()))
     train(data, tmp_path, report=lambda row: epochs.append(row["epoch"]))
     assert epochs == [1, 2, 3]
 

@@ -66,7 +66,7 @@ def fitted(seed):
 
 @pytest.fixture(scope="module")
 def models():
-    return [fitted(seed) for seed in (1, 6, 7)]
+    return [fitted(seed) for seed in range(1, 13)]
 
 
 def within(off, error):
@@ -77,7 +77,7 @@ def within(off, error):
 @pytest.mark.slow
 @pytest.mark.parametrize("snr", [(5, 20), (20, 50), (50, 200), (200, 1000), (1000, 2000)])
 def test_errors_hold_at_every_signal_to_noise(models, snr):
-    rng, side, count = np.random.default_rng(2), models[0].stamp_px + 4, 300
+    rng, side, count = np.random.default_rng(2), models[0].stamp_px + 4, 100
     held = {}
     for model in models:
         place = rng.uniform(20, SIZE - 20, (count, 2))
@@ -101,7 +101,7 @@ def test_errors_hold_at_every_signal_to_noise(models, snr):
             held.setdefault(name, []).append(within(off[usable], error[usable]))
     for name, parts in held.items():
         one, two = np.mean(parts, axis=0)
-        # 900 stars leave ± 0.016 and 0.007, but bright stars of a model share its error.
+        # 1200 stars leave ± 0.014 and 0.006, but bright stars of a model share its error.
         assert 0.61 < one < 0.75, (name, one)
         assert 0.91 < two < 0.985, (name, two)
 
@@ -114,7 +114,8 @@ def test_no_errors_of_the_model_where_numbers_are_known(models):
     found = models[0].predict(stamps, fixed=True, **given)
     assert (found.background_error == 0).all()
     assert (found.x_error == 0).all()
-    assert (found.flux_error > 1e5 * models[0].bundle.errors.measured.flux).all()
+    errors = models[0].bundle.errors.measured
+    assert (found.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
 
 
 @pytest.mark.slow
@@ -137,8 +138,11 @@ def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp
     off = np.array(rows["flux"]) - found.flux_total
     one, two = within(off, np.hypot(rows["flux_error"], found.flux_total_error))
     assert one > 0.6 and two > 0.9
-    # No error of a bright star is below that of the model.
-    assert (rows["flux_error"] > models[0].flux_error * rows["flux"]).all()
+    # No error of a bright star is below that of the model, which grows towards the edge.
+    model_error = models[0].flux_error(place)
+    assert (rows["flux_error"] > model_error * rows["flux"]).all()
+    middle, edge = models[0].flux_error(np.array([[300.0, 300.0], [20.0, 20.0]]))
+    assert edge > 1.5 * middle
 
 
 def test_flags_of_photometry():

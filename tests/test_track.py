@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from psfdae.files import Column, write_product
-from psfdae_paper import mlflow_model
+from psfdae_paper import registry
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import runs_of_datasets
 
@@ -122,7 +122,7 @@ def site(tmp_path, empty_database, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(mlflow_model, "write_model", lambda *given: np.zeros((1, 8, 8), "f4"))
+    monkeypatch.setattr(registry, "_with_bundle", lambda files, *given: files)
     return Site(tmp_path, empty_database)
 
 
@@ -152,7 +152,7 @@ def test_run_holds_what_the_files_say(site):
     for name in ("config.yaml", "evaluation.csv", "figures/random-template_strip.png"):
         assert (copies / name).is_file()
     assert not (copies / "figures/held_out-template_strip.png").exists()
-    model = f"models/{dae.outputs.model_outputs[0].model_id}/artifacts/data"
+    model = f"models/{dae.outputs.model_outputs[0].model_id}/artifacts"
     assert (artifacts / model / "dae.safetensors").read_bytes() == b"weights"
 
 
@@ -232,12 +232,12 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys):
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     stars = write_tree(tmp_path)
     _, first = runs_of_datasets(tmp_path, stars)
-    config = first.files["model/config.yaml"]
+    config, content_hash = first.files["model/config.yaml"], first.content_hash
     tree = yaml.safe_load(config.read_text())
     config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
     attempt = runs_of_datasets(tmp_path, stars)[1]
     assert attempt.config_hash == first.config_hash
-    assert attempt.content_hash != first.content_hash
+    assert attempt.content_hash != content_hash
     write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
     assert runs_of_datasets(tmp_path, stars)[1].config_hash != first.config_hash
 

@@ -18,21 +18,6 @@ if command -v flock >/dev/null 2>&1; then
     program=$1
     shift
     [ -z "$(ls .snakemake/locks 2>/dev/null)" ] || "$program" --unlock "$@" >/dev/null 2>&1 || true
-    # Damaged files of an earlier run are set aside and named. They are forced, because Snakemake
-    # does not miss a file as long as what was made from it is there.
-    damaged=$([ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS")
-    if [ -n "$damaged" ]; then
-        # Those that this run knows: it would stop at others, such as a user's own.
-        known=$("$program" --summary "$@" 2>/dev/null | cut -f 1)
-        damaged=$(printf '%s\n' "$damaged" | grep -Fx -e "$known" || true)
-    fi
-    if [ -n "$damaged" ]; then
-        IFS='
-'
-        set -f
-        # shellcheck disable=SC2086 # one argument per line
-        set -- --forcerun $damaged "$@"
-    fi
     set -- "$program" "$@"
 fi
 export PSFDAE_RUN="$PWD"

@@ -67,26 +67,12 @@ def require(
     """
     tree = expected if isinstance(expected, Mapping) else expected.model_dump()
     for key in keys:
-        group, expected_group = _at(config, key), _at(tree, key)
-        names, subgroups = [key], set()
-        if isinstance(group, Mapping) and isinstance(expected_group, Mapping):
-            # If both sides state one part of a group by itself, such as aberrations, they state
-            # all of its parts: then a part that one side lacks differs.
-            of_group = {name for name, value in group.items() if isinstance(value, Mapping)}
-            expected_of_group = {k for k, v in expected_group.items() if isinstance(v, Mapping)}
-            if of_group & expected_of_group:
-                subgroups = of_group | expected_of_group
-            compared = ({*group} & {*expected_group} | subgroups) - UNCOMPARED_KEYS
-            names = [f"{key}.{name}" for name in sorted(compared)]
-        for name in names:
-            value, expected_value = _at(config, name), _at(tree, name)
-            is_missing = value is None or expected_value is None
-            if is_missing and name.rpartition(".")[2] not in subgroups:
-                continue
-            difference = _difference(name, value, expected_value)
-            if difference is not None:
-                dotted_key, a, b = difference
-                raise ProductError(f"{path}: {dotted_key} = {a}, but {expected_from} has {b}")
+        difference = _difference(key, _at(config, key), _at(tree, key), is_partial=True)
+        if difference is not None:
+            name, value, expected_value = difference
+            raise ProductError(
+                f"{path}: {name} = {value}, but {expected_from} has {expected_value}"
+            )
 
 
 def _at(tree: Any, key: str) -> Any:
@@ -96,21 +82,31 @@ def _at(tree: Any, key: str) -> Any:
     return tree
 
 
-def _difference(name: str, first: Any, second: Any) -> tuple[str, Any, Any] | None:
+def _difference(
+    name: str, first: Any, second: Any, is_partial: bool = False
+) -> tuple[str, Any, Any] | None:
     """Return the first key in which two values differ, with its two values; None if they agree.
 
-    Groups are compared key by key; a side without the group has none of its keys.
+    Groups are compared key by key; a side without the group has none of its keys. If `is_partial`,
+    a side need not state the group, nor all of its keys.
     """
-    if first is None and isinstance(second, Mapping):
-        first = {}
-    elif second is None and isinstance(first, Mapping):
-        second = {}
+    if is_partial and (first is None or second is None):
+        return None
     if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
         return None if first == second else (name, first, second)
-    for key in {**first, **second}:
+    keys, stated_parts = [*{**first, **second}], set()
+    if is_partial:
+        # If both sides state one part of a group by itself, such as aberrations, they state all of
+        # its parts: then a part that one side lacks differs.
+        parts = [{k for k, v in side.items() if isinstance(v, Mapping)} for side in (first, second)]
+        stated_parts = parts[0] | parts[1] if parts[0] & parts[1] else set()
+        keys = sorted({*first} & {*second} | stated_parts)
+    for key in keys:
         if key not in UNCOMPARED_KEYS:
-            values = first.get(key, "nothing"), second.get(key, "nothing")
-            if (difference := _difference(f"{name}.{key}", *values)) is not None:
+            absent = {} if key in stated_parts else "nothing"
+            values = first.get(key, absent), second.get(key, absent)
+            is_optional = is_partial and key not in stated_parts
+            if (difference := _difference(f"{name}.{key}", *values, is_optional)) is not None:
                 return difference
     return None
 

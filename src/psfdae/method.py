@@ -297,7 +297,7 @@ class DrawsStars(Protocol):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draw noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
 
-    def fitted_flux_error(self) -> float:
+    def fitted_flux_error(self) -> tuple[float, tuple[float, ...]]:
         """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
 
 

@@ -6,18 +6,18 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar, overload
+from typing import TYPE_CHECKING, Any, SupportsFloat
+
+import yaml
 
 from psfdae.files import ProductError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Value = TypeVar("Value")
 
-
-def read_yaml(path: Path | None) -> dict[str, Any]:
-    """Read a YAML file with a mapping of texts to plain values, as JSON could hold it.
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file with a mapping.
 
     Raises
     ------
@@ -27,25 +27,10 @@ def read_yaml(path: Path | None) -> dict[str, Any]:
     tree = parse_yaml(path)
     if not isinstance(tree, dict):
         raise ProductError(f"{path}: damaged (no mapping in it); write it again")
-    _require_plain(path, tree)
     return tree
 
 
-def _require_plain(path: Path | None, tree: Any) -> None:
-    """Refuse keys that are no texts, and values such as dates that JSON does not know."""
-    if isinstance(tree, dict):
-        for key, value in tree.items():
-            if not isinstance(key, str):
-                raise ProductError(f"{path}: key {key!r} is no text")
-            _require_plain(path, value)
-    elif isinstance(tree, list):
-        for value in tree:
-            _require_plain(path, value)
-    elif not isinstance(tree, str | int | float | None):
-        raise ProductError(f"{path}: {tree!r} is neither text nor number")
-
-
-def parse_yaml(path: Path | None) -> Any:
+def parse_yaml(path: Path) -> Any:
     """Return the content of a YAML file, which is of any type.
 
     Raises
@@ -53,80 +38,33 @@ def parse_yaml(path: Path | None) -> Any:
     ProductError
         If the file is missing or wrong, or has a key twice; names file, line and column.
     """
-    import yaml
-
-    assert path is not None
-    text = _text(path)
     try:
-        loader = yaml.SafeLoader(text)
-        node = loader.get_single_node()
-        if node is None:
-            return None
-        # Before any value is made, because aliases of aliases may fill the memory.
-        _count_values(node, {})
-        return loader.construct_document(node)
+        return yaml.load(_text(path), UniqueKeyLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        position = f": {_mark(mark)}" if mark is not None else ""
+        place = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = " ".join(f"{error.context or ''} {error.problem or ''}".split())
-        raise ProductError(f"{path}{position}: {problem or 'no YAML'}") from None
-    except yaml.reader.ReaderError as error:
-        code = f"#x{ord(text[error.position]):04x}"
-        raise ProductError(
-            f"{path}: {_line_and_column(text[: error.position])}: character {code} is not allowed"
-        ) from None
+        raise ProductError(f"{path}{place}: {problem or 'no YAML'}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
-    except ProductError as error:
-        raise ProductError(f"{path}{error}") from None
-    except Exception as error:  # PyYAML's constructors do not all have errors of their own
-        raise ProductError(f"{path}: a value that cannot be read ({error})") from None
+    except (yaml.YAMLError, ValueError) as error:  # such as a character, or a date, that is none
+        raise ProductError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
 
 
-def _count_values(node: Any, counts: dict[int, int]) -> int:
-    """Return the number of values of a YAML node once its aliases are written out.
+class UniqueKeyLoader(yaml.SafeLoader):
+    """Loader of plain values that refuses a mapping with a key twice; YAML takes the last."""
 
-    `counts` has those of nodes that were counted before, by identity: an alias is the same node.
-
-    Raises
-    ------
-    ProductError
-        If a mapping has a key twice, or there are more than a million values.
-    """
-    import yaml
-
-    if id(node) in counts:
-        return counts[id(node)]
-    counts[id(node)] = 1
-    children: list[Any] = []
-    if isinstance(node, yaml.MappingNode):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the mapping of a node; ConstructorError with the place of a repeated key."""
         keys = set()
-        for key, value in node.value:
-            children += [key, value]
+        for key, _ in node.value:
             # The merge key << may be there several times.
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if (key.tag, key.value) in keys:
-                    raise ProductError(
-                        f": {_mark(key.start_mark)}: key {key.value!r} is there twice"
-                    )
-                keys.add((key.tag, key.value))
-    elif isinstance(node, yaml.SequenceNode):
-        children = node.value
-    counts[id(node)] = 1 + sum(_count_values(child, counts) for child in children)
-    # No file of ours has a thousandth of this.
-    if counts[id(node)] > 1_000_000:
-        raise ProductError(f": {_mark(node.start_mark)}: more than 1000000 values")
-    return counts[id(node)]
-
-
-def _mark(mark: Any) -> str:
-    return f"line {mark.line + 1}, column {mark.column + 1}"
-
-
-def _line_and_column(preceding_text: str) -> str:
-    """Return the position in a file after a text, counted from line 1, column 1."""
-    column = len(preceding_text) - preceding_text.rfind("\n")
-    return f"line {preceding_text.count(chr(10)) + 1}, column {column}"
+                if key.value in keys:
+                    problem = f"key {key.value!r} is there twice"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                keys.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def _text(path: Path) -> str:
@@ -140,19 +78,17 @@ def _text(path: Path) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        position = _line_and_column(data[: error.start].decode("utf-8"))
+        # Position of the wrong byte, counted from line 1, column 1.
+        lines = data[: error.start].decode("utf-8").split("\n")
+        place = f"line {len(lines)}, column {len(lines[-1]) + 1}"
         byte = f"{data[error.start]:#04x}"
-        raise ProductError(f"{path}: {position}: byte {byte} is not UTF-8") from None
+        raise ProductError(f"{path}: {place}: byte {byte} is not UTF-8") from None
 
 
-@overload
-def from_tree(path: Path, tree: object, *keys: str) -> Any: ...
-@overload
-def from_tree(path: Path, tree: object, *keys: str, make: Callable[[Any], Value]) -> Value: ...
 def from_tree(
-    path: Path, tree: Any, *keys: str, make: Callable[[Any], Value] | None = None
-) -> Any | Value:
-    """Return a part of the content of a file, or what `make` makes of it.
+    path: Path, tree: Any, key: str, make: Callable[[Any], Any] = lambda value: value
+) -> Any:
+    """Return the value of a key in the content of a file, or what `make` makes of it.
 
     Parameters
     ----------
@@ -160,40 +96,28 @@ def from_tree(
         The file, for messages.
     tree : object
         Its content.
-    *keys : str
-        Keys from the top of the tree to the part.
+    key : str
     make : callable, optional
-        Makes the result from the part.
+        Makes the result from the value.
 
     Raises
     ------
     ProductError
-        If a key is missing, or `make` refuses its value.
+        If the key is missing, or `make` refuses its value.
     """
-    name = ".".join(keys)
-    for key in keys:
-        if not isinstance(tree, dict) or key not in tree:
-            raise ProductError(f"{path}: key {name!r} is missing")
-        tree = tree[key]
-    if make is None:
-        return tree
+    if not isinstance(tree, dict) or key not in tree:
+        raise ProductError(f"{path}: key {key!r} is missing")
     try:
-        return make(tree)
+        return make(tree[key])
     except (ValueError, TypeError, ArithmeticError) as error:
-        line = " ".join(str(error).split())
-        raise ProductError(f"{path}: {name}: {line}") from None
+        raise ProductError(f"{path}: {key}: {' '.join(str(error).split())}") from None
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file with an object; raise ProductError that names file, line and column."""
+    """Read a JSON file with an object; raise ProductError, which names the file, for another."""
     try:
         tree = json.loads(_text(path))
-    except json.JSONDecodeError as error:
-        position = f"line {error.lineno}, column {error.colno}"
-        raise ProductError(f"{path}: {position}: {error.msg}") from None
-    except RecursionError:
-        raise ProductError(f"{path}: nested too deeply") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProductError(f"{path}: damaged ({error}); write it again") from None
     if not isinstance(tree, dict):
         raise ProductError(f"{path}: damaged (no object in it); write it again")
@@ -201,7 +125,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; raise ProductError if one of the columns named is missing."""
+    """Read the rows of a CSV file; raise ProductError if it lacks a column or is damaged."""
     try:
         reader = csv.DictReader(_text(path).splitlines(keepends=True))
         missing = [name for name in columns if name not in (reader.fieldnames or ())]

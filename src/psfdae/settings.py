@@ -96,25 +96,22 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     configuration gives the same text, comments and number formats do not count)
     and something that a person can paste.
     """
-    return [f"++{key}={_literal(value)}" for key, value in sorted(_leaves(tree))]
+
+    def literal(value: Any) -> str:
+        if isinstance(value, list):
+            return "[" + ",".join(map(literal, value)) + "]"
+        return value if isinstance(value, str) else json.dumps(value)
+
+    return [f"++{key}={literal(value)}" for key, value in sorted(leaves(tree))]
 
 
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the dotted key and the value of each leaf of a tree."""
-    leaves: list[tuple[str, Any]] = []
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return the dotted key and the value of each leaf of a tree, in the order of the tree."""
+    pairs: list[tuple[str, Any]] = []
     for key, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves += _leaves(value, f"{prefix}{key}.")
-        else:
-            leaves.append((prefix + key, value))
-    return leaves
-
-
-def _literal(value: Any) -> str:
-    """Return a value as it is written in an override."""
-    if isinstance(value, list):
-        return "[" + ",".join(_literal(item) for item in value) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
+        is_group = isinstance(value, Mapping)
+        pairs += leaves(value, f"{prefix}{key}.") if is_group else [(prefix + key, value)]
+    return pairs
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]

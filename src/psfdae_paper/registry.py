@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae_paper import mlflow_model
+from psfdae.model.bundle import SUFFIX, write_bundle
+from psfdae.model.packing import uncalibrated
+from psfdae.model.psf_model import PsfModel, load_model
+from psfdae.model.star_sets import read_stars
+from psfdae.rng import stream
+from psfdae_paper.configuration.compose import part
 from psfdae_paper.tracking import MODEL, Run
 
 if TYPE_CHECKING:
@@ -20,60 +24,114 @@ TEST_MSE = "test_mse"
 """Tag of a version, and metric of its run: the mean over all noise levels."""
 
 
-def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -> str | None:
-    """Log the model of a run with all its files; return its id, or None if the run has no model.
+class PyfuncModel:
+    """A model of PSFs as `mlflow.pyfunc` calls it."""
 
-    `mlflow.pyfunc` can load a model that restores single stamps; its signature and an example
-    describe its input.
+    def __init__(self, model: PsfModel) -> None:
+        self.model = model
+
+    def predict(self, model_input: np.ndarray, params: Mapping[str, Any] | None = None) -> Any:
+        """Return PSFs of stamps (n, d, d), times their fluxes; stamps in any unit, with sky."""
+        return self.model.predict(model_input).psf
+
+
+def _load_pyfunc(path: str) -> PyfuncModel:
+    """Load the bundle of a folder, as `mlflow.pyfunc.load_model` asks for."""
+    (bundle,) = Path(path).glob(f"*{SUFFIX}")
+    return PyfuncModel(load_model(bundle))
+
+
+def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> str | None:
+    """Log the model of a run with all its files, and register one that restores single stamps.
+
+    Returns
+    -------
+    str or None
+        Id of the model in MLflow; None if the run has no model, such as that of a sweep.
     """
     from mlflow.entities import LoggedModelOutput
 
-    # A run without files of a model, such as a sweep, has nothing to log.
-    files = {name: path for name, path in record.files.items() if name.startswith(MODEL)}
+    files = {name: path for name, path in run.files.items() if name.startswith(MODEL)}
     if not files:
         return None
-    name = registered_name(record)
-    logged = client.create_logged_model(experiment, name, run_id, model_type=record.kind)
+    name = registered_name(run)
+    logged = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
     model_id: str = logged.model_id
     client.log_outputs(run_id, [LoggedModelOutput(model_id, 0)])
-    # MLflow copies a folder; links in it save a copy of large files.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, "files")
         link(files, folder, MODEL)
-        if record.fit is not None and record.data is not None:
-            example = mlflow_model.write_model(
-                record.fit, record.data, record.reference, name, folder
-            )
-            folder = _loadable(folder, example, run_id, model_id)
+        if run.fit is not None and run.data is not None:
+            folder = _with_bundle(folder, run, run_id, model_id)
         client.log_model_artifacts(model_id, str(folder))
     client.finalize_logged_model(model_id, "READY")
+    # The model becomes a version of the models of its dataset and method.
+    if run.fit is not None:
+        if not client.search_registered_models(f"name = '{name}'"):
+            description = f"PSFs of stamps of {run.dataset}, restored by {run.kind}."
+            client.create_registered_model(name, description=description)
+        tags = {"split": run.split, "reference": run.reference}
+        if TEST_MSE in run.metrics:
+            tags[TEST_MSE] = f"{run.metrics[TEST_MSE]:.6g}"
+        location = client.get_logged_model(model_id).artifact_location
+        client.create_model_version(name, location, run_id, tags, model_id=model_id)
     return model_id
 
 
+def registered_name(run: Run) -> str:
+    """Return the name of the models of a dataset and method."""
+    return f"{run.dataset}-{run.kind}"
+
+
 def link(files: Mapping[str, Path], folder: Path, prefix: str = "") -> None:
-    """Make links to files in a folder, by their names without a prefix."""
+    """Make links to files in a folder, by their names without a prefix.
+
+    MLflow copies a folder; links save a copy of large files.
+    """
     for name, path in files.items():
         target = folder / name.removeprefix(prefix)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.symlink_to(path.resolve())
 
 
-def registered_name(record: Run) -> str:
-    """Return the name of the models of a dataset and method."""
-    return f"{record.dataset}-{record.kind}"
+def _with_bundle(files: Path, run: Run, run_id: str, model_id: str) -> Path:
+    """Add a bundle to the files of a fit; return a folder that `mlflow.pyfunc` can load.
 
+    The bundle has no errors, which take a minute to measure (`psfdae bundle`); no PSF depends on
+    them.
+    """
+    from mlflow.models import Model, ModelSignature
+    from mlflow.pyfunc import save_model
+    from mlflow.types import Schema, TensorSpec
 
-def register(client: MlflowClient, run_id: str, model_id: str, record: Run) -> None:
-    """Make the logged model of a run a version of the models of its dataset and method."""
-    name = registered_name(record)
-    if not client.search_registered_models(f"name = '{name}'"):
-        description = f"PSFs of stamps of {record.dataset}, restored by {record.kind}."
-        client.create_registered_model(name, description=description)
-    tags = {"split": record.split, "reference": record.reference}
-    if TEST_MSE in record.metrics:
-        tags[TEST_MSE] = f"{record.metrics[TEST_MSE]:.6g}"
-    location = client.get_logged_model(model_id).artifact_location
-    client.create_model_version(name, location, run_id, tags, model_id=model_id)
+    assert run.fit is not None and run.data is not None
+    method_class, place = run.fit
+    described, product = method_class.described(place), read_stars(run.data, run.reference)
+    # Groups of settings that tell which stars a fit was trained on, and with which noise.
+    groups = ("seed", "noise", "parts")
+    config = part(groups, {group: described[group] for group in groups})
+    name, fitted = registered_name(run), method_class.load(place, run.reference)
+    bundle, held_out = uncalibrated(
+        fitted, product, run.reference, config, described, name, "not stated"
+    )
+    write_bundle(bundle, files / f"{name}{SUFFIX}")
+    # An example of input: a noisy stamp of a test star on its sky, in photons, shape (1, d, d).
+    noise, rng = held_out.noise, stream(config.seed, "noise", "example")
+    flux = noise.flux(float(np.median(config.noise.levels)))
+    stamp = rng.poisson(flux * held_out.images[:1] + noise.background).astype(np.float32)
+    # Stamps in, PSFs of the same size out. MLflow would look for requirements by itself for long.
+    stamps = Schema([TensorSpec(np.dtype(np.float32), (-1, *stamp.shape[1:]))])
+    folder = files.with_name("loadable")
+    save_model(
+        str(folder),
+        loader_module=__name__,
+        data_path=str(files),
+        pip_requirements=["psfdae"],
+        signature=ModelSignature(stamps, stamps),
+        input_example=stamp,
+        mlflow_model=Model(run_id=run_id, model_id=model_id),
+    )
+    return folder
 
 
 def choose_best(client: MlflowClient, name: str) -> None:
@@ -105,38 +163,3 @@ def forget(client: MlflowClient, run_id: str) -> None:
     for output in outputs.model_outputs if outputs else ():
         client.delete_logged_model(output.model_id)
     client.delete_run(run_id)
-
-
-def _loadable(files: Path, stamp: np.ndarray, run_id: str, model_id: str) -> Path:
-    """Move the files of a model into a folder that `mlflow.pyfunc` can load, and return it.
-
-    `mlflow.pyfunc.save_model` is not used: it reads all files of all installed packages.
-
-    Parameters
-    ----------
-    files : Path
-        Folder with a bundle and further files; it is moved.
-    stamp : ndarray, shape (1, d, d)
-        Example of the model's input.
-    run_id, model_id : str
-    """
-    from mlflow.models import Model, ModelSignature
-    from mlflow.pyfunc import add_to_model
-    from mlflow.types import Schema, TensorSpec
-
-    folder, side = files.with_name("loadable"), stamp.shape[-1]
-    folder.mkdir()
-    files.rename(folder / "data")
-    # The description by which MLflow finds and reads the example.
-    example = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
-    text = json.dumps(stamp.tolist())
-    (folder / example["artifact_path"]).write_text(text, encoding="utf-8")
-    # Stamps in, PSFs of the same size out.
-    stamps = Schema([TensorSpec(np.dtype(np.float32), (-1, side, side))])
-    signature = ModelSignature(stamps, stamps)
-    model = Model(
-        run_id=run_id, model_id=model_id, signature=signature, saved_input_example_info=example
-    )
-    add_to_model(model, loader_module=mlflow_model.__name__, data="data")  # type: ignore[no-untyped-call]
-    model.save(str(folder / "MLmodel"))
-    return folder

@@ -1,17 +1,18 @@
-"""Finished runs in the results folder, read for MLflow: their files, settings and metrics."""
+"""Runs as MLflow shows them, read from the files in the results folder."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
@@ -20,12 +21,16 @@ from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.reading import number, read_csv, read_yaml
+from psfdae.settings import leaves
 from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT, TRAINED
 from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.sweeps.points import hash_of
+
+if TYPE_CHECKING:
+    from mlflow.entities import Metric
 
 WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
 """Files of the networks of scene 3, in their folders."""
@@ -37,25 +42,9 @@ MODEL = "model/"
 """Prefix of the names of files that are the model of a run."""
 
 
-class Point(NamedTuple):
-    """Value of a metric at an epoch, 0 for the finished run; time in ms since 1970."""
-
-    name: str
-    value: float
-    epoch: int
-    time_ms: int
-
-
-class Fit(NamedTuple):
-    """Fit of a method that a model bundle can hold, and its folder or file."""
-
-    kind: type[Method]
-    place: Path
-
-
 @dataclass(frozen=True)
 class Run:
-    """Finished run of a method, a network or a sweep.
+    """Run of a method, a network or a sweep.
 
     Attributes
     ----------
@@ -70,8 +59,8 @@ class Run:
         Files by their names within the run.
     config : mapping
         Configuration of the training, with that of its stars.
-    end_ms : int
-        Time of the end in ms since 1970.
+    last_file : Path or None
+        File that the run has written last; None while it runs.
     metrics : mapping of str to float
         Metrics of the finished run.
     epochs : sequence of mappings
@@ -86,10 +75,8 @@ class Run:
         Tags that not all runs have.
     data : Path or None
         Product with the training data.
-    fit : Fit or None
-        Fit of a run whose model restores single stamps.
-    content_hash : str
-        Hash of files and settings.
+    fit : tuple of a type of Method and a Path, or None
+        Fit that a model bundle can hold, and its folder or file.
 
     Raises
     ------
@@ -106,7 +93,7 @@ class Run:
     experiment: str
     files: Mapping[str, Path] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
-    end_ms: int = 0
+    last_file: Path | None = None
     metrics: Mapping[str, float] = field(default_factory=dict)
     epochs: Sequence[Mapping[str, float]] = ()
     seconds: float | None = None
@@ -114,19 +101,30 @@ class Run:
     parent: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
     data: Path | None = None
-    fit: Fit | None = None
-    content_hash: str = field(init=False)
+    fit: tuple[type[Method], Path] | None = None
 
     def __post_init__(self) -> None:
-        contents = {name: digest_of(path) for name, path in self.files.items()}
-        # 2 is a version: raise it when other metrics or settings are read from the files, and all
-        # runs are imported again.
-        object.__setattr__(self, "content_hash", hash_of([2, self.config_hash, contents]))
+        for path in (*self.files.values(), self.last_file):
+            if path is not None and not path.is_file():
+                raise ProductError(f"{path}: no such file")
 
-    @property
+    @cached_property
     def config_hash(self) -> str:
         """Hash of the settings alone."""
         return hash_of(self.config)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of files and settings."""
+        # 3 is a version: raise it when other metrics or settings are read from the files, and all
+        # runs are imported again.
+        contents = {name: sha256_of(path) for name, path in self.files.items()}
+        return hash_of([3, self.config_hash, contents])
+
+    @property
+    def end_ms(self) -> int:
+        """Time of the end in ms since 1970; 0 for a run that has not ended."""
+        return int(1000 * self.last_file.stat().st_mtime) if self.last_file else 0
 
     @property
     def start_ms(self) -> int:
@@ -135,13 +133,6 @@ class Run:
         if seconds is None:
             seconds = max((row["seconds"] for row in self.epochs), default=0.0)
         return self.end_ms - int(1000 * seconds)
-
-    @property
-    def points(self) -> list[Point]:
-        """Metrics of all epochs and of the finished run, as far as they are finite."""
-        points = epoch_points(self.epochs, self.start_ms)
-        points += [Point(name, value, 0, self.end_ms) for name, value in self.metrics.items()]
-        return [point for point in points if math.isfinite(point.value)]
 
 
 def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
@@ -237,10 +228,10 @@ def _run_of_fit(
         _named_after_fit(kind, **key, experiment=experiment),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
         config={**product.config, **settings},
-        end_ms=_time_ms(fits.outputs(kind, model)[0]),
+        last_file=fits.outputs(kind, model)[0],
         metrics=metrics,
         data=stars,
-        fit=Fit(kind, model) if kind.packing else None,
+        fit=(kind, model) if kind.packing else None,
         epochs=epochs,
     )
 
@@ -270,14 +261,11 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:
     """List figures of a dataset, without those whose path names another split or reference."""
-    labels = [f"{s}-{r}" for s in ("random", "held_out") for r in ("realisation", "template")]
-    labels += ["random", "held_out"]
-    # Longer labels first, because "random" begins "random-template", too.
     figures = {}
     for path in sorted(folder.rglob("*.png")):
         name = path.relative_to(folder).as_posix()
-        label = next((label for label in labels if name.startswith(label)), None)
-        if label in (None, f"{split}-{reference}", split):
+        label = re.match("(random|held_out)(-(realisation|template))?", name)
+        if label is None or label[0] in (split, f"{split}-{reference}"):
             figures[f"figures/{name}"] = path
     return figures
 
@@ -318,7 +306,7 @@ def runs_of_alignment(results: Path) -> list[Run]:
                 _named_after_network(kind),
                 files={**_network_files(folder, weights), **shared},
                 config=config,
-                end_ms=_time_ms(folder / weights),
+                last_file=folder / weights,
                 metrics=metrics,
                 data=results / f"data/alignment/{states}.h5",
                 epochs=_epochs(folder / HISTORY),
@@ -364,7 +352,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
         experiment=f"sweep_{name}",
         files={path.relative_to(folder).as_posix(): path for path in paths},
         config=read_yaml(folder / "sweep.yaml"),
-        end_ms=_time_ms(summary),
+        last_file=summary,
         metrics=metrics,
         tags={"best_point": str(best_point.get("point", ""))},
     )
@@ -400,7 +388,7 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
         experiment=f"sweep_{name}",
         files={file: path for file, path in files.items() if path.is_file()},
         config={**config, "axes": result["values"]},
-        end_ms=_time_ms(folder / "result.json"),
+        last_file=folder / "result.json",
         metrics=result["metrics"],
         epochs=_epochs(history) if history.is_file() else (),
         seconds=read_cost(folder)["seconds"],
@@ -453,7 +441,10 @@ def settings_of(run: Run, preset: str) -> dict[str, str]:
     configuration's for this dataset and preset. The choice does not depend on other runs.
     """
     dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
-    defaults = _default_settings(run.dataset, preset)
+    defaults = {}
+    # Stars that are none of the datasets, such as those of a user, have no defaults.
+    if run.dataset in dataset_names() and (config_dir() / f"preset/{preset}.yaml").is_file():
+        defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
     differing = {
         key: value
         for key, value in flatten(run.config).items()
@@ -462,40 +453,15 @@ def settings_of(run: Run, preset: str) -> dict[str, str]:
     return {"method": run.kind, "split": run.split, "reference": run.reference, **differing}
 
 
-@cache
-def _default_settings(dataset: str, preset: str) -> dict[str, str]:
-    """Return the settings of a dataset in the configuration; none if it has no such dataset."""
-    if dataset not in dataset_names() or not (config_dir() / f"preset/{preset}.yaml").is_file():
-        return {}
-    return flatten(load((f"dataset={dataset}", f"preset={preset}")).model_dump())
-
-
-def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten(tree: Mapping[str, Any]) -> dict[str, str]:
     """Return the leaves of a config by their dotted names: text unchanged, other values as JSON."""
-    leaves: dict[str, str] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves |= flatten(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
-    return leaves
+    return {key: v if isinstance(v, str) else json.dumps(v) for key, v in leaves(tree)}
 
 
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file; raises ProductError if it is missing."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-
-
-def _time_ms(path: Path) -> int:
-    """Return the time at which a file was written, in ms since 1970; raises ProductError."""
-    try:
-        return int(path.stat().st_mtime * 1000)
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
@@ -504,20 +470,23 @@ def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 
-def epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
-    """List the metrics of every epoch of a history, and the best validation error.
+def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Metric]:
+    """Return the metrics of every epoch of a history, and the best validation error.
 
     `start_ms` is the start of the training in ms since 1970.
     """
+    from mlflow.entities import Metric
+
     # Other columns of the history are counters and times, not metrics.
-    points = [
-        Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))
+    metrics = [
+        Metric(name, value, start_ms + int(1000 * row["seconds"]), int(row["epoch"]))
         for row in epochs
         for name, value in row.items()
         if name not in ("epoch", "step", "seconds", "cpu_seconds")
     ]
     # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
-    errors = [p for p in points if p.name == "validation_mse" and math.isfinite(p.value)]
+    errors = [m for m in metrics if m.key == "validation_mse" and math.isfinite(m.value)]
     if errors:
-        points.append(min(errors, key=lambda p: p.value)._replace(name="best_validation_mse"))
-    return points
+        best = min(errors, key=lambda m: m.value)
+        metrics.append(Metric("best_validation_mse", best.value, best.timestamp, best.step))
+    return metrics

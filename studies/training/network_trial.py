@@ -40,7 +40,7 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
         started = time.process_time()
         psfdae([*words, *overrides], standalone_mode=False)
         seconds = time.process_time() - started
-        predict, rows = network_predictor(Path(folder), config), []
+        predict, rows = network_predictor(Path(folder), test, config), []
         for level in config.noise.levels:
             noisy = noisy_test_states(config, test["stamps"], "uniform", level)
             seen = denoise(dae, config, noisy) if ALIGNERS[kind].denoised else noisy

@@ -33,7 +33,7 @@ from psfdae_paper.configuration.compose import write_settings
 from psfdae.method import HISTORY
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
-from psfdae.files import DIGESTS, ProductError
+from psfdae.files import ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 

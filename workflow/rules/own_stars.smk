@@ -87,5 +87,5 @@ rule from_stars_example:
     message:
         "Collecting what was learnt from the image"
     shell:
-        "psfdae copy {input.report} {output.table} {input.selection} {output.selection}"
-        " {input.picture} {output.picture} > {log} 2>&1"
+        "( cp {input.report} {output.table} && cp {input.selection} {output.selection}"
+        " && cp {input.picture} {output.picture} ) > {log} 2>&1"

@@ -19,7 +19,6 @@ from psfdae.errors import Error
 from psfdae.files import (
     atomic_path,
     check_outputs,
-    interrupted,
     write_bytes,
     write_columns,
     write_product,
@@ -223,13 +222,11 @@ def train(
     lists = [files.star_list(source.name) for source in sources] if options.detect else []
     inputs = [path for source in sources for path in source.files()]
     check_outputs([*files.paths(), *lists, page], inputs)
-    if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
+    if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     with _locked(out):
-        # A killed run may have left models of exposures, but not yet the model of all images.
-        unfinished = not files.bundle.exists() and interrupted(files.bundle)
         bundles = sorted(out.glob(f"*{SUFFIX}"))
-        if bundles and not (overwrite or unfinished):
+        if bundles and not overwrite:
             raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
         return _write_model(settings, sources, files, licence, candidates, page)
 

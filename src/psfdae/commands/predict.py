@@ -19,7 +19,7 @@ import numpy as np
 from psfdae.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
 from psfdae.figures import write_png
-from psfdae.files import atomic_path, check_outputs, interrupted
+from psfdae.files import atomic_path, check_outputs
 from psfdae.image.fits_file import Card
 from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.stamps import Stamps, StarFlag
@@ -267,16 +267,15 @@ def predict_image(
 def check_targets(
     inputs: Sequence[object], out: Path, *other_outputs: Path | None, overwrite: bool
 ) -> None:
-    """Refuse outputs that exist, unless `overwrite` is set or a killed run left them.
+    """Refuse outputs that exist, unless `overwrite` is set.
 
     Parameters
     ----------
     inputs : sequence
         All that the command reads.
     out : Path
-        The output that gets its name last.
+        The output; none of the others may have its name.
     other_outputs : Path or None
-        Outputs that may be there already if a run was killed.
 
     Raises
     ------
@@ -285,11 +284,10 @@ def check_targets(
     """
     targets = [out, *filter(None, other_outputs)]
     check_outputs(targets, inputs)
-    replaceable = overwrite or (not out.exists() and interrupted(out))
     for target in targets:
         if target.is_dir():
             raise PredictionError(f"{target}: is a folder, not a file")
-        if target.exists() and not replaceable:
+        if target.exists() and not overwrite:
             raise PredictionError(f"{target}: exists already; --overwrite replaces it")
     for target in targets[1:]:
         if target.resolve() == out.resolve():

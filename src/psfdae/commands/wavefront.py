@@ -239,16 +239,8 @@ def _as_fits(wavefronts: Wavefronts, image: str) -> HDUList:
     # State of the telescope, if one was fitted to all stars: a row for each of its numbers.
     if wavefronts.joint is not None:
         joint = wavefronts.joint
-        columns = [
-            fits.Column("name", "20A", array=np.array(joint.model.names)),
-            fits.Column("unit", "8A", array=np.array(joint.model.units)),
-            fits.Column("prior", "D", array=joint.model.mean),
-            fits.Column("prior_error", "D", array=joint.model.sd),
-            fits.Column("value", "D", array=joint.value),
-            fits.Column("error", "D", array=joint.error),
-            fits.Column("correlation", f"{joint.value.size}D", array=joint.correlation),
-        ]
-        state = fits.BinTableHDU.from_columns(columns, name="JOINT")
+        state = fits.table_to_hdu(joint.table)
+        state.name = "JOINT"
         state.header["PROB"] = (joint.probability, "of this state against its twin")
         hdus.append(state)
     return fits.HDUList(hdus)
@@ -286,12 +278,11 @@ def _joint_report(joint: Joint) -> list[str]:
         f"the telescope, from {joint.star.size} stars together:",
         f"{'number':16}{'unit':>6}{'prior':>12}{'± ':>11}{'found':>12}{'± ':>11}",
     ]
-    columns = (joint.model.mean, joint.model.sd, joint.value, joint.error)
-    for name, unit, *numbers in zip(joint.model.names, joint.model.units, *columns, strict=True):
-        prior, prior_error, value, error = numbers
-        lines.append(
-            f"{name:16}{unit:>6}{prior:12.4g}{prior_error:11.2g}{value:12.4g}{error:11.2g}"
-        )
+    form = "{:16}{:>6}{:12.4g}{:11.2g}{:12.4g}{:11.2g}"
+    lines += [
+        form.format(*row)
+        for row in joint.table["name", "unit", "prior", "prior_error", "value", "error"]
+    ]
     # Two numbers that change the image alike are known worse than their errors suggest, each by
     # itself: name pairs with a correlation above 0.5.
     correlated = np.argwhere(np.triu(np.abs(joint.correlation) > 0.5, 1))

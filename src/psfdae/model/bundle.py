@@ -295,7 +295,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
         problem = f"array {name!r} has shape {array.shape}, not {shape}"
         _require(shape is None or array.shape == shape, path, problem)
         _require(np.isfinite(array), path, f"array {name!r} is not finite")
-        if name.startswith("errors/") and name != "errors/outlier_limit":
+        if name.startswith(("errors/half_width", "errors/ratio", "errors/scale", "errors/flux")):
             _require(array >= 0, path, f"array {name!r} must have numbers of at least 0")
     noise = arrays["errors/noise"]
     is_ascending = nodes > 0 and noise[0] > 0 and (np.diff(noise) > 0).all()

@@ -138,7 +138,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     result = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + wing_light, wings_used)
     stars = result.stars
     # The error of the PSF is no noise, and is as large a part of each flux.
-    stars["flux_error"] = np.hypot(stars["flux_error"], model.flux_error * stars["flux"])
+    model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1)) * stars["flux"]
+    stars["flux_error"] = np.hypot(stars["flux_error"], model_error)
     saturated = np.zeros(image.shape, dtype=bool)
     if observation.saturate is not None:
         saturated = image >= observation.saturate

@@ -41,22 +41,36 @@ class ModelErrors(NamedTuple):
     Attributes
     ----------
     flux : float
-        Error of the flux, over the flux.
+        Error of the flux, over the flux, RMS over the field.
     sky : float
         Error of the sky in a pixel, over the flux.
     centre : float
         Error of the centre along each axis, in pixels.
     fitted_flux : float
-        Error of the flux over the flux, where the PSF is fitted on a sky that is known from the
-        whole image.
+        Error of the flux over the flux, RMS over the field, where the PSF is fitted on a sky that
+        is known from the whole image.
+    growth : tuple of 6 floats
+        (x₀, y₀, a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² + c w² +
+        d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By default
+        it is the same at all places.
     """
 
     flux: float = 0.0
     sky: float = 0.0
     centre: float = 0.0
     fitted_flux: float = 0.0
+    growth: tuple[float, ...] = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
-    def added_to(self, covariance: np.ndarray, flux: np.ndarray) -> np.ndarray:
+    def flux_factor(self, place: np.ndarray) -> np.ndarray:
+        """Return √v: errors of fluxes at places (n, 2), x and y, over those of the field, (n,).
+
+        1 where the place is not known (NaN).
+        """
+        u2, w2 = np.square(place - np.array(self.growth[:2])).T
+        terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
+        return np.where(np.isfinite(u2 + w2), np.sqrt(np.array(self.growth[2:]) @ terms), 1.0)
+
+    def added_to(self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Return covariances of measured stars with the errors of the model too.
 
         Parameters
@@ -64,6 +78,8 @@ class ModelErrors(NamedTuple):
         covariance : ndarray, shape (n, 4, 4)
             Covariance of flux, sky, row and column, due to noise.
         flux : ndarray, shape (n,)
+        place : ndarray, shape (n, 2)
+            Place x and y in the image; NaN where unknown.
 
         Returns
         -------
@@ -73,6 +89,7 @@ class ModelErrors(NamedTuple):
         # Standard errors by the model: those of flux and sky grow with the flux.
         unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
         model_sigma = np.concatenate([unit * [self.flux, self.sky], zeros + self.centre], axis=1)
+        model_sigma *= self.flux_factor(place)[:, None]
         # A method that is given a number returns it with a σ far below any that noise makes.
         variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
         known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
@@ -136,18 +153,21 @@ class ErrorModel:
             "flux_scale": (nodes,),
             "distance_limit": (),
             "outlier_limit": (nodes,),
-            "measured": (len(ModelErrors._fields),),
+            "measured": (10,),
         }
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
         values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
-        return cls(**values | {"measured": ModelErrors(*arrays["measured"].tolist())})
+        flux, sky, centre, fitted_flux, *growth = arrays["measured"].tolist()
+        measured = ModelErrors(flux, sky, centre, fitted_flux, tuple(growth))
+        return cls(**values | {"measured": measured})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
         values = {table.name: getattr(self, table.name) for table in fields(self)}
+        values["measured"] = [*self.measured[:4], *self.measured.growth]
         return {
             name: np.asarray(value, np.float32 if name == "half_width68" else np.float64)
             for name, value in values.items()

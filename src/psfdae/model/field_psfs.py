@@ -70,13 +70,12 @@ class FieldPsfs(ABC):
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image that the model was trained on, if known."""
 
-    @property
-    def flux_error(self) -> float:
-        """Standard error of a star's flux on a known sky due to the model, over the flux.
+    def flux_error(self, place: np.ndarray) -> np.ndarray:
+        """Return the errors of stars' fluxes on a known sky that are due to the model.
 
-        0 if it is not known.
+        Over the flux, of stars at places (n, 2), x and y; 0 if they are not known.
         """
-        return 0.0
+        return np.zeros(len(place))
 
     @property
     def wings(self) -> Wings | None:

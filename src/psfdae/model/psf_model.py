@@ -275,11 +275,15 @@ class PsfModel(FieldPsfs):
         """Light of stars beyond their stamps, if the bundle says any."""
         return self.restorer.wings
 
-    @property
-    def flux_error(self) -> float:
-        """Standard error over the flux that model and wings make of every star on a known sky."""
+    def flux_error(self, place: np.ndarray) -> np.ndarray:
+        """Return what model and wings make of the errors of stars at places (n, 2), x and y.
+
+        Standard errors over the flux (n,) of stars on a known sky.
+        """
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
-        return float(np.hypot(self.bundle.errors.measured.fitted_flux, error / (1.0 + light)))
+        errors = self.bundle.errors.measured
+        fitted_error = errors.fitted_flux * errors.flux_factor(place)
+        return np.asarray(np.hypot(fitted_error, error / (1.0 + light)))
 
     @property
     def image_px(self) -> tuple[int, int] | None:

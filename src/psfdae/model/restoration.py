@@ -374,7 +374,7 @@ def restored_by_measurement(
     )
     measured = estimate.measured
     assert measured is not None and estimate.sigma is not None
-    covariance = errors.measured.added_to(measured.covariance, measured.flux)
+    covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
     # A flux that was given counts if the photometry could use it, another one above its error.
     flux = np.where(has_flux, stars.flux, measured.flux)

@@ -148,8 +148,7 @@ def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> N
     content = io.BytesIO()
     torch.save({"fingerprint": fingerprint, **state}, content)
     digest = hashlib.sha256(content.getbuffer()).hexdigest().encode()
-    # Without a digest beside the file: it changes all the time, and holds its own checksum.
-    with atomic_path(path, digest=False) as temporary, temporary.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(CHECKPOINT_HEADER + digest + b"\n")
         file.write(content.getbuffer())
 

@@ -63,6 +63,16 @@ class Peaks:
     evaluations: np.ndarray
     converged: np.ndarray
 
+    def laplace(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return covariances (M, K, K) and logarithms (M,) of the mass by Laplace's approximation.
+
+        The mass of a peak is its height times √|covariance|; it is 0 where no normal distribution
+        has the peak's information.
+        """
+        covariance = np.linalg.inv(self.information)
+        sign, log_determinant = np.linalg.slogdet(covariance)
+        return covariance, np.where(sign > 0, self.height + 0.5 * log_determinant, -np.inf)
+
     def overwrite(self, rows: np.ndarray, peaks: Peaks, peak_rows: np.ndarray) -> None:
         """Replace the peaks at `rows` by those at `peak_rows` of `peaks`, counts aside."""
         for name in ("parameters", "height", "slope", "information", "converged"):

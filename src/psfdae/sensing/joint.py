@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, Wav
 from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
 from psfdae.telescope.settings import Seeing
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 MAX_ROUNDS = 4
 """Rounds in which stars choose the mode nearest to the state and the state follows them, and in
@@ -65,7 +69,27 @@ class Joint:
     star: np.ndarray
     disagrees: np.ndarray
 
+    @property
+    def table(self) -> Table:
+        """Table with a row for each number: name, unit, prior, fitted value, errors, correlation.
 
+        `correlation` (Q,) is that of the error with the errors of all numbers.
+        """
+        from astropy.table import Table
+
+        columns = {
+            "name": np.array(self.model.names, "U20"),
+            "unit": np.array(self.model.units, "U8"),
+            "prior": self.model.mean,
+            "prior_error": self.model.sd,
+            "value": self.value,
+            "error": self.error,
+            "correlation": self.correlation,
+        }
+        return Table(columns)
+
+
+@dataclass(frozen=True, eq=False)
 class TelescopePosterior:
     """Posterior of the numbers of a telescope, and of the places, fluxes and skies of its stars.
 
@@ -73,7 +97,7 @@ class TelescopePosterior:
     place (x, y), flux and sky of each star in turn. If the FWHM of the seeing is one of the
     numbers, stamps are linear in it about the seeing of `optics`.
 
-    Parameters
+    Attributes
     ----------
     search : WavefrontSearch
     model : TelescopeModel
@@ -82,11 +106,15 @@ class TelescopePosterior:
     optics : StarOptics
     """
 
-    def __init__(
-        self, search: WavefrontSearch, model: TelescopeModel, stars: np.ndarray, optics: StarOptics
-    ) -> None:
-        self.search, self.model, self.stars, self.optics = search, model, stars, optics
-        self.number_count = model.sd.size
+    search: WavefrontSearch
+    model: TelescopeModel
+    stars: np.ndarray
+    optics: StarOptics
+
+    @property
+    def number_count(self) -> int:
+        """Number Q of numbers of the telescope."""
+        return self.model.sd.size
 
     @cached_property
     def _broadening(self) -> SampledStamps:
@@ -94,24 +122,24 @@ class TelescopePosterior:
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
-    def _seeing(self) -> Seeing:
-        assert self.optics.telescope.seeing is not None, "the model has one"
+    def seeing(self) -> Seeing:
+        """Seeing of the optics; a model with a seeing has one."""
+        assert self.optics.telescope.seeing is not None
         return self.optics.telescope.seeing
 
     def relative_seeing(self, t: np.ndarray) -> float:
         """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
         # The FWHM is the last number of the model.
         fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
-        return float(fwhm / self._seeing.fwhm_arcsec)
+        return float(fwhm / self.seeing.fwhm_arcsec)
 
     def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
-        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self._seeing.fwhm_arcsec
+        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self.seeing.fwhm_arcsec
         # The same telescope but for its seeing.
-        seeing = self._seeing.model_copy(update={"fwhm_arcsec": fwhm})
+        seeing = self.seeing.model_copy(update={"fwhm_arcsec": fwhm})
         telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
-        optics = replace(self.optics, telescope=telescope)
-        return TelescopePosterior(self.search, self.model, self.stars, optics)
+        return replace(self, optics=replace(self.optics, telescope=telescope))
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
         """Return the coefficients of the stars (m, K) in waves at standardised numbers t (Q,)."""
@@ -164,7 +192,7 @@ class TelescopePosterior:
             broadened = self._broadening.stamps(modes).reshape(len(self.stars), -1)
             broadened = broadened.astype(np.float64)
             stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
-            slopes[:, q - 1] = self.model.sd[-1] / self._seeing.fwhm_arcsec * broadened
+            slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadened
         expected = self.search.expected_counts(self.stars, stamps, slopes, star_parameters)
         return poisson_information(self.search.photons.counts[self.stars], *expected)
 
@@ -230,9 +258,7 @@ def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     """Return the most probable state with its errors, and its twin if there is another peak."""
     model, stars = posterior.model, posterior.stars
     t = peaks.parameters[:, : posterior.number_count]
-    # Laplace's approximation: mass = height of the peak × √|covariance|.
-    covariance = np.linalg.inv(peaks.information)
-    evidence = peaks.height + 0.5 * np.linalg.slogdet(covariance)[1]
+    covariance, evidence = peaks.laplace()
     best_peak = int(evidence.argmax())
     state_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
     sigma = np.sqrt(np.diagonal(state_covariance))

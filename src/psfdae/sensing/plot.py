@@ -1,4 +1,8 @@
-"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars."""
+"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars.
+
+In: `psfdae.sensing.results.Wavefronts`. Out: a figure with three panels, in which each star has
+its pupil, or its stamp, at its field angle.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.figures import WIDTH_IN, new_figure, styled
-from psfdae.sensing.results import Wavefronts
+from psfdae.sensing.results import Wavefronts, flat_modes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,6 +25,12 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     """Draw wavefronts of bright stars at their places, those of the model, and residual stamps.
 
     The model is the telescope's state if it was fitted, else the mean of the prior.
+
+    Parameters
+    ----------
+    wavefronts : Wavefronts
+    title : str
+        Title above the three panels.
     """
     stars = _bright_separate_stars(wavefronts)
     # OPD of the most probable mode of each star, and of the model.
@@ -53,6 +63,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     cell = 0.92 * ((high - low).max() or 1.0) / CELLS
     half = 0.5 * cell
     for panel, (name, images, limit, colours, unit) in zip(axes, panels, strict=True):
+        # Rows of images run along +y, as the field angles do.
         for (x, y), image in zip(wavefronts.field_deg[stars], images, strict=True):
             mappable = panel.imshow(
                 image,
@@ -70,6 +81,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
             xlabel="x (deg)",
             title=name,
         )
+        # Without stars there is nothing that a colour bar could explain.
         if len(stars):
             figure.colorbar(mappable, ax=panel, location="bottom", shrink=0.8, label=unit)
     axes[0].set_ylabel("y (deg)")
@@ -78,7 +90,10 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
 
 
 def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
-    """Return the brightest explained stars that are a cell or more from each other."""
+    """Return the brightest explained stars that are a cell or more from each other.
+
+    A cell is the field's larger side over `CELLS`. The result has the numbers of the stars.
+    """
     stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
     # Brightest first: of stars in one cell, the brightest is drawn.
     stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
@@ -93,21 +108,12 @@ def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
 
 
 def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return the OPD in waves over the pupil, without piston and tilts, (m, 48, 48).
+    """Return the OPD in waves over the pupil, without piston and tilts, (m, 50, 50).
 
-    NaN where the pupil is not lit. `coefficients` (m, K) are in waves.
+    NaN where less than half of a sample is lit. `coefficients` (m, K) are in waves.
     """
-    # The lit annulus on a grid.
-    axis = np.linspace(-1.0, 1.0, 48)
-    x, y = axis[None, :], axis[:, None]
-    radius = np.hypot(x, y)
-    is_lit = (radius <= 1.0) & (radius >= wavefronts.telescope.obscuration)
     # OPD Σ c_k T_kj M_j of each star.
-    modes = wavefronts.terms.modes(x, y)[:, is_lit]
-    opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ modes
-    # Take out the plane that fits best.
-    planes = np.stack([np.broadcast_to(term, is_lit.shape)[is_lit] for term in (1.0, x, y)], axis=1)
-    opd -= (planes @ np.linalg.lstsq(planes, opd.T, rcond=None)[0]).T
-    images = np.full((len(star), *is_lit.shape), np.nan)
-    images[:, is_lit] = opd
-    return images
+    images, weight = flat_modes(wavefronts.terms, wavefronts.telescope.obscuration, 48)
+    opd = np.einsum("mk,mkj->mj", coefficients, wavefronts.terms.to_modes[star]) @ images
+    opd[:, weight < 0.5 * weight.max()] = np.nan
+    return np.asarray(opd.reshape(len(star), 50, 50))

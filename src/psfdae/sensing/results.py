@@ -71,6 +71,7 @@ def wavefront(
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
     stamps = stars if isinstance(stars, Stamps) else _as_stamps(stars, noise, gain)
+    # A field angle for each star: aberrations change over the field.
     angle = np.asarray(field_deg, float)
     if angle.shape != (len(stamps), 2) or not np.isfinite(angle).all():
         raise SensingError(
@@ -98,7 +99,7 @@ def _as_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None
     SensingError
         If shapes do not fit, or noise or gain is not above 0.
     """
-    # Square stamps, one or more.
+    # Square stamps in double precision, one or more.
     data = np.asarray(stars, float)
     if data.ndim != 3 or data.shape[1] != data.shape[2] or not len(data):
         raise SensingError(f"stars of shape {data.shape}, expected (n, d, d)")
@@ -129,6 +130,38 @@ def _as_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None
         listed=np.full((count, 2), np.nan),
         **dict.fromkeys(("x", "y", "flux", "background", "magnitude", "colour"), unknown),
     )
+
+
+def flat_modes(terms: Terms, obscuration: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the modes of the pupil without piston and tilts, and the light on its samples.
+
+    Taking the plane off every mode takes it off every sum of modes.
+
+    Parameters
+    ----------
+    terms : Terms
+        With J modes.
+    obscuration : float
+        Linear central obscuration of the pupil.
+    samples : int
+        Samples across the pupil; the grid is M = samples + 2 wide.
+
+    Returns
+    -------
+    images : ndarray, shape (J, M²)
+        OPD in waves of a unit of each mode.
+    weight : ndarray, shape (M²,)
+        Transmission of the samples, of sum 1.
+    """
+    pupil = annular_pupil(samples, obscuration)
+    weight = pupil.amplitude.ravel() / pupil.amplitude.sum()
+    # Least-squares planes a + b x + c y of the modes over the pupil.
+    x, y = np.meshgrid(pupil.axis, pupil.axis)
+    planes = np.stack([np.ones(x.size), x.ravel(), y.ravel()])
+    images = terms.modes(pupil.axis[None, :], pupil.axis[:, None])
+    images = images.reshape(len(images), -1)
+    fit = np.linalg.solve((planes * weight) @ planes.T, (planes * weight) @ images.T)
+    return images - fit.T @ planes, weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +274,20 @@ class Wavefronts:
         return {name: np.array(values) for name, values in zip(names, columns, strict=True)}
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
-        """Return central intervals of the coefficients over all modes, (n, K, 2) in waves."""
-        # Quantiles at (1 ± probability)/2 leave out equal parts on both sides.
+        """Return central intervals of the coefficients over all modes of each star.
+
+        Parameters
+        ----------
+        probability : float
+            Probability that an interval holds; by default that of ± σ of a normal distribution.
+
+        Returns
+        -------
+        ndarray, shape (n, K, 2)
+            Lower and upper ends in waves; NaN for stars without usable pixels.
+        """
+        # Quantiles of the draws at (1 ± probability)/2 leave out equal parts on both sides. Draws
+        # go to all modes by their probabilities, so an interval spans a star's twins, too.
         half = 0.5 * probability
         ends = np.quantile(self.coefficients, [0.5 - half, 0.5 + half], axis=1)
         return self._for_all_stars(np.moveaxis(ends, 0, -1))
@@ -250,16 +295,7 @@ class Wavefronts:
     @cached_property
     def rms(self) -> tuple[np.ndarray, np.ndarray]:
         """RMS of the wavefront over the lit pupil in waves, without tilts, and its error, (n,)."""
-        # Modes on 128 samples across the pupil, less their least-squares planes.
-        pupil = annular_pupil(128, self.telescope.obscuration)
-        weight = pupil.amplitude.ravel() / pupil.amplitude.sum()
-        x, y = np.meshgrid(pupil.axis, pupil.axis)
-        planes = np.stack([np.ones(x.size), x.ravel(), y.ravel()])
-        images = self.terms.modes(pupil.axis[None, :], pupil.axis[:, None])
-        images = images.reshape(len(images), -1)
-        fit = np.linalg.solve((planes * weight) @ planes.T, (planes * weight) @ images.T)
-        images = images - fit.T @ planes
-        # Taking a plane off every mode takes it off every sum of modes.
+        images, weight = flat_modes(self.terms, self.telescope.obscuration, 128)
         # Mean square of Σ c_j M_j over the pupil: cᵀ G c with the Gram matrix G of the modes.
         gram = (images * weight) @ images.T
         modes = np.einsum("msk,mkj->msj", self.coefficients, self.terms.to_modes[self.star])
@@ -268,22 +304,37 @@ class Wavefronts:
         return self._for_all_stars(rms.mean(axis=1)), self._for_all_stars(rms.std(axis=1))
 
     def psf(self, oversampling: int = 1, side: int | None = None) -> np.ndarray:
-        """Return posterior mean PSFs, (n, s, s), s = oversampling × side, the chief ray central.
+        """Return posterior mean PSFs, with the chief ray in the middle.
 
-        The whole light is 1 per oversampling²; `side` in pixels is that of the stamps by default.
-        NaN for stars without usable pixels.
+        Parameters
+        ----------
+        oversampling : int
+            Values per pixel along each axis.
+        side : int, optional
+            Side in pixels, by default that of the stamps.
+
+        Returns
+        -------
+        ndarray, shape (n, s, s)
+            With s = oversampling × side. Values are light per pixel: over the whole image they
+            sum to oversampling². NaN for stars without usable pixels.
         """
         return self.psf_and_error(oversampling, side)[0]
 
     def psf_and_error(
         self, oversampling: int = 1, side: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return `psf`, and the standard deviation of its pixels over the star's wavefronts."""
+        """Return `psf`, and the standard deviation of its pixels over the star's wavefronts.
+
+        Parameters and shapes are those of `psf`.
+        """
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
         # The star stands in the middle: its place is no part of the PSF.
         centred = np.zeros((self.draws.shape[1], 2))
+        # Each draw is a wavefront with its PSF: mean and scatter over them, star by star, because
+        # all images of all stars would not fit the memory.
         mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
             # Smaller pixels hold less light: their values are those of a whole pixel.
@@ -294,6 +345,7 @@ class Wavefronts:
     @cached_property
     def model(self) -> np.ndarray:
         """Posterior mean images of the stars without sky, in the unit of the stamps, (n, d, d)."""
+        # A draw has coefficients, then the place (x, y), flux and sky.
         k = len(self.terms.names)
         model = np.full(self.stamps.data.shape, np.nan)
         for row, star in enumerate(self.star):
@@ -312,6 +364,7 @@ class Wavefronts:
     @property
     def snr(self) -> np.ndarray:
         """S/N of a matched filter, (n,): √Σ model² over the noise of the sky in a pixel."""
+        # The filter that is the star's image m has the variance σ² Σ m² and the signal Σ m².
         power = np.sqrt((self.model**2).sum(axis=(1, 2)))
         return np.asarray(power / self.search.photons.sky_noise)
 
@@ -325,15 +378,20 @@ class Wavefronts:
 
     @property
     def chi2(self) -> np.ndarray:
-        """Deviance of the best mode over the number of pixels, (n,)."""
+        """Deviance of the best mode over the number of pixels, (n,); about 1 if it is right."""
         pixels = self.search.photons.pixels[self.star]
         return self._for_all_stars(self.modes.best_modes.deviance / pixels)
 
     def measured(self) -> dict[str, np.ndarray]:
-        """Return place, flux and sky of every star with errors, (n,) each.
+        """Return place, flux and sky of every star with errors.
 
-        The place of the chief ray is a 0-based pixel of the image, where stamps were cut from one,
-        else of the stamp; flux is the whole light.
+        Returns
+        -------
+        dict of ndarray, shape (n,)
+            `x` and `y`, the place of the chief ray: a 0-based pixel of the image, where stamps
+            were cut from one, else of the stamp; `flux`, the whole light, and `sky`, in the unit
+            of the stamps. Each has an error, `x_error` and so on; all are means and standard
+            deviations over all modes. NaN for stars without usable pixels.
         """
         star, photons, side = self.star, self.search.photons, self.stamps.data.shape[-1]
         # Zero and unit of each parameter. Places count from the middle of the stamp, flux and sky
@@ -348,7 +406,7 @@ class Wavefronts:
             "sky": (photons.sky_level[star], np.sqrt(photons.sky_counts[star]) / gain),
         }
         for index, (name, (zero, unit)) in enumerate(scales.items(), len(self.terms.names)):
-            # Mean and standard deviation over all modes.
+            # Mean and standard deviation of the draws of all modes, in the unit of the column.
             draws = self.draws[..., index]
             columns[name] = self._for_all_stars(zero + unit * draws.mean(axis=1))
             columns[f"{name}_error"] = self._for_all_stars(unit * draws.std(axis=1))
@@ -369,7 +427,13 @@ class Wavefronts:
     def table(self) -> Table:
         """Table with a row for every star and mode, the likeliest mode of a star first.
 
-        Coefficients and errors are in waves. `rms` and `rms_error` are in nanometres.
+        A star without usable pixels has a row of NaN. Columns are
+
+        - `id` of the star, number `mode` and its `probability`;
+        - `explained`, `chi2` and `snr` of the star, and its field angle `x_deg`, `y_deg`;
+        - each coefficient and its error in waves, the standard deviation inside the mode;
+        - `rms` of the wavefront over all modes and `rms_error`, in nanometres;
+        - place, flux and sky with errors, as in `measured`.
         """
         from astropy.table import Column, Table
 
@@ -381,6 +445,7 @@ class Wavefronts:
         star = star[order]
 
         def completed(values: np.ndarray) -> np.ndarray:
+            # Values of the summary, and NaN for stars that it has not.
             return np.append(values, unusable)[order]
 
         columns: list[tuple[str, np.ndarray, str | None]] = [

@@ -1,4 +1,9 @@
-"""Random draws from posteriors of many parameters, by Markov chains around their modes."""
+"""Random draws from posteriors of many parameters, by Markov chains around their modes.
+
+In: a function that evaluates posteriors, and for each posterior the places, covariances and masses
+of its modes. Out: draws of the parameters, by which intervals and means are computed. The caller
+is `psfdae.sensing.stars`, with one posterior per star.
+"""
 
 from __future__ import annotations
 
@@ -60,13 +65,16 @@ def sample_around(
     mean, covariance, evidence : ndarray, shapes (M, D), (M, D, D) and (M,)
         Place, covariance and logarithm of the mass of every mode.
     rngs : sequence of n Generators
+        Random stream of each posterior.
 
     Returns
     -------
     ndarray, shape (n, `CHAINS.draws`, D)
+        Draws of each posterior, in the order of the steps, chains side by side.
     """
     posteriors, chains = len(rngs), CHAINS.number
-    # Each chain is given a mode of its posterior, by the masses of the modes.
+    # Each chain is given a mode of its posterior, with the probability of the mode's mass. Masses
+    # are relative to the largest of the posterior, so that none overflows.
     bounds = np.searchsorted(owner, np.arange(posteriors + 1))
     mass = np.exp(evidence - np.maximum.reduceat(evidence, bounds[:-1])[owner])
     mode = np.concatenate(
@@ -77,12 +85,14 @@ def sample_around(
     )
     # Chains of a posterior are neighbours.
     posterior = np.repeat(np.arange(posteriors), chains)
+    # Draws of a reference normal are mean + L x with x ~ N(0, 1) and L Lᵀ = scale² × covariance.
     mean, factor = mean[mode], CHAINS.reference_scale * np.linalg.cholesky(covariance)[mode]
 
     def parameters_of(place: np.ndarray) -> np.ndarray:
         return np.asarray(mean + (factor @ place[:, :, None])[:, :, 0])
 
     def draw_normals() -> np.ndarray:
+        # Each posterior has its own stream: its draws do not depend on the others.
         shape = (chains, mean.shape[1])
         return np.concatenate([rng.standard_normal(shape) for rng in rngs])
 
@@ -94,6 +104,7 @@ def sample_around(
     place = draw_normals() / CHAINS.reference_scale
     height = log_posterior(posterior, parameters_of(place))
     stride = np.ones(posteriors)
+    # All chains of all posteriors go on step by step together.
     draws = []
     for step in steps("draws", range(CHAINS.steps)):
         # Proposal x' = √(1 − s²) x + s ξ with the stride s. It leaves the reference normal as it

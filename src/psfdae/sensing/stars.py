@@ -430,12 +430,9 @@ class WavefrontSearch:
         steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
         with task("modes", steps.max_steps + 1) as advance:
             peaks = climb(evaluate, start, limit, steps, star)
-        # Laplace's approximation: mass = height of the peak × √|covariance|.
-        covariance = np.linalg.inv(peaks.information)
-        sign, log_determinant = np.linalg.slogdet(covariance)
-        evidence = np.where(sign > 0, peaks.height + 0.5 * log_determinant, -np.inf)
+        # Height = −½ (deviance + penalty of the prior).
         deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
-        return StarModes(star, peaks.parameters, covariance, evidence, deviance)
+        return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
 
     def _draw_parameters_of(self, modes: StarModes) -> np.ndarray:
         """Draw from the posteriors of all stars that the modes belong to."""

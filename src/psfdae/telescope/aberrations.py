@@ -1,14 +1,17 @@
 """Settings of the static aberrations of a telescope.
 
-They are given as Seidel terms, as Zernike terms over the field, or by a ray trace. All are OPDs
-in waves of the telescope's wavelength; lengths of a prescription are in metres.
+They are given as Seidel terms, as Zernike terms over the field, or by a ray trace of the surfaces
+of a prescription. All are OPDs in waves of the telescope's wavelength; lengths of a prescription
+are in metres. `psfdae.telescope.field` turns them into coefficients at the field angles of stars.
+
+A ValueError of a check becomes a line of a ConfigError, which names the key.
 """
 
 from __future__ import annotations
 
 import re
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import (
@@ -27,22 +30,46 @@ HIGHEST_NOLL = 45
 """Highest Noll index of a term, the last one of radial order 8."""
 
 
-def _check_not_zero(value: float) -> float:
-    """Return a radius of curvature, or refuse 0."""
+def check_not_zero(value: float) -> float:
+    """Return a radius of curvature, or raise ValueError if it is 0; flat mirrors are left out."""
     if value == 0:
         raise ValueError("must not be 0")
     return value
 
 
-Radius = Annotated[Finite, AfterValidator(_check_not_zero)]
-# Types of settings: two numbers along x and y, waves of scatter, and Sellmeier's three terms.
+# Types of settings: a radius in metres, two numbers along x and y, waves of scatter, and the three
+# terms of Sellmeier's equation.
+Radius = Annotated[Finite, AfterValidator(check_not_zero)]
 Pair = tuple[Finite, Finite]
 Jitter = Annotated[float, Field(ge=0, le=100)]
 Resonances = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
+class OmitsLateKeys(Group):
+    """Group some of whose keys came after its first products.
+
+    These keys are left out of products while they have their default: products of telescopes that
+    do not use them keep their bytes.
+    """
+
+    late_keys: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def omit_late_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the group as a tree, without late keys that have their default."""
+        fields = type(self).model_fields
+        return {
+            key: value
+            for key, value in dump(self).items()
+            if key not in self.late_keys or getattr(self, key) != fields[key].default
+        }
+
+
 class Mirror(Group):
-    """Conic mirror."""
+    """Conic mirror, z = r²/R / (1 + √(1 − (1 + k) r²/R²)) above its vertex.
+
+    R is the radius of curvature and k the conic constant: −1 is a paraboloid.
+    """
 
     radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
     conic: Finite = Field(description="Conic constant")
@@ -65,8 +92,8 @@ class Lens(Group):
     clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
 
     @model_validator(mode="after")
-    def _check_thickness(self) -> Lens:
-        # The front is above the back.
+    def check_thickness(self) -> Lens:
+        """Refuse a lens whose back is not below its front."""
         thickness = self.front_vertex_m - self.back_vertex_m
         if not thickness > 0:
             raise ValueError(
@@ -108,7 +135,7 @@ class Prescription(Group):
         return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
 
     @model_validator(mode="after")
-    def _check_path(self) -> Prescription:
+    def check_path(self) -> Prescription:
         """Refuse lenses without a secondary or a glass, and surfaces in a wrong order."""
         # Lenses need a secondary in front of them, and a glass.
         if self.lenses and self.secondary is None:
@@ -138,7 +165,10 @@ class Prescription(Group):
 
 
 class Seidel(Group):
-    """Static third-order aberrations in waves at H = 1."""
+    """Static third-order aberrations in waves at H = 1, the edge of the field on an axis.
+
+    The wavefront is that of `psfdae.optics.wavefronts`, a polynomial of pupil and field.
+    """
 
     kind: Literal["seidel"] = Field(description="Kind of aberrations; decides the other keys")
     spherical: Finite = Field(description="W040, waves")
@@ -153,13 +183,19 @@ class Seidel(Group):
         return np.array([getattr(self, term) for term in SEIDEL_TERMS])
 
 
-def _as_polynomial(term: Any) -> Any:
+def as_polynomial(term: Any) -> Any:
     """Return a bare number as the term that is the same over the whole field."""
     return {"constant": term} if isinstance(term, int | float) else term
 
 
-def _check_powers(term: dict[str, float]) -> dict[str, float]:
-    """Return a term whose keys are products of x and y, in this order, up to the sixth degree."""
+def check_powers(term: dict[str, float]) -> dict[str, float]:
+    """Return a term whose keys are products of x and y, in this order, up to the sixth degree.
+
+    Raises
+    ------
+    ValueError
+        For a key that is no such product; `constant` is the product of no factors.
+    """
     for name in term:
         if name != "constant" and not re.fullmatch(r"(?=.)x*y*", name):
             raise ValueError(f"{name!r}: must be constant or a product such as x, yy or xxy")
@@ -168,10 +204,15 @@ def _check_powers(term: dict[str, float]) -> dict[str, float]:
     return term
 
 
-def _check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Return terms whose names are Zernike polynomials from z2 on."""
+def check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Return terms whose names are Zernike polynomials, z2 to the highest.
+
+    Raises
+    ------
+    ValueError
+        For another name; z1 is piston, which no image shows.
+    """
     for name in terms:
-        # z1 is piston, which no image shows.
         number = re.fullmatch(r"z([1-9]\d?)", name)
         if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
             raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
@@ -181,8 +222,8 @@ def _check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float
 FieldPolynomial = Annotated[
     dict[str, Finite],
     Field(min_length=1),
-    BeforeValidator(_as_polynomial),
-    AfterValidator(_check_powers),
+    BeforeValidator(as_polynomial),
+    AfterValidator(check_powers),
 ]
 
 
@@ -195,7 +236,7 @@ class Zernike(Group):
 
     kind: Literal["zernike"] = Field(description="Kind of aberrations; decides the other keys")
     terms: Annotated[
-        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(_check_noll)
+        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(check_noll)
     ] = Field(
         description="Waves RMS by Noll index and power of the field: "
         "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
@@ -210,15 +251,21 @@ class Zernike(Group):
     @property
     def polynomials(self) -> list[dict[tuple[int, int], float]]:
         """Coefficient in waves by powers (of x, of y) of the field, in the order of `noll`."""
+        # The key xxy is x²y: powers (2, 1). `constant` has neither letter.
         return [
             {(name.count("x"), name.count("y")): waves for name, waves in term.items()}
             for term in (self.terms[f"z{noll}"] for noll in self.noll)
         ]
 
 
-class Raytraced(Group):
-    """Aberrations of a telescope that a ray trace computes (batoid)."""
+class Raytraced(OmitsLateKeys):
+    """Aberrations of a telescope that a ray trace computes (batoid).
 
+    The telescope may be out of focus, and its secondary misaligned. The trace is that of
+    `psfdae.telescope.raytracing`.
+    """
+
+    late_keys = ("decentre_m", "tilt_deg")
     kind: Literal["raytraced"] = Field(description="Kind of aberrations; decides the other keys")
     prescription: Prescription
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
@@ -240,19 +287,11 @@ class Raytraced(Group):
         return np.array([*self.decentre_m, *np.deg2rad(self.tilt_deg)])
 
     @model_validator(mode="after")
-    def _check_secondary(self) -> Raytraced:
+    def check_secondary(self) -> Raytraced:
+        """Refuse a misalignment of a secondary that is not there."""
         if self.prescription.secondary is None and self.misalignment.any():
             raise ValueError(
                 f"decentre_m = {list(self.decentre_m)}, tilt_deg = {list(self.tilt_deg)}: "
                 "must be 0, because the prescription has no secondary"
             )
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_zero_misalignment(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Products of aligned telescopes keep the bytes that they had before misalignments.
-        return {
-            key: value
-            for key, value in dump(self).items()
-            if key not in ("decentre_m", "tilt_deg") or any(value)
-        }

@@ -3,6 +3,10 @@
 The aberrations of a star are the coefficients of some terms of its wavefront. Tilts are left out:
 they move the star, whose place is not known better than its image tells. All stars follow from a
 few numbers of the telescope, such as the decentre of its secondary mirror.
+
+In: the settings of a telescope (`psfdae.telescope.settings`) and field angles of stars. Out:
+`Terms`, the prior of each star by itself, and `TelescopeModel`, the numbers that are common to
+all stars, with their prior. `psfdae.sensing` measures both.
 """
 
 from __future__ import annotations
@@ -66,9 +70,20 @@ def relative_field(telescope: OwnTelescope, angle_deg: np.ndarray) -> np.ndarray
 def static_zernikes(
     telescope: OwnTelescope, angle_deg: np.ndarray
 ) -> tuple[tuple[int, ...], np.ndarray]:
-    """Return J Noll indices, and static coefficients (n, J) at field angles (n, 2).
+    """Return the static Zernike coefficients of a telescope without Seidel terms.
 
-    The coefficients are an OPD in waves. The telescope has no Seidel terms.
+    Parameters
+    ----------
+    telescope : OwnTelescope
+    angle_deg : ndarray, shape (n, 2)
+        Field angles (x, y).
+
+    Returns
+    -------
+    noll : tuple of int, length J
+        Noll indices.
+    coefficients : ndarray, shape (n, J)
+        OPD in waves.
 
     Raises
     ------
@@ -103,11 +118,19 @@ def trace_zernikes(
         Distance of the detector beyond best focus.
     misalignment : ndarray, shape (4,)
         Decentre x, y in metres and tilt about x, y in radians of the secondary.
+
+    Raises
+    ------
+    RayTracingError
+        If the ray trace of a field is vignetted.
+    MissingExtraError
+        If batoid is not installed.
     """
     from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 
     aberrations = telescope.aberrations
     assert isinstance(aberrations, Raytraced)
+    # batoid is an extra: the message says which telescope needs it.
     with needed_by(f"{telescope.name}: a ray trace"):
         optic = build_optic(aberrations.prescription, telescope, defocus_m)
     field_rad, highest = np.deg2rad(angle_deg), aberrations.highest_zernike
@@ -150,7 +173,8 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
         modes = partial(zernike_images, noll)
         # Z_j goes with cos mφ or sin mφ, which is the same at opposite points if m is even.
         is_even = np.array([noll_to_nm(j)[1] % 2 == 0 for j in noll])
-    # Prior: a fraction of the static coefficient, and a part that all have alike, in quadrature.
+    # Prior: σ² = (fraction × static coefficient)² + waves². The second part is what all stars have
+    # alike; by default it is the star-to-star jitter of the telescope's settings.
     prior = telescope.prior
     waves = jitter if prior.waves is None else prior.waves
     sd = np.hypot(prior.fraction * np.abs(mean), waves)
@@ -186,7 +210,7 @@ class TelescopeModel:
         """
         slopes = []
         for axis, step in enumerate(0.01 * self.sd):
-            # One number at a time.
+            # (c(q + δ) − c(q − δ)) / 2δ, one number at a time.
             shift = np.where(np.arange(self.sd.size) == axis, step, 0.0)
             change = self.coefficients(numbers + shift) - self.coefficients(numbers - shift)
             slopes.append(change / (2.0 * step))
@@ -196,10 +220,20 @@ class TelescopeModel:
 def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> TelescopeModel:
     """Return the model of a telescope that is common to all stars at field angles (n, 2).
 
-    Its numbers are, for Seidel terms, the coefficients that are no tilt; for Zernike terms, the
-    coefficients of their polynomials of the field; for a ray trace, the detector's defocus, and
-    decentre and tilt of the secondary, or without one the place of the optical axis. The FWHM of
-    the seeing is the last number if the prior leaves it free.
+    Its numbers depend on how the telescope is described:
+
+    - Seidel terms: the coefficients that are no tilt;
+    - Zernike terms: the coefficients of their polynomials of the field;
+    - ray trace: the detector's defocus, and decentre and tilt of the secondary, or without one
+      the place of the optical axis.
+
+    The FWHM of the seeing is the last number if the prior leaves it free.
+
+    Parameters
+    ----------
+    telescope : OwnTelescope
+    angle_deg : ndarray, shape (n, 2)
+        Field angles (x, y) of the stars.
     """
     angle_deg = np.asarray(angle_deg, float)
     prior, aberrations, seeing = telescope.prior, telescope.aberrations, telescope.seeing
@@ -252,7 +286,7 @@ def _linear_model(
     fraction, waves : float
         Standard deviation of the numbers: relative to the mean, and in waves, in quadrature.
     """
-    # Prior of the numbers; those without a width are constants.
+    # Prior of the numbers. Those without a width are constants, a fixed part of the coefficients.
     sd = np.hypot(fraction * np.abs(mean), waves)
     is_free = sd > 0
     fixed = np.tensordot(mean[~is_free], basis[~is_free], 1)
@@ -269,7 +303,10 @@ def _linear_model(
 def _ray_traced_model(
     telescope: OwnTelescope, aberrations: Raytraced, angle_deg: np.ndarray
 ) -> TelescopeModel:
-    """Return the model of a ray-traced telescope: defocus, and secondary or optical axis."""
+    """Return the model of a ray-traced telescope: defocus, and secondary or optical axis.
+
+    The coefficients of all stars are traced anew for each set of numbers.
+    """
     prior, defocus_m = telescope.prior, aberrations.defocus_m
     if aberrations.prescription.secondary is not None:
         # Misalignments are in metres and radians, numbers in metres and degrees.

@@ -80,7 +80,8 @@ class ZernikeTracer:
         self.optic = optic
         self.wavelength_m = wavelength_m
         self.field_rad = np.asarray(field_rad, float)
-        # Weighted least squares, (√w Z)⁺ √w.
+        # Weighted least squares of the wavefront on Z_1 … Z_J at the rays: coefficients are
+        # (√w Z)⁺ √w times the lead. Weights of a quadrature make it the fit over the annulus.
         x, y, self._weights = annulus_points(highest_noll, optic.pupilObscuration)
         root = np.sqrt(self._weights)
         basis = zernike_images(range(1, highest_noll + 1), x, y)
@@ -120,9 +121,10 @@ class ZernikeTracer:
 
     def _trace(self, number: int, misalignment: np.ndarray) -> np.ndarray:
         """Return the coefficients (F, J) of one misalignment, whose number messages name."""
-        # The trace changes the rays in place.
+        # Trace all rays through the misaligned telescope; the trace changes them in place.
         rays = self._rays.copy()
         misalign(self.optic, misalignment).trace(rays)
+        # A field that loses a ray is refused: its wavefront would be that of another pupil.
         is_stopped = (rays.vignetted | rays.failed).reshape(len(self.field_rad), -1)
         if is_stopped.any():
             is_vignetted = is_stopped.any(axis=1)
@@ -145,7 +147,8 @@ class ZernikeTracer:
         along = (offset * direction).sum(-1)
         excess = (offset**2).sum(-1) - self.optic.sphereRadius**2
         path = path - along - np.sqrt(along**2 - excess)
-        # Lead of every ray on the mean of its field, in waves, and its fit.
+        # Lead of every ray on the mean of its field, in waves, positive where its path is short.
+        # The fit's first coefficients, piston and tilts, are left out.
         lead = (path @ self._weights[:, None] - path) / self.wavelength_m
         return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
 
@@ -189,9 +192,20 @@ def build_optic(
 
     Its items are M1, M2 and lenses if any, and the detector D, `defocus_m` beyond best focus.
     batoid is imported only here and where rays are launched: no other scene depends on it.
+
+    Parameters
+    ----------
+    prescription : Prescription
+        Surfaces and glass.
+    telescope : Telescope
+        Gives the diameter and the linear central obscuration of the pupil.
+    defocus_m : float
+        Distance of the detector beyond best focus, along the light.
     """
     import batoid
 
+    # Parts of batoid's: a plane at a height, an aperture that blocks light beyond a radius, and
+    # surfaces. All are centred on the axis.
     def at(z: float) -> Any:
         return batoid.CoordSys().shiftLocal([0.0, 0.0, z])
 
@@ -199,7 +213,7 @@ def build_optic(
         return batoid.ObscNegation(batoid.ObscCircle(radius))
 
     def mirror(settings: Mirror, name: str, aperture: Any) -> Any:
-        # Quadric finds no point of a paraboloid on the axis.
+        # batoid's Quadric finds no point of a paraboloid on the axis.
         if settings.conic == -1.0:
             surface = batoid.Paraboloid(settings.radius_m)
         else:
@@ -208,6 +222,7 @@ def build_optic(
         return batoid.Mirror(surface, name=name, coordSys=place, obscuration=aperture)
 
     def lens(name: str, settings: Lens) -> Any:
+        # Two spheres, from the vacuum into the glass and out of it.
         front = ("front", settings.front_radius_m, settings.front_vertex_m, vacuum, glass)
         back = ("back", settings.back_radius_m, settings.back_vertex_m, glass, vacuum)
         surfaces = [

@@ -11,19 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, model_validator
 
 from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
 from psfdae.reading import read_yaml
 from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, validate
-from psfdae.telescope.aberrations import Jitter, Raytraced, Seidel, Zernike
+from psfdae.telescope.aberrations import Jitter, OmitsLateKeys, Raytraced, Seidel, Zernike
 
 
 class Telescope(Group):
@@ -53,7 +47,8 @@ class Seeing(Group):
     )
 
     @model_validator(mode="after")
-    def _check_beta(self) -> Seeing:
+    def check_beta(self) -> Seeing:
+        """Require the exponent of a Moffat profile, and refuse one of a Gaussian."""
         if (self.kind == "moffat") != (self.beta is not None):
             raise ValueError(
                 f"beta = {self.beta}: must be between 1.5 and 20 for kind = moffat, "
@@ -79,7 +74,7 @@ class Prior(Group):
     )
 
 
-def _checked_aberrations(tree: Any) -> Any:
+def aberrations_by_kind(tree: Any) -> Any:
     """Check aberrations by the class of their `kind`.
 
     The class is chosen beforehand, so that messages name no member of a union.
@@ -94,13 +89,14 @@ def _checked_aberrations(tree: Any) -> Any:
     return classes[kind].model_validate(tree)
 
 
-class OwnTelescope(Telescope):
+class OwnTelescope(OmitsLateKeys, Telescope):
     """Telescope of one's own, with its field and aberrations (config/dataset/_telescope.yaml)."""
 
+    late_keys = ("seeing", "prior")
     field_edge_deg: Annotated[float, Field(gt=0, le=45)] = Field(
         description="Field angle of the outermost field on an axis, where the relative field is 1"
     )
-    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(_checked_aberrations)] = (
+    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(aberrations_by_kind)] = (
         Field(description="Static aberrations over the field")
     )
     seeing: Seeing | None = Field(default=None, description="Null: a telescope above the air")
@@ -115,17 +111,6 @@ class OwnTelescope(Telescope):
         fwhm = pixel_width(self.seeing.fwhm_arcsec, self.diameter_m, self.wavelength_m)
         return Profile(fwhm, self.seeing.beta)
 
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Products of telescopes without seeing and prior keep the bytes that they had before there
-        # were such settings.
-        defaults = {"seeing": None, "prior": Prior()}
-        return {
-            key: value
-            for key, value in dump(self).items()
-            if key not in defaults or getattr(self, key) != defaults[key]
-        }
-
 
 def has_own_aberrations(tree: object) -> bool:
     """Return True if a telescope, checked or not yet, brings aberrations of its own."""
@@ -133,14 +118,14 @@ def has_own_aberrations(tree: object) -> bool:
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(keys & set(tree)))
 
 
-def _checked_telescope(tree: Any) -> Any:
-    """Check a telescope by its class: with aberrations, or without."""
+def telescope_by_keys(tree: Any) -> Any:
+    """Check a telescope by its class: with aberrations of its own, or without."""
     if not isinstance(tree, Mapping):
         return tree
     return (OwnTelescope if has_own_aberrations(tree) else Telescope).model_validate(tree)
 
 
-AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(_checked_telescope)]
+AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(telescope_by_keys)]
 
 
 def read_telescope(path: str | Path) -> OwnTelescope:
@@ -160,21 +145,32 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     >>> f"{telescope.name}: a pixel is {telescope.pixel:.2f} λ/D wide"
     'refractor: a pixel is 1.76 λ/D wide'
     """
+    tree = composed_tree(Path(path))
     try:
-        return validate(OwnTelescope, _composed_tree(Path(path).absolute()))
+        return validate(OwnTelescope, tree)
     except ConfigError as error:
-        # Every line of the message names the file as the user did.
-        prefix = f"{Path(path).absolute()}: "
-        lines = [line.removeprefix(prefix) for line in str(error).splitlines()]
+        # Every line of the message names the file.
+        lines = str(error).splitlines()
         raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
 
 
-def _composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the content of a file with that of the files in its list `defaults`.
+def composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the content of a file with that of the files in its list `defaults`, as Hydra does.
 
-    `including` are the files on the way to this one, each of which names the next.
+    Parameters
+    ----------
+    path : Path
+    including : tuple of Path
+        Files on the way to this one, each of which names the next.
+
+    Raises
+    ------
+    ConfigError
+        If the list has an entry that is no name, or names a file that includes this one.
+    ProductError
+        If a file is missing or damaged.
     """
-    if path in including:
+    if path.resolve() in including:
         raise ConfigError(f"{path}: defaults: it names itself")
     # The file without the list of those that it includes.
     tree = read_yaml(path)
@@ -193,18 +189,19 @@ def _composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, An
         # Content of the entry: the file itself, or another file, under its key if it has one.
         part = tree
         if text != "_self_":
-            folder = path.parent.parent / match["group"] if match["group"] else path.parent
-            part = _composed_tree(folder / f"{match['name']}.yaml", (*including, path))
+            # Groups are folders side by side.
+            folder = path.parent / ".." / match["group"] if match["group"] else path.parent
+            part = composed_tree(folder / f"{match['name']}.yaml", (*including, path.resolve()))
             for key in reversed(match["key"].split(".") if match["key"] else []):
                 part = {key: part}
-        composed = _merged(composed, part)
+        composed = merged(composed, part)
     return composed
 
 
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Merge two trees, key by key; where both have a value, that of the second one counts."""
     subtrees = {
-        key: _merged(first[key], value)
+        key: merged(first[key], value)
         for key, value in second.items()
         if isinstance(value, Mapping) and isinstance(first.get(key), Mapping)
     }

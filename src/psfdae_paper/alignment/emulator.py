@@ -12,9 +12,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from psfdae_paper.alignment.fisher import STATES_AT_ONCE, stamps_and_slopes
-from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.alignment.telescope import QuadraticModel, design_states, mirror_symmetries
+from psfdae_paper.alignment.likelihood import STATES_AT_ONCE, StateOptics
+from psfdae_paper.alignment.telescope import design_states, mirror_symmetries
 from psfdae_paper.configuration.alignment import Fit
 
 
@@ -23,9 +22,8 @@ class StampEmulator:
 
     Parameters
     ----------
-    model : QuadraticModel
-    operator : AlignmentStamps
-        The optics that made the stamps.
+    optics : StateOptics
+        The optics that made the stamps, which are not movable.
     states : ndarray, shape (n, 4)
         States within ±1 in units of the range. The first `settings.outer_states` are also stretched
         to between there and `settings.limit`, because nothing can be extrapolated.
@@ -35,24 +33,19 @@ class StampEmulator:
     """
 
     def __init__(
-        self,
-        model: QuadraticModel,
-        operator: AlignmentStamps,
-        states: np.ndarray,
-        stamps: np.ndarray,
-        settings: Fit,
+        self, optics: StateOptics, states: np.ndarray, stamps: np.ndarray, settings: Fit
     ) -> None:
         # States beyond the range: their largest number is stretched to 1 … limit.
         stretched = states[: settings.outer_states]
         reach = np.linspace(1.0, settings.limit, len(stretched))[:, None]
         stretched = stretched * reach / np.abs(stretched).max(axis=1, keepdims=True)
-        self.stamps = np.concatenate([stamps, operator(model(stretched))[0]])
+        self.stamps = np.concatenate([stamps, optics.operator(optics.model(stretched))[0]])
         self.mirrors = mirror_symmetries(stamps.shape[1] - 1)
         states = np.concatenate([states, stretched])
         mirrored = np.concatenate([mirror.states(states) for mirror in self.mirrors])
         # States are the nearer the less their stamps differ: with L Lᵀ = Σ ∂p ∂pᵀ over the pixels
         # of 25 states, the distance of two states is |(t − t')ᵀ L|.
-        slopes = stamps_and_slopes(model, operator, design_states())[1]
+        slopes = optics(design_states())[1]
         changes = np.moveaxis(slopes, 2, 0).reshape(4, -1).astype(np.float64)
         self._metric = np.linalg.cholesky(changes @ changes.T)
         self._places = mirrored @ self._metric

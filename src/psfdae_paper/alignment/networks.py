@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,14 +22,11 @@ from scipy.linalg import eigh
 from torch import nn
 
 from psfdae.networks.training import Row, Training
-from psfdae.networks.weights import channels_last, with_weights
+from psfdae.networks.weights import channels_last
 from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.rng import stream
 from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
 from psfdae_paper.configuration.alignment import Cnn, NetworkTrain, Perceptron
-
-PARAMETERS = 4
-"""Numbers of a state: decentre x, y and tilt x, y in units of the range."""
 
 
 class AlignmentCnn(nn.Module):
@@ -60,7 +56,7 @@ class AlignmentCnn(nn.Module):
             ]
             channels, side = width, -(-side // step)
         self.features = nn.Sequential(*layers)
-        self.linear = nn.Linear(channels * side**2, PARAMETERS)
+        self.linear = nn.Linear(channels * side**2, 4)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
@@ -91,7 +87,7 @@ class AlignmentPerceptron(nn.Module):
         sizes = [config.components, *config.widths]
         layers = [(nn.Linear(*pair), nn.SiLU()) for pair in pairwise(sizes)]
         self.features = nn.Sequential(*chain.from_iterable(layers))
-        self.linear = nn.Linear(sizes[-1], PARAMETERS)
+        self.linear = nn.Linear(sizes[-1], 4)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
@@ -167,11 +163,6 @@ def build_network(
     return model
 
 
-def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: Path) -> Network:
-    """Load the network of a configuration with weights from a file; raises ProductError."""
-    return with_weights(lambda: empty_network(config, fields, stamp_px), weights)
-
-
 def scale_stamps(stamps: np.ndarray) -> torch.Tensor:
     """Scale flux-normalised stamps to a mean of 1, as the networks receive them."""
     images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32))
@@ -214,33 +205,34 @@ def predict_states(
 
 
 @dataclass(frozen=True)
-class MixedNoise:
-    """Noise of random levels λ of a band, drawn from a normal distribution, which is faster."""
-
-    noise: NoiseModel
-    levels: np.ndarray
-
-    def __call__(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw noisy stamps of states, each state at one level."""
-        return self.noise.draw_gaussian(stamps, mixed_levels(self.levels, len(stamps), rng), rng)
-
-
-@dataclass(frozen=True)
 class TrainingStates:
-    """States on which a network is trained.
+    """States on which a network is trained, and the noise of their stamps.
 
     Attributes
     ----------
     states : ndarray, shape (n, 4)
     stamps : ndarray, shape (n, F, d, d) or (D, n, F, d, d)
         Stamps, or D draws of their noise, of which every field shows one at random.
-    noise : MixedNoise, optional
+    noise : NoiseModel, optional
         Noise that is drawn anew for every batch.
+    levels : sequence of float
+        Noise levels λ, of which each state of a batch gets one at random.
     """
 
     states: np.ndarray
     stamps: np.ndarray
-    noise: MixedNoise | None = None
+    noise: NoiseModel | None = None
+    levels: Sequence[float] = ()
+
+    def with_noise(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Add noise of random levels to stamps, if there is noise.
+
+        It is drawn from a normal distribution, which is faster than Poisson counts.
+        """
+        if self.noise is None:
+            return stamps
+        levels = mixed_levels(np.asarray(self.levels), len(stamps), rng)
+        return self.noise.draw_gaussian(stamps, levels, rng)
 
 
 class NetworkTraining(Training):
@@ -298,8 +290,7 @@ class NetworkTraining(Training):
         for numbers in self._shuffled(rng):
             # Noise, then a mirror image: all states of a batch are mirrored alike.
             images, truth = self._draw_stamps(numbers, rng), self.data.states[numbers]
-            if self.data.noise is not None:
-                images = self.data.noise(images, rng)
+            images = self.data.with_noise(images, rng)
             if self.mirrors:
                 mirror = self.mirrors[rng.integers(len(self.mirrors))]
                 images, truth = mirror.stamps(images), mirror.states(truth)
@@ -325,7 +316,7 @@ class NetworkTraining(Training):
         scaled = scale_stamps(clean)
         if self.data.noise is None:
             return scaled, scaled
-        return scaled, scale_stamps(self.data.noise(clean, rng))
+        return scaled, scale_stamps(self.data.with_noise(clean, rng))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the mean squared error of a batch."""
@@ -387,10 +378,10 @@ class PerceptronTraining(NetworkTraining):
         if self.data.noise is None:
             return []
         # Standard deviation of every pixel of the mean stamps, in their scale of mean 1.
-        law, to_mean = self.data.noise.noise, self.data.stamps.shape[-1] ** 2
+        noise, to_mean = self.data.noise, self.data.stamps.shape[-1] ** 2
         mean, axes = (a.double().numpy() for a in (self.model.mean, self.model.axes))
         psf = np.maximum(mean / to_mean, 0.0)
-        sigma = [to_mean * np.sqrt(law.variance(psf, level)) for level in self.data.noise.levels]
+        sigma = [to_mean * np.sqrt(noise.variance(psf, level)) for level in self.data.levels]
         # With σ A = Q R the covariance is Aᵀ σ² A = RᵀR. One array in this mode, which numpy's
         # annotations do not know.
         roots = (np.asarray(np.linalg.qr(s[:, None] * axes, mode="r")) for s in sigma)

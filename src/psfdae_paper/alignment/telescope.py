@@ -23,6 +23,7 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 
 from psfdae.errors import Error
+from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import RayTracingError, ZernikeTracer, build_optic
 from psfdae.telescope.settings import Telescope
@@ -34,9 +35,6 @@ DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))
 """Pairs of degrees of freedom whose products are terms of the quadratic model, in their order."""
-
-TERMS = 1 + 4 + len(PAIRS)
-"""Terms of the quadratic model: 1, the four numbers of a state, their ten products."""
 
 
 class ModelError(Error, RuntimeError):
@@ -168,18 +166,6 @@ def quadratic_terms(states: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(states)), states, *products])
 
 
-def term_slopes(states: np.ndarray) -> np.ndarray:
-    """Return the derivatives of `quadratic_terms` by the four numbers, shape (n, 4, 15)."""
-    # ∂t_k/∂t_a = 1 for k = a, and ∂(t_a t_b) = t_b ∂t_a + t_a ∂t_b, which is 2 t_a for a = b.
-    slopes = np.zeros((len(states), 4, TERMS))
-    for axis in range(4):
-        slopes[:, axis, 1 + axis] = 1.0
-    for term, (a, b) in enumerate(PAIRS, start=5):
-        slopes[:, a, term] += states[:, b]
-        slopes[:, b, term] += states[:, a]
-    return slopes
-
-
 @dataclass(frozen=True)
 class QuadraticModel:
     """Zernike coefficients at F fields as quadratic functions of a state.
@@ -198,7 +184,13 @@ class QuadraticModel:
 
     def jacobian(self, states: np.ndarray) -> np.ndarray:
         """Return derivatives by the four numbers of a state, (n, F, 4, J), in waves per range."""
-        return np.asarray(np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients))
+        # ∂t_k/∂t_a = 1 for k = a, and ∂(t_a t_b) = t_b ∂t_a + t_a ∂t_b, which is 2 t_a for a = b.
+        slopes = np.zeros((len(states), 4, self.coefficients.shape[1]))
+        slopes[:, range(4), range(1, 5)] = 1.0
+        for term, (a, b) in enumerate(PAIRS, start=5):
+            slopes[:, a, term] += states[:, b]
+            slopes[:, b, term] += states[:, a]
+        return np.asarray(np.einsum("nkt,ftj->nfkj", slopes, self.coefficients))
 
 
 def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
@@ -213,9 +205,9 @@ def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
     count, fields, modes = zernikes.shape
     terms = quadratic_terms(states)
     fit, _, rank, _ = np.linalg.lstsq(terms, zernikes.reshape(count, -1), rcond=None)
-    if rank < TERMS:
-        raise ModelError(f"{count} states determine {rank} of the {TERMS} quadratic terms")
-    return QuadraticModel(np.moveaxis(fit.reshape(TERMS, fields, modes), 0, 1))
+    if rank < len(fit):
+        raise ModelError(f"{count} states determine {rank} of the {len(fit)} quadratic terms")
+    return QuadraticModel(np.moveaxis(fit.reshape(-1, fields, modes), 0, 1))
 
 
 def verify(
@@ -239,3 +231,38 @@ def verify(
             "choose a smaller range of misalignment"
         )
     return residual
+
+
+def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray) -> np.ndarray:
+    """Solve for decentres that cancel the field-constant coma of tilts, to first order.
+
+    Along this line tilt and decentre leave hardly more than linear astigmatism, whose sign an
+    image in focus does not show: in focus, t and −t on it are twins.
+
+    Parameters
+    ----------
+    model : QuadraticModel
+    tilts : ndarray, shape (n, 2)
+        Tilts in units of the range.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Decentres in units of the range.
+    """
+    # Slopes S of both comas, Noll 7 and 8, by the four numbers, mean of the fields:
+    # S_d decentre + S_t tilt = 0.
+    coma = slice(7 - FIRST_NOLL, 9 - FIRST_NOLL)
+    slopes = model.coefficients[:, 1:5, coma].mean(axis=0)
+    return -np.linalg.solve(slopes[:2].T, slopes[2:].T @ tilts.T).T
+
+
+def twin_states(model: QuadraticModel, states: np.ndarray) -> np.ndarray:
+    """Return states with the opposite tilt and the same field-constant coma, shape (n, 4).
+
+    In focus their stamps hardly differ from those of `states`; parameters after the four are
+    unchanged.
+    """
+    tilts = states[:, 2:4]
+    decentre = states[:, :2] + coma_free_decentre(model, -2.0 * tilts)
+    return np.concatenate([decentre, -tilts, states[:, 4:]], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.metrics import error_correlation
-from psfdae_paper.alignment.fisher import expected_abs_error
+from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.paper import published
 

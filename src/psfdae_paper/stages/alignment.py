@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from psfdae.belonging import require
-from psfdae.files import Column, read_product, write_csv, write_product
+from psfdae.files import Column, Product, read_product, write_csv, write_product
 from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.options import File
 from psfdae.rng import stream
@@ -86,6 +86,21 @@ def read_model(
     product = read_product(path, "alignment_model", ("coefficients",))
     require(path, product.config, WAVEFRONT_KEYS, expected_config, owner)
     return QuadraticModel(product["coefficients"])
+
+
+def read_states(
+    path: Path,
+    expected_config: Mapping[str, Any] | Group | None = None,
+    owner: object = "the configuration",
+) -> Product:
+    """Read the columns `states` and `stamps` of a product of `alignment states`.
+
+    Parameters and errors are those of `read_model`; by default nothing has to agree.
+    """
+    product = read_product(path, "alignment_states", ("states", "stamps"))
+    if expected_config is not None:
+        require(path, product.config, STAMP_KEYS, expected_config, owner)
+    return product
 
 
 @command("alignment states", reads=STATE_GROUPS, choice=CHOICE)

@@ -20,16 +20,7 @@ import click
 import numpy as np
 
 from psfdae.belonging import require, require_origin, write_origin
-from psfdae.files import (
-    Column,
-    Product,
-    as_csv,
-    as_yaml,
-    read_product,
-    write_csv,
-    write_product,
-    write_text,
-)
+from psfdae.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
 from psfdae.fits import store
 from psfdae.method import CONFIG, HISTORY, TrainingSet
 from psfdae.methods.dae import Dae
@@ -38,7 +29,7 @@ from psfdae.noise import mixed_levels
 from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
-from psfdae.settings import deciding
+from psfdae.settings import deciding, validate
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import (
@@ -54,22 +45,10 @@ from psfdae_paper.configuration.aligners import (
 from psfdae_paper.configuration.alignment import CHOICE, NETWORKS, STAMP_KEYS, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
+from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model, read_states
 
 if TYPE_CHECKING:
     from psfdae_paper.alignment.networks import TrainingStates
-
-Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
-Trained = Annotated[Folder, "Folder for weights, config and history."]
-DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
-
-DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
-"""Networks that are trained on the DAE's output."""
-
-NOISE_FREE = 0.0
-"""Noise level of the rows without noise."""
-
-if TYPE_CHECKING:
 
     class NetworkFolders:
         """A folder of each network, by its name."""
@@ -78,6 +57,13 @@ else:
         "NetworkFolders",
         [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
     )
+
+Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
+Trained = Annotated[Folder, "Folder for weights, config and history."]
+DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
+
+DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
+"""Networks that are trained on the DAE's output."""
 
 
 @command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=CHOICE)
@@ -89,10 +75,8 @@ def train_dae(
     out: Trained,
 ) -> None:
     """Train the DAE on the stamps of the grid."""
-    grid_product, large_product = (
-        read_product(path, "alignment_states", ("states", "stamps")) for path in (grid, train)
-    )
-    require(train, large_product.config, STAMP_KEYS, grid_product.config, grid)
+    grid_product = read_states(grid)
+    large_product = read_states(train, grid_product.config, grid)
     # The DAE restores stamps one by one, whatever their state and field.
     # 100 states of the large set choose the best epoch; the DAE is not trained on them.
     training = _single_stamps(grid_product["stamps"])
@@ -138,24 +122,19 @@ def train_network(
     """Train a network that estimates states of misalignment."""
     from psfdae.networks.training import fingerprint, progress, train
     from psfdae.networks.weights import save_weights
-    from psfdae_paper.alignment.networks import (
-        MixedNoise,
-        NetworkTraining,
-        TrainingStates,
-        training_of,
-    )
+    from psfdae_paper.alignment.networks import NetworkTraining, TrainingStates, training_of
 
     # Settings and training data of this kind of network.
     if ALIGNERS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
     settings: NetworkTrain = getattr(config, f"train_{kind}")
-    product = read_product(states, "alignment_states", ("states", "stamps"))
+    product = read_states(states)
     if dae:
         require_origin(dae, STAMP_KEYS, product)
     # Stamps without noise, with noise that is drawn anew in every epoch, or the DAE's output.
     data = TrainingStates(product["states"], product["stamps"])
     if ALIGNERS[kind].noisy:
-        data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
+        data = replace(data, noise=noise_model(config), levels=config.noise.levels)
     if dae and data.noise:
         data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
         product.arrays.clear()  # only the product's configuration is still needed
@@ -202,13 +181,13 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
     rng = stream(config.seed, "cnn", "noise", kind)
     count = getattr(config, f"train_{kind}").noise_draws
     # Each state has one noise level, which is the same in all draws.
-    level = mixed_levels(data.noise.levels, len(data.states), rng)
+    level = mixed_levels(np.asarray(data.levels), len(data.states), rng)
     denoised = np.empty((count, *data.stamps.shape), np.float32)
     for draw in denoised:
         # 1000 states at a time limit the memory.
         for start in range(0, len(level), 1000):
             part = slice(start, start + 1000)
-            noisy = data.noise.noise.draw(data.stamps[part], level[part], rng)
+            noisy = data.noise.draw(data.stamps[part], level[part], rng)
             draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
     return replace(data, stamps=denoised, noise=None)
 
@@ -228,68 +207,57 @@ def noisy_test_states(
     config: Config, stamps: np.ndarray, test_set: str, level: float
 ) -> np.ndarray:
     """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0."""
-    if level == NOISE_FREE:
+    if level == 0.0:
         return stamps
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
     return noise_model(config).draw(stamps, level, rng)
 
 
-def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np.ndarray]:
+def network_predictor(
+    folder: Path, states: Product, config: Config, name: str | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
     """Load the trained network of a folder, a function from stamps (n, F, d, d) to states (n, 4).
 
     It estimates the mean over the mirror images of the stamps if the network was trained so.
 
+    Parameters
+    ----------
+    folder : Path
+    states : Product
+        States whose stamps the network is to be applied to.
+    config : Config
+    name : str, optional
+        Name that the network must have.
+
     Raises
     ------
     ProductError
-        If its configuration is missing, or has a wrong key.
+        If it was trained for other stamps, has another name, or is damaged.
     """
     import torch
 
-    from psfdae.settings import validate
-    from psfdae_paper.alignment.networks import load_network, predict_states
+    from psfdae.networks.weights import with_weights
+    from psfdae_paper.alignment.networks import empty_network, predict_states
     from psfdae_paper.alignment.telescope import mirror_symmetries
 
-    torch.set_num_threads(config.evaluation.threads)
-    # The configuration beside the weights describes the network; every value is checked.
+    # The configuration beside the weights must agree with the stamps.
     path = folder / CONFIG
     described = read_yaml(path)
-    fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
-    kind = from_tree(path, described, "network", make=_network_kind)
-    settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
-    model = load_network(settings, fields, side, folder / WEIGHTS)
-    mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
-    return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
-
-
-def _network_kind(value: object) -> str:
-    """Return the kind of a network; ValueError if there is no such kind."""
-    if value not in NETWORKS:
-        raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
-    return str(value)
-
-
-def _size(value: object) -> int:
-    """Return a size; ValueError if it is no whole number in the possible range."""
-    if not isinstance(value, int) or not 1 <= value <= 4096:
-        raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
-    return value
-
-
-def require_network(folder: Path, states: Product, name: str | None = None) -> None:
-    """Refuse a network that has been trained for other stamps, or has another name.
-
-    Raises
-    ------
-    ProductError
-        With the values that differ.
-    """
     _, fields, _, side = states["stamps"].shape
-    described, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
-    require(folder / CONFIG, described, keys, {"fields": fields, "stamp_px": side}, states.path)
+    shape = {"fields": fields, "stamp_px": side}
+    require(path, described, tuple(shape), shape, states.path)
     require_origin(folder, STAMP_KEYS, states)
     if name:
-        require(folder / CONFIG, described, ("name",), {"name": name}, "the command")
+        require(path, described, ("name",), {"name": name}, "the command")
+    # It describes training and network, and is checked as settings are.
+    training = f"train_{from_tree(path, described, 'name')}"
+    trained = from_tree(path, described, training, make=partial(validate, NetworkTrain))
+    kind = NETWORKS[trained.network]
+    settings = from_tree(path, described, trained.network, make=partial(validate, kind))
+    torch.set_num_threads(config.evaluation.threads)
+    model = with_weights(lambda: empty_network(settings, fields, side), folder / WEIGHTS)
+    mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
+    return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
 
 @command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=CHOICE)
@@ -304,14 +272,14 @@ def estimate(
 ) -> None:
     """Estimate the states of a test set with every learned method."""
     limit_threads(config.evaluation.threads)
-    product = read_product(states, "alignment_states", ("states", "stamps"))
+    product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
-    folders: dict[str, Path] = vars(networks)
-    for name, folder in folders.items():
-        require_network(folder, product, name)
-    predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
-    # The same noisy stamps for all methods, with the time that each takes.
-    levels = [NOISE_FREE, *config.noise.levels]
+    predict = {
+        name: network_predictor(folder, product, config, name)
+        for name, folder in vars(networks).items()
+    }
+    # The same noisy stamps for all methods, with the time that each takes; λ = 0 is no noise.
+    levels = [0.0, *config.noise.levels]
     estimates = np.empty((len(levels), len(LEARNED), *product["states"].shape))
     rows = []
     for row, level in enumerate(levels):
@@ -364,19 +332,12 @@ def fit(
 ) -> None:
     """Fit the states of a test set by maximum likelihood."""
     from psfdae_paper.alignment.emulator import StampEmulator
-    from psfdae_paper.alignment.fisher import parameters_of, stamps_and_slopes, twin_states
-    from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
+    from psfdae_paper.alignment.likelihood import Likelihood, StateOptics, refit_twins
 
     limit_threads(1)
-    product, large_product = (
-        read_product(path, "alignment_states", ("states", "stamps", "noll"))
-        for path in (states, train)
-    )
-    for states_product in (product, large_product):
-        require(states_product.path, states_product.config, STAMP_KEYS, config)
+    product, large_product = read_states(states, config), read_states(train, config)
     wavefronts = read_model(model, product.config, states)
-    require_network(network, product)
-    predict = network_predictor(network, config)
+    predict = network_predictor(network, product, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
     rows, methods = [], methods_of_set(FITTED, test_set)
@@ -386,26 +347,26 @@ def fit(
     # starts the first fit.
     started = time.perf_counter()
     emulator = StampEmulator(
-        wavefronts, operator(), large_product["states"], large_product["stamps"], config.fit
+        StateOptics(wavefronts, operator()),
+        large_product["states"],
+        large_product["stamps"],
+        config.fit,
     )
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
         # Flux and place of the stars are known, or parameters of the fit, too.
-        stamp_operator = operator(movable=method.unknown_flux)
-        optics = partial(stamps_and_slopes, wavefronts, stamp_operator, emulator=emulator)
-        exact = Likelihood(optics, noise_model(config), level)
+        optics = StateOptics(wavefronts, operator(movable=method.unknown_flux), emulator)
+        exact = Likelihood(optics, noise_model(config), level, stamps)
         # The emulator can compute stars at their given position only.
         fast = exact if method.unknown_flux else replace(exact, stamps=emulator)
-        parameters = parameters_of(wavefronts, stamp_operator, start)
-        first_fit = fit_states(fast, stamps, parameters, config.fit)
+        first_fit = fast.maximise(optics.parameters_of(start), config.fit)
         # In focus, a state and its twin have nearly the same stamps: the better one of both fits.
-        twins = twin_states(wavefronts, first_fit.parameters, product["noll"])
-        best_fit, twin_tried = refit_twins(fast, stamps, first_fit, twins, config.fit)
+        best_fit, twin_tried = refit_twins(fast, first_fit, wavefronts, config.fit)
         # The last steps use the exact optics.
         final_fit = best_fit
         if fast is not exact:
-            final_fit = fit_states(exact, stamps, best_fit.parameters, config.fit)
+            final_fit = exact.maximise(best_fit.parameters, config.fit)
         last_evaluations = final_fit.evaluations * (fast is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
@@ -442,18 +403,18 @@ def bound(
     out: Annotated[File, "HDF5 product with Cramér-Rao bounds."],
 ) -> None:
     """Bound the errors of any unbiased estimate."""
-    from psfdae_paper.alignment.fisher import bound_covariances
+    from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
 
     limit_threads(1)
-    product = read_product(states, "alignment_states", ("states",))
-    require(states, product.config, STAMP_KEYS, config)
+    product = read_states(states, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
     # Bounds with flux and place of the stars known, or unknown: the stamps are then movable.
     methods = methods_of_set(BOUNDS, test_set)
     unknown_flux = [method.unknown_flux for method in methods]
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(unknown_flux))
-    covariances = bound_covariances(wavefronts, operator, noise, levels, truth, unknown_flux)
+    optics = StateOptics(wavefronts, operator)
+    covariances = bound_covariances(optics, noise, levels, truth, unknown_flux)
     about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
     columns = {
         "states": Column(truth, "range", "true states"),

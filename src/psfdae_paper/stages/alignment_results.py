@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -16,9 +16,14 @@ from psfdae.model.star_sets import noise_model
 from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
-from psfdae_paper.alignment.fisher import coma_free_decentre, expected_abs_error
+from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.alignment.telescope import StateTracer, design_states, fit_quadratic
+from psfdae_paper.alignment.telescope import (
+    StateTracer,
+    coma_free_decentre,
+    design_states,
+    fit_quadratic,
+)
 from psfdae_paper.configuration.aligners import (
     ALIGNERS,
     BOUNDS,
@@ -31,7 +36,7 @@ from psfdae_paper.configuration.aligners import (
 from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stages.alignment import StatesFile
+from psfdae_paper.stages.alignment import StatesFile, read_states
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
 
 if TYPE_CHECKING:
@@ -41,14 +46,10 @@ Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]
 Bounds = Annotated[tuple[File, ...], "Product of `alignment bound`.", {"flag": "--bound"}]
 ErrorTable = Annotated[File, "CSV of `alignment tables`."]
-
-MULTIPLES = np.linspace(-1.5, 1.5, 61)
-"""Multiples of the state in the twin figure; −1 is the twin."""
+Png = Annotated[File, "PNG."]
 
 FIGURE_METHODS = [method.name for method in ESTIMATORS if not method.unknown_flux]
 """Methods whose estimates and errors are drawn."""
-
-Png = Annotated[File, "PNG."]
 
 
 class Key(TypedDict):
@@ -59,61 +60,61 @@ class Key(TypedDict):
     method: str
 
 
-def read_errors(
-    estimates: Sequence[Path], fits: Sequence[Path]
-) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Read the estimates of every method and noise level.
+class MethodResult(NamedTuple):
+    """Result of a method, or of a bound, at one noise level.
 
-    Yields
-    ------
-    key : Key
-    truth, estimate : ndarray, shape (n, 4)
-        True and estimated states, in units of the range.
-    """
-    # Networks, and beside them the constant estimate of the aligned telescope.
-    for path in estimates:
-        product = read_product(path, "alignment_estimates")
-        truth, test_set = product["states"], product.config["test_set"]
-        for row, level in enumerate(product["levels"]):
-            key = Key(test_set=test_set, noise_level=float(level), method="constant")
-            yield key, truth, np.zeros_like(truth)
-            for column, method in enumerate(LEARNED):
-                yield {**key, "method": method.name}, truth, product["estimates"][row, column]
-    # Maximum-likelihood fits; a product has one noise level.
-    for path in fits:
-        product = read_product(path, "alignment_fit", ("states", "estimates"))
-        test_set, level = product.config["test_set"], product.config["level"]
-        methods = methods_of_set(FITTED, test_set)
-        for method, states in zip(methods, product["estimates"], strict=True):
-            key = Key(test_set=test_set, noise_level=level, method=method.name)
-            yield key, product["states"], states
-
-
-def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
-    """Read the Cramér–Rao bounds of every noise level.
-
-    Yields
-    ------
+    Attributes
+    ----------
     key : Key
     truth : ndarray, shape (n, 4)
         True states, in units of the range.
-    covariances : ndarray, shape (n, 4, 4)
-        Bounds on the covariances of unbiased estimates.
+    values : ndarray, shape (n, 4) or (n, 4, 4)
+        Estimated states or, of a bound, covariances of unbiased estimates.
+    is_bound : bool
     """
-    for path in bounds:
-        product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
-        test_set = product.config["test_set"]
-        methods = methods_of_set(BOUNDS, test_set)
-        for method, by_level in zip(methods, product["covariances"], strict=True):
-            for level, covariances in zip(product["levels"], by_level, strict=True):
-                key = Key(test_set=test_set, noise_level=float(level), method=method.name)
-                yield key, product["states"], covariances
+
+    key: Key
+    truth: np.ndarray
+    values: np.ndarray
+    is_bound: bool
 
 
-def require_one_test(
+def read_results(
     estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
-) -> None:
-    """Refuse estimates, fits and bounds that differ in telescope, noise or states.
+) -> Iterator[MethodResult]:
+    """Read the results of all methods and noise levels, from products of one test.
+
+    Raises
+    ------
+    ProductError
+        If products differ in telescope, noise or states.
+    """
+    for product in products_of_one_test(estimates, fits, bounds):
+        truth, test_set = product["states"], product.config["test_set"]
+        is_bound = product.kind == "alignment_bound"
+        # Names of the methods, and their values as an array [λ, method, state, ...].
+        if is_bound:
+            aligners = methods_of_set(BOUNDS, test_set)
+            levels, values = product["levels"], product["covariances"].swapaxes(0, 1)
+        elif product.kind == "alignment_fit":
+            # A product of maximum-likelihood fits has one noise level.
+            aligners = methods_of_set(FITTED, test_set)
+            levels, values = np.array([product.config["level"]]), product["estimates"][None]
+        else:
+            # The networks, and the constant estimate of the aligned telescope, which is 0.
+            aligners = [ALIGNERS["constant"], *LEARNED]
+            levels = product["levels"]
+            values = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
+        for level, by_method in zip(levels, values, strict=True):
+            for aligner, of_method in zip(aligners, by_method, strict=True):
+                key = Key(test_set=test_set, noise_level=float(level), method=aligner.name)
+                yield MethodResult(key, truth, of_method, is_bound)
+
+
+def products_of_one_test(
+    estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
+) -> list[Product]:
+    """Read products; refuse those that differ in telescope, noise or states.
 
     Raises
     ------
@@ -121,18 +122,19 @@ def require_one_test(
         With the first value that differs.
     """
     same_keys = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
-    earlier: list[Product] = []
+    products: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
         for path in paths:
             product = read_product(path, f"alignment_{kind}", ("states",))
             # Bounds have no noise that is drawn, and so no seed.
             keys = same_keys if kind == "bound" else ("seed", *same_keys)
             # Compare with all products before; sets of the same name must have the same states.
-            for reference in earlier:
+            for reference in products:
                 require(path, product.config, keys, reference.config, reference.path)
                 if product.config["test_set"] == reference.config["test_set"]:
                     _require_states(product, reference)
-            earlier.append(product)
+            products.append(product)
+    return products
 
 
 def _require_states(product: Product, reference: Product) -> None:
@@ -164,22 +166,22 @@ def tables(
 
     from psfdae_paper.evaluation import alignment_tables as rows
 
-    require_one_test(estimates, fits, bounds)
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
         bound_config = read_product(path, "alignment_bound", ()).config
         require(path, bound_config, STAMP_KEYS, product.config, states)
     unit = product["unit"]
-    # Measured errors, then those that unbiased estimates at the bound would have.
+    # Measured errors, and those that unbiased estimates at the bound would have.
     rows_by_table: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
-    for key, truth, estimate in read_errors(estimates, fits):
-        rows_by_table[errors] += rows.error_rows(key, estimate - truth, unit)
-        if key["method"] != "constant":
-            rows_by_table[correlation] += rows.measured_correlations(key, estimate - truth)
-    for key, _, covariances in read_bounds(bounds):
-        rows_by_table[errors] += rows.bound_rows(key, covariances, unit)
-        if key["method"] == "cramer_rao":
-            rows_by_table[correlation] += rows.predicted_correlations(key, covariances)
+    for key, truth, values, is_bound in read_results(estimates, fits, bounds):
+        if is_bound:
+            rows_by_table[errors] += rows.bound_rows(key, values, unit)
+            if key["method"] == "cramer_rao":
+                rows_by_table[correlation] += rows.predicted_correlations(key, values)
+        else:
+            rows_by_table[errors] += rows.error_rows(key, values - truth, unit)
+            if key["method"] != "constant":
+                rows_by_table[correlation] += rows.measured_correlations(key, values - truth)
     # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
@@ -252,7 +254,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     """Draw the nine stamps of a few states before and after the DAE."""
     from psfdae_paper.evaluation.alignment_figures import stamp_rows
 
-    product = read_product(states, "alignment_states", ("states", "stamps"))
+    product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
@@ -277,10 +279,8 @@ def predicted(
     """Draw estimates against the truth."""
     from psfdae_paper.evaluation.alignment_figures import predicted_against_true
 
-    require_one_test([estimates], fits, [])
     by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
-    truth = np.empty(0)
-    for key, truth, states in read_errors([estimates], fits):  # noqa: B007
+    for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
     write_png(predicted_against_true(truth, by_method), out)
@@ -291,19 +291,13 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     """Draw errors against the size of the misalignment."""
     from psfdae_paper.evaluation.alignment_figures import errors_against_size, size_of
 
-    require_one_test(estimates, fits, bounds)
+    # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
-    for key, truth, states in read_errors(estimates, fits):
-        if key["method"] in FIGURE_METHODS and key["noise_level"] > 0:
-            error = np.abs(states - truth).mean(axis=1)
-            curves[key["noise_level"]][key["method"]] = (size_of(truth), error)
-    # The bound on the mean error of the four numbers.
-    count = 0
-    for key, truth, covariances in read_bounds(bounds):
-        if key["method"] == "cramer_rao":
-            error, count = expected_abs_error(covariances).mean(axis=1), len(truth)
-            curves[key["noise_level"]]["cramer_rao"] = (size_of(truth), error)
-    title = f"Errors against misalignment, {count} uniform states"
+    for key, truth, values, is_bound in read_results(estimates, fits, bounds):
+        if key["noise_level"] > 0 and key["method"] in (*FIGURE_METHODS, "cramer_rao"):
+            error = expected_abs_error(values) if is_bound else np.abs(values - truth)
+            curves[key["noise_level"]][key["method"]] = (size_of(truth), error.mean(axis=1))
+    title = f"Errors against misalignment, {len(truth)} uniform states"
     write_png(errors_against_size(curves, title), out)
 
 
@@ -322,11 +316,13 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
 
     limit_threads(1)
     # In focus, the stamps of a state and of its twin hardly differ; a defocus tells them apart.
+    multiples = np.linspace(-1.5, 1.5, 61)
     rows, stamp_rows, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
-        state, line_stamps = _stamps_of_multiples(config, defocus)
-        state_stamps = line_stamps[np.argmin(np.abs(MULTIPLES - 1.0))].astype(np.float64)
-        twin_stamps = line_stamps[np.argmin(np.abs(MULTIPLES + 1.0))]
+        state, line_stamps = _stamps_of_multiples(config, defocus, multiples)
+        # The multiple 1 is the state, −1 its twin.
+        state_stamps = line_stamps[np.argmin(np.abs(multiples - 1.0))].astype(np.float64)
+        twin_stamps = line_stamps[np.argmin(np.abs(multiples + 1.0))]
         focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
         stamp_rows += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
         # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
@@ -335,30 +331,32 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
             chi2 = ((line_stamps - state_stamps) ** 2 / variance).sum(axis=(1, 2, 3))
             rows += [
                 (level, 1e3 * defocus, multiple, value)
-                for multiple, value in zip(MULTIPLES, chi2, strict=True)
+                for multiple, value in zip(multiples, chi2, strict=True)
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
     write_png(twin_ambiguity(curves, stamp_rows, state), out)
 
 
-def _stamps_of_multiples(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _stamps_of_multiples(
+    config: Config, defocus_m: float, multiples: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Ray-trace the stamps of multiples of a state whose decentre cancels the coma of its tilt.
 
     Returns
     -------
     state : ndarray, shape (4,)
         The state in units of the range.
-    stamps : ndarray, shape (61, F, d, d)
-        Stamps of `MULTIPLES` of the state, with the CCD at a defocus of `defocus_m` metres.
+    stamps : ndarray, shape (len(multiples), F, d, d)
+        Stamps of multiples of the state, with the CCD at a defocus of `defocus_m` metres.
     """
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
     model = fit_quadratic(design_states(), tracer(design_states()))
     tilt = np.array([(0.20, 0.25)])  # x, y in units of the range
-    state = np.concatenate([coma_free_decentre(model, tilt, operator.noll), tilt], axis=1)[0]
-    return state, operator(tracer(MULTIPLES[:, None] * state))[0]
+    state = np.concatenate([coma_free_decentre(model, tilt), tilt], axis=1)[0]
+    return state, operator(tracer(multiples[:, None] * state))[0]
 
 
 @command("alignment figure correlation")

@@ -77,7 +77,7 @@ def run(config: Config, task: Task, name: str) -> Measured:
 def _rows(config: Config, task: Task, role: str) -> list[Row]:
     """Measure one network at all noise levels; return rows like those of the main workflow."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
-    predict = network_predictor(task.folder, config)
+    predict = network_predictor(task.folder, product, config)
     # The test part is the uniform set, with the noise that it has in the main workflow.
     test_set = "uniform" if role == "test" else role
     rows: list[Row] = []

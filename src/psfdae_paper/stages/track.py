@@ -1,14 +1,13 @@
 """Stage `track`: finished runs become MLflow runs, and again without duplicates.
 
-The results folder is the truth and the database a view of it: no training talks
-to MLflow, and a lost database is rebuilt by running the stage again.
+The results folder is the truth and the database a view of it: a lost database is rebuilt by
+running the stage again.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import math
 import os
 import tempfile
 from collections import Counter
@@ -18,28 +17,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.errors import Error
-from psfdae.files import atomic_path, write_text
+from psfdae.files import as_yaml, write_columns
 from psfdae.method import CONFIG
 from psfdae.options import File, Folder
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
-from psfdae_paper.registry import (
-    choose_best,
-    forget,
-    link,
-    log_model,
-    register,
-    registered_name,
-)
+from psfdae_paper.registry import choose_best, forget, link, log_model, registered_name
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
     Run,
-    digest_of,
+    epoch_metrics,
     runs_of_alignment,
     runs_of_datasets,
     runs_of_sweep,
     settings_of,
+    sha256_of,
 )
 from psfdae_paper.views import show
 
@@ -56,18 +49,6 @@ LIVE = "live"
 
 PARENT = "mlflow.parentRunId"
 """Tag by which MLflow shows a run as a part of another."""
-
-BATCH, PARAM_LENGTH = 100, 6000
-"""MLflow takes 100 params, or 1000 metrics, at once, and 6000 characters of a param."""
-
-MOST_RUNS = 50_000
-"""Runs of an experiment that MLflow gives at once, at most."""
-
-DIGEST = 16
-"""Characters of the SHA-256 of its product that tell a dataset from others."""
-
-COLUMNS = ("run_id", "action", "experiment", *SLOT, "config_hash")
-NOT_SENT = "not sent"
 
 
 class TrackingError(Error, RuntimeError):
@@ -103,14 +84,14 @@ def track(
 
 def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
     """Import runs; see `track`. Raises TrackingError if the database cannot be used."""
-    artifacts = database.parent / "mlartifacts"
-    uri = prepared()
-    tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
-    done: list[tuple[str, str]] = []
-    with alone(database):
+    uri = server()
+    import_tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
+    # MLflow's id of each run, and what was done with it.
+    outcomes: list[tuple[str, str]] = []
+    with locked(database):
         try:
-            for outcome in _import(runs, tags, uri, database, artifacts):
-                done.append(outcome)
+            for outcome in _import(runs, import_tags, uri, database):
+                outcomes.append(outcome)
         except Exception as error:
             if not ours_to_explain(error):
                 raise
@@ -121,17 +102,21 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
                 ) from error
             print(
                 f"MLflow at {uri} cannot be used: {first_line(error)}\n"
-                f"Not sent: {', '.join(r.name for r in runs[len(done) :])}\n"
+                f"Not sent: {', '.join(run.name for run in runs[len(outcomes) :])}\n"
                 "To send later, repeat the import (snakemake --forcerun track)."
             )
-    done += [("", NOT_SENT)] * (len(runs) - len(done))
-    write_text(receipt, _as_csv(runs, preset, done))
-    counts = Counter(action for _, action in done)
-    print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
+    outcomes += [("", "not sent")] * (len(runs) - len(outcomes))
+    ids, actions = [run_id for run_id, _ in outcomes], [action for _, action in outcomes]
+    columns = {"run_id": ids, "action": actions, "experiment": [run.experiment for run in runs]}
+    tags = [{"preset": preset, **tags_of(run)} for run in runs]
+    columns |= {key: [row[key] for row in tags] for key in (*SLOT, "config_hash")}
+    write_columns(receipt, columns)
+    counts = sorted(Counter(actions).items())
+    print(f"{len(runs)} runs:", ", ".join(f"{count} {action}" for action, count in counts))
 
 
-def prepared() -> str:
-    """Address of the server that the environment names, "" if none; MLflow is made ready."""
+def server() -> str:
+    """Return the address of the server that the environment names, "" if none; set up MLflow."""
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     # MLflow's own waits add up to minutes for a server that is away.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
@@ -140,7 +125,7 @@ def prepared() -> str:
 
 
 @contextmanager
-def alone(database: Path) -> Iterator[None]:
+def locked(database: Path) -> Iterator[None]:
     """Wait for other importers: two that meet on a new database would ruin it."""
     import fcntl
 
@@ -151,167 +136,159 @@ def alone(database: Path) -> Iterator[None]:
 
 
 def _import(
-    runs: Sequence[Run], tags: dict[str, str], uri: str, database: Path, artifacts: Path
+    runs: Sequence[Run], import_tags: dict[str, str], uri: str, database: Path
 ) -> Iterator[tuple[str, str]]:
-    """Id and action of one record after the other."""
+    """Import one run after the other; yield MLflow's id of each, and what was done.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    import_tags : dict of str
+        Tags that all runs of this import have.
+    uri : str
+        Address of a server; "" takes the database.
+    database : Path
+    """
     client = client_of(uri, database)
     experiments: dict[str, str] = {}
-    known: dict[tuple[str, ...], list[MlflowRun]] = {}
     imported: dict[str, str] = {}
-    for record in runs:
-        name = record.experiment
-        if name not in experiments:
-            experiments[name] = experiment_of(client, name, uri, artifacts)
-            for old in _runs(client, experiments[name]):
-                known.setdefault((name, *_slot(old.data.tags)), []).append(old)
-        own = {**tags, **tags_of(record)}
-        if record.parent:
-            own[PARENT] = imported[record.parent]
-        outcome = _import_one(
-            client, experiments[name], record, own, known.get((name, *_slot(own)), ())
-        )
-        imported[record.source] = outcome[0]
+    for run in runs:
+        if run.experiment not in experiments:
+            experiments[run.experiment] = experiment_of(client, run.experiment, uri, database)
+        tags = {**import_tags, **tags_of(run)}
+        if run.parent:
+            tags[PARENT] = imported[run.parent]
+        outcome = _import_run(client, experiments[run.experiment], run, tags)
+        imported[run.source] = outcome[0]
         yield outcome
-    for name in dict.fromkeys(registered_name(record) for record in runs if record.fit):
+    for name in dict.fromkeys(registered_name(run) for run in runs if run.fit):
         choose_best(client, name)
     for name, experiment in experiments.items():
-        show(client, experiment, [record for record in runs if record.experiment == name])
+        show(client, experiment, [run for run in runs if run.experiment == name])
 
 
 def client_of(uri: str, database: Path) -> MlflowClient:
-    """A client of a server, or else of the database, which is made if missing."""
+    """Return a client of a server, or else of the database, which it makes if it is missing."""
     from mlflow import MlflowClient
 
-    if not uri:
-        if not database.exists():
-            # The migrations take seconds; killed within them, MLflow could not go on.
-            with atomic_path(database, digest=False) as temporary:
-                MlflowClient(f"sqlite:///{temporary.resolve()}").search_experiments(max_results=1)
-        uri = f"sqlite:///{database.resolve()}"
-    return MlflowClient(uri)
+    return MlflowClient(uri or f"sqlite:///{database.resolve()}")
 
 
-def experiment_of(client: MlflowClient, name: str, uri: str, artifacts: Path) -> str:
-    """Id of an experiment, which is made if missing; raises TrackingError if it was moved."""
+def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> str:
+    """Return the id of an experiment, which is made if missing.
+
+    Raises
+    ------
+    TrackingError
+        If the database keeps files in another place than `mlartifacts` beside it.
+    """
     # A server decides itself where artifacts go.
-    served = uri.startswith(("http", "databricks"))
-    location = None if served else (artifacts.resolve() / name).as_uri()
-    found = client.get_experiment_by_name(name)
-    if found is None:
+    is_served = uri.startswith(("http", "databricks"))
+    location = None if is_served else (database.parent.resolve() / "mlartifacts" / name).as_uri()
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
         return str(client.create_experiment(name, artifact_location=location))
-    if not uri and found.artifact_location != location:
+    if not uri and experiment.artifact_location != location:
         # A copied results folder would otherwise write into the original's files.
         raise TrackingError(
-            f"the database keeps its files in {found.artifact_location}, not in {location}; "
+            f"the database keeps its files in {experiment.artifact_location}, not in {location}; "
             "was the results folder moved? Delete mlflow.db and import again"
         )
-    if found.lifecycle_stage == "deleted":
-        client.restore_experiment(found.experiment_id)
-    return str(found.experiment_id)
+    if experiment.lifecycle_stage == "deleted":
+        client.restore_experiment(experiment.experiment_id)
+    return str(experiment.experiment_id)
 
 
 def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str]) -> list[MlflowRun]:
     """Return the active runs of a place in the results folder that this stage has made."""
-    return [run for run in _runs(client, experiment) if _slot(run.data.tags) == _slot(tags)]
+    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
+    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
+    return list(client.search_runs([experiment], query))
 
 
-def _runs(client: MlflowClient, experiment: str) -> Iterator[MlflowRun]:
-    """Active runs of an experiment that this stage has made."""
-    known = client.search_runs([experiment], max_results=MOST_RUNS)
-    yield from (run for run in known if "config_hash" in run.data.tags)
-
-
-def _import_one(
-    client: MlflowClient,
-    experiment: str,
-    record: Run,
-    tags: dict[str, str],
-    known: Sequence[MlflowRun],
+def _import_run(
+    client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]
 ) -> tuple[str, str]:
-    """Leave exactly one active run of the record; `known` are those of its slot."""
-    same = [run for run in known if run.data.tags["config_hash"] == record.config_hash]
+    """Leave exactly one active run with the files and settings of a run.
+
+    Returns
+    -------
+    run_id, action : str
+        MLflow's id of the run, and what was done.
+    """
+    slot = runs_of_slot(client, experiment, tags)
+    of_config = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
     # An import that was killed leaves a run without content_hash.
-    valid = [r for r in same if r.data.tags.get("content_hash") == record.content_hash]
-    if valid:
-        run_id, action = valid[0].info.run_id, "unchanged"
+    unchanged = [r for r in of_config if r.data.tags.get("content_hash") == run.content_hash]
+    if unchanged:
+        run_id, action = str(unchanged[0].info.run_id), "unchanged"
         for key in ("superseded", PARENT):
             # A parent that has new files is another run.
-            if key in tags and valid[0].data.tags.get(key) != tags[key]:
+            if key in tags and unchanged[0].data.tags.get(key) != tags[key]:
                 client.set_tag(run_id, key, tags[key])
     else:
-        run_id, action = _create(client, experiment, record, tags), "created"
-        if same:
-            action = "updated"
-    for old in known:
-        if (old in same or old.data.tags["config_hash"] == LIVE) and old.info.run_id != run_id:
+        run_id = _create(client, experiment, run, tags)
+        action = "updated" if of_config else "created"
+    # Runs of the same settings, or under way, give way; those of other settings are superseded.
+    for old in slot:
+        if old.info.run_id == run_id:
+            continue
+        if old in of_config or old.data.tags["config_hash"] == LIVE:
             forget(client, old.info.run_id)
-        elif old not in same and old.data.tags.get("superseded") != "true":
+        elif old.data.tags.get("superseded") != "true":
             client.set_tag(old.info.run_id, "superseded", "true")
     return run_id, action
 
 
-def _create(client: MlflowClient, experiment: str, record: Run, tags: dict[str, str]) -> str:
-    import yaml
-    from mlflow.entities import Metric, Param
+def _create(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]) -> str:
+    """Create a run in MLflow with all that belongs to it, and return its id."""
+    from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
 
-    created = client.create_run(experiment, record.start_ms, tags, record.name)
-    run_id: str = created.info.run_id
-    data = _log_data(client, run_id, record)
-    model_id = log_model(client, experiment, run_id, record)
-    of_model = {"model_id": model_id, **data} if model_id else data
-    metrics = [
-        Metric(p.name, p.value, p.time_ms, p.epoch, **({} if p.epoch else of_model))
-        for p in record.points
-    ]
-    settings = settings_of(record, tags["preset"])
-    params = [Param(k, v[:PARAM_LENGTH]) for k, v in settings.items()]
-    for i in range(0, len(params), BATCH):
-        client.log_batch(run_id, params=params[i : i + BATCH], synchronous=True)
+    run_id: str = client.create_run(experiment, run.start_ms, tags, run.name).info.run_id
+    # Metrics of the finished run name the data that it was trained on, and its model.
+    origin: dict[str, str] = {}
+    if run.data is not None and run.data.is_file():
+        source = json.dumps({"uri": run.data.resolve().as_uri()})
+        # Sixteen digits of the checksum tell a dataset from others.
+        data = Dataset(run.dataset, sha256_of(run.data)[:16], "local", source)
+        training = [InputTag("mlflow.data.context", "training")]
+        client.log_inputs(run_id, [DatasetInput(data, training)])
+        origin = {"dataset_name": data.name, "dataset_digest": data.digest}
+    if model_id := log_model(client, experiment, run_id, run):
+        origin["model_id"] = model_id
+    metrics = epoch_metrics(run.epochs, run.start_ms)
+    metrics += [Metric(key, v, run.end_ms, 0, **origin) for key, v in run.metrics.items()]
     log_metrics(client, run_id, metrics)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        link({k: path for k, path in record.files.items() if not k.startswith(MODEL)}, folder)
-        (folder / CONFIG).write_text(yaml.safe_dump(record.config), encoding="utf-8")
-        client.log_artifacts(run_id, str(folder))
-    if record.fit and model_id:
-        register(client, run_id, model_id, record)
-    client.set_terminated(run_id, record.status, record.end_ms)
-    client.set_tag(run_id, "content_hash", record.content_hash)
+    # MLflow takes 100 params at once, and 6000 characters of a param.
+    params = [Param(key, v[:6000]) for key, v in settings_of(run, tags["preset"]).items()]
+    for i in range(0, len(params), 100):
+        client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
+    # Files that are not part of the model.
+    with tempfile.TemporaryDirectory() as folder:
+        link({k: path for k, path in run.files.items() if not k.startswith(MODEL)}, Path(folder))
+        client.log_artifacts(run_id, folder)
+    client.log_text(run_id, as_yaml(run.config), CONFIG)
+    client.set_terminated(run_id, run.status, run.end_ms)
+    # Last, so that a run without it is known to be incomplete.
+    client.set_tag(run_id, "content_hash", run.content_hash)
     return run_id
 
 
 def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
-    """Log any number of metrics."""
-    for i in range(0, len(metrics), 10 * BATCH):
-        client.log_batch(run_id, metrics=metrics[i : i + 10 * BATCH], synchronous=True)
+    """Log metrics as far as they are finite; MLflow takes 1000 at once."""
+    finite = [metric for metric in metrics if math.isfinite(metric.value)]
+    for i in range(0, len(finite), 1000):
+        client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
 
 
-def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
-    """Log what a run has learnt from, if it is there; how metrics name it."""
-    if record.data is None or not record.data.is_file():
-        return {}
-    from mlflow.entities import Dataset, DatasetInput, InputTag
-
-    source = json.dumps({"uri": record.data.resolve().as_uri()})
-    data = Dataset(record.dataset, digest_of(record.data)[:DIGEST], "local", source)
-    of_training = [InputTag("mlflow.data.context", "training")]
-    client.log_inputs(run_id, [DatasetInput(data, of_training)])
-    return {"dataset_name": data.name, "dataset_digest": data.digest}
-
-
-def tags_of(record: Run) -> dict[str, str]:
-    """Tags of a run in MLflow, but for those of the whole import."""
-    own = {key: getattr(record, key) for key in SLOT if key != "preset"}
-    own |= record.tags
-    return {**own, "config_hash": record.config_hash, "superseded": "false"}
-
-
-def _slot(tags: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(tags.get(key, "") for key in SLOT)
+def tags_of(run: Run) -> dict[str, str]:
+    """Return the tags of a run in MLflow, but for those of the whole import."""
+    slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
+    return {**slot, **run.tags, "config_hash": run.config_hash, "superseded": "false"}
 
 
 def ours_to_explain(error: Exception) -> bool:
-    """Whether an error comes from the database, the server or the disk, not from a bug."""
+    """Return True if an error comes from the database, the server or the disk, not from a bug."""
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -321,13 +298,3 @@ def ours_to_explain(error: Exception) -> bool:
 def first_line(error: Exception) -> str:
     """Return the first line of an error."""
     return str(error).strip().split("\n", 1)[0]
-
-
-def _as_csv(runs: Sequence[Run], preset: str, done: Sequence[tuple[str, str]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for record, (run_id, action) in zip(runs, done, strict=True):
-        row = {"run_id": run_id, "action": action, "experiment": record.experiment}
-        writer.writerow({**row, "preset": preset, **tags_of(record)})
-    return text.getvalue()

@@ -1,0 +1,33 @@
+"""Stage `manifest`: the checksums of a finished run, which show later damage to its files."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated
+
+from psfdae.files import write_text
+from psfdae.options import Folder
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.command import command
+
+
+@command("manifest")
+def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}]) -> None:
+    """Write the checksums of a run to SHA256SUMS.
+
+    `sha256sum --check --quiet SHA256SUMS` in the folder then names the files that are damaged.
+    Listed are the products; logs, costs and MLflow's copies are not, nor are other runs in folders
+    of this one.
+    """
+    # Runs with other presets, and the run of record, may lie below that with the preset "fast".
+    other_runs = {"reference", *(path.stem for path in (config_dir() / "preset").glob("*.yaml"))}
+    no_products = {"logs", "benchmarks", "benchmarks_on_request", "checkpoints", "mlartifacts"}
+    lines = []
+    for path in sorted(results.glob("*/**/*")):
+        place = path.relative_to(results)
+        is_hidden = any(part.startswith(".") for part in place.parts)
+        if path.is_file() and not is_hidden and place.parts[0] not in other_runs | no_products:
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            lines.append(f"{digest}  {place.as_posix()}\n")
+    write_text(results / "SHA256SUMS", "".join(lines))
