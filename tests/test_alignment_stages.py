@@ -119,10 +119,13 @@ def test_same_configuration_gives_the_same_bytes(results, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["alignment", "config", "dataset=dataset3"], "dataset=alignment"),
+        (["alignment", "model", "--out=x.h5", "dataset=dataset3"], "dataset=alignment"),
         (["config", "--stage", "templates", "dataset=alignment"], "no simulated stars"),
-        (["alignment", "config", "telescope=example_zernike"], "example_zernike: brings its own"),
-        (["alignment", "config", "prescription=newtonian"], "secondary: missing"),
+        (
+            ["config", "dataset=alignment", "telescope=example_zernike"],
+            "zernike: brings its own",
+        ),
+        (["config", "dataset=alignment", "prescription=newtonian"], "secondary: missing"),
         (["alignment", "model", "--out=x.h5", "alignment.field_radius_deg=0.8"], "field (0.8, 0)°"),
         (["alignment", "train-network", "--kind=dae_retrained", *TRAINING], "--dae"),
     ],

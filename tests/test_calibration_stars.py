@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 
 from psfdae.bright_stars import LEAST_SKY, BrightStars
-from psfdae.image.selection import (
-    brightest_pixels,
-    crowded,
-    misfit,
-    signal_to_noise,
-    sky_around,
-    window_of,
-)
-from psfdae.image.stamps import cut
+from psfdae.image.stamps import cut, sky_around
+from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, signal_to_noise
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
 from psfdae.moments import shift_stamps, windowed_centres
 from psfdae.noise import NoiseModel, noise_equivalent_px
@@ -45,16 +38,6 @@ def bright_stars(centre, snr=500.0):
     noise = np.ones(count)
     centre, row, colour = np.asarray(centre), np.arange(count), np.full(count, np.nan)
     return BrightStars(wide, peak, centre, position, 1e4 * noise, noise, level, row, centre, colour)
-
-
-def test_window_of_a_gaussian_is_as_wide_as_it_is():
-    """S/N = F / (σ √A) with A = 1/Σp² gives its width back, but no less than 0.7 px."""
-    sigma = np.array([0.9, 1.5, 2.5, 0.3])
-    psf = np.concatenate([gaussians([[0.2, 0.4]], sigma=s) for s in sigma])
-    area = np.array([noise_equivalent_px(image / image.sum()) for image in psf])
-    flux, noise = np.array([1e4, 2e3, 5e5, 1e4]), np.array([3.0, 7.0, 2.0, 3.0])
-    window = window_of(flux / (noise * np.sqrt(area)), flux, noise)
-    assert window == pytest.approx(np.maximum(sigma, 0.7), rel=0.02)
 
 
 def test_sky_is_that_around_the_star():

@@ -9,8 +9,7 @@ import pytest
 from command_line import refused as refusal
 from psfdae.files import ProductError
 from psfdae.reading import read_yaml
-from psfdae_paper.configuration import compose
-from psfdae_paper.configuration.compose import clear_caches, config_dir, load
+from psfdae_paper.configuration.compose import clear_caches, config_dir
 
 
 @pytest.fixture
@@ -51,20 +50,3 @@ def test_a_configuration_runs_no_code(tmp_path):
     (tmp_path / "config.yaml").write_text("!!python/object/apply:os.getpid []")
     with pytest.raises(ProductError, match=r"config\.yaml: line 1, .*python"):
         read_yaml(tmp_path / "config.yaml")
-
-
-def test_a_kept_composition_is_whole_and_up_to_date(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(compose, "CACHE_FOLDERS", [tmp_path / "kept"])
-    first = load()
-    (kept,) = (tmp_path / "kept").iterdir()
-    clear_caches()
-    with monkeypatch.context() as patch:
-        patch.setattr(compose, "_by_hydra", None)
-        assert load() == first
-    kept.write_bytes(kept.read_bytes().replace(b"0", b"1", 1))
-    clear_caches()
-    assert load() == first
-    path = folder / "config.yaml"
-    path.write_text(path.read_text().replace(f"seed: {first.seed}", "seed: 7"))
-    clear_caches()
-    assert load().seed == 7

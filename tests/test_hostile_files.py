@@ -154,29 +154,15 @@ def test_a_file_that_changes_after_opening_is_noticed(good, tmp_path):
         list(observation.chunks(10))
 
 
-def test_columns_of_fits_tables_are_what_astropy_reads(tmp_path):
-    """Those of variable length are left alone: a small file unfolds to any size."""
-    table = Table(
-        {
-            "scaled": np.arange(4, dtype=np.uint16),
-            "large": np.arange(4, dtype=np.uint64) + 2**63,
-            "gap": np.ma.array([1, 2, 3, 4], mask=[0, 1, 0, 0]),
-            "text": ["a", "bc", "", "d"],
-            "unit": np.arange(4.0),
-        }
-    )
-    table["unit"].unit = "deg"
+def test_columns_of_fits_tables_that_hold_arrays_are_no_numbers(tmp_path):
     lists = fits.Column("many", "PB()", array=np.array([np.zeros(9, np.uint8)] * 4, dtype=object))
-    columns = fits.table_to_hdu(table).columns + lists
+    gap = Table({"x": np.ma.array([1, 2, 3, 4], mask=[0, 1, 0, 0]), "y": np.zeros(4)})
+    columns = fits.table_to_hdu(gap).columns + lists
     fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "s.fits")
     catalogue = read_catalogue(tmp_path / "s.fits")
-    with fits.open(tmp_path / "s.fits") as hdus:
-        whole = Table.read(hdus[1], format="fits", mask_invalid=False)
-    for name in whole.colnames[:-1]:
-        column = catalogue.table[name]
-        assert column.tolist() == whole[name].tolist()
-        assert (column.dtype, column.unit) == (whole[name].dtype, whole[name].unit)
-    with pytest.raises(ObservationError, match="'many' holds arrays"):
+    np.testing.assert_array_equal(catalogue.numbers("x"), [1, np.nan, 3, 4])
+    assert catalogue.columns(np.arange(4)).colnames == []
+    with pytest.raises(ObservationError, match="'many' holds"):
         catalogue.numbers("many")
 
 

@@ -8,8 +8,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from fits_inputs import open_observation, write_field
-from psfdae.image.catalogue import CONVENTIONS, read_catalogue
+from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
+from psfdae.image.position_columns import CONVENTIONS
 from psfdae.image.stamps import StarFlag
 
 D = 8
@@ -64,18 +65,18 @@ def test_every_format_gives_the_same_stars(tmp_path, image, name):
     np.testing.assert_array_equal(chunk.colour, [0.5, 0.25, -0.25])
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS, ids=lambda c: c.pairs[0][0])
-def test_every_alias_in_any_case(tmp_path, image, convention):
+@pytest.mark.parametrize("pairs", CONVENTIONS, ids=lambda pairs: pairs[0].first)
+def test_every_alias_in_any_case(tmp_path, image, pairs):
     # In capitals xcenter is IRAF's, which counts from 1, and else photutils', from 0.
-    of_case = convention.names.lower() == "xcenter,ycenter"
+    of_case = pairs[0].first.lower() == "xcenter"
     cases = (str,) if of_case else (str.lower, str.upper) * 9
-    for pair, change in zip(2 * convention.pairs, cases, strict=False):
-        values = ([150.0], [2.0]) if convention.sky else ([12.0], [9.0])
-        table = Table(values, names=[change(name) for name in pair])
+    for columns, change in zip(2 * pairs, cases, strict=False):
+        values = ([150.0], [2.0]) if columns.sky else ([12.0], [9.0])
+        table = Table(values, names=[change(columns.first), change(columns.second)])
         table.write(tmp_path / "a.csv", format="ascii.csv", overwrite=True)
-        origin = 0 if convention.origin is None and not convention.sky else None
+        origin = 0 if columns.origin is None and not columns.sky else None
         observation = open_observation(image, D, catalogue=tmp_path / "a.csv", origin=origin)
-        expected = (19.5, 14.5) if convention.sky else np.array([12, 9]) - (convention.origin or 0)
+        expected = (19.5, 14.5) if columns.sky else np.array([12, 9]) - (columns.origin or 0)
         np.testing.assert_allclose(observation.positions[0], expected, atol=1e-6)
 
 

@@ -17,7 +17,8 @@ from command_line import refused
 from image_training import few_draws
 from psfdae import StarFlag, load_model
 from psfdae.image.observation import Source
-from psfdae.image.selection import collect, saturation_advice
+from psfdae.image.selection import collect
+from psfdae.image.selection_advice import saturation_advice
 from psfdae.image.stamps import cut
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.settings import from_words

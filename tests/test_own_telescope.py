@@ -17,7 +17,7 @@ TRAINED = ["parts.train_stars=160", "parts.test_stars=40", *STARS]
 TINY = {
     "simulate": ["grid.points=3"],
     "stars": STARS,
-    "train": ["train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]", *TRAINED],
+    "fit": ["train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]", *TRAINED],
     "bundle": TRAINED,
     "predict": ["--threads", "1", "--quiet"],
 }

@@ -14,8 +14,9 @@ from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
 from psfdae.image.observation import Source
-from psfdae.image.selection import Verdict, completed, sharper_than_stars, wider_than_stars
+from psfdae.image.selection import Verdict, completed
 from psfdae.image.sky_level import noise_correlation, sky_level, sky_steps
+from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
 from psfdae.image.trails import find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
@@ -180,9 +181,10 @@ def test_noise_of_neighbours_that_is_shared_is_that_of_their_sum(clean):
 def test_trails_are_found_and_stars_are_none(clean):
     image, none = clean[0], np.zeros(clean[0].shape, bool)
     row, column = np.indices(image.shape)
-    assert find_trails(image, none)[1] == 0
+    assert find_trails(image, none, sky_level(image, none))[1] == 0
     across = (row - 100 - 0.4 * column) / np.hypot(1, 0.4)
-    mask, count = find_trails(image + 150 * np.exp(-0.5 * (across / 1.2) ** 2), none)
+    image = image + 150 * np.exp(-0.5 * (across / 1.2) ** 2)
+    mask, count = find_trails(image, none, sky_level(image, none))
     assert count == 1 and mask[np.abs(across) < 2].mean() > 0.95
     assert not mask[np.abs(across) > 12].any()
 
@@ -306,7 +308,7 @@ def test_noise_of_few_counts_has_no_blank_areas():
     image[100:132, 100:132] += drawn(moffat(3.0), [(16, 16)], [1e4], 32)
     none = np.zeros(image.shape, bool)
     assert not bad_pixels.blank_areas(image, none)
-    assert bad_pixels.least_value_share(image, none)[0] == 0
+    bad_pixels.refuse_clipped_sky(image, none)
 
 
 def test_overscan_of_the_header_is_bad_where_the_pixels_confirm_it(clean):
@@ -337,12 +339,10 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
         Stars.from_image(clipped, place)
     for scatter, sky in ((12.0, 0.0), (12.0, -12.0)):
         noise = np.random.default_rng(7).normal(sky, scatter, (256, 256))
-        share, least = bad_pixels.least_value_share(
-            np.maximum(noise, 0), np.zeros(noise.shape, bool)
-        )
-        assert share >= 0.49 and least == 0
+        with pytest.raises(bad_pixels.ClippedSkyError, match="least value, 0: the sky"):
+            bad_pixels.refuse_clipped_sky(np.maximum(noise, 0), np.zeros(noise.shape, bool))
     few = np.random.default_rng(8).poisson(1.0, (256, 256)).astype(float)
-    assert bad_pixels.least_value_share(few, np.zeros(few.shape, bool))[0] == 0
+    bad_pixels.refuse_clipped_sky(few, np.zeros(few.shape, bool))
 
 
 # Units.

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from psfdae.image import selection as advice
-from psfdae.image.selection import misfit
+from psfdae.image import selection_advice as advice
 from psfdae.image.stamps import cut
+from psfdae.image.star_criteria import misfit
 from psfdae.model.report import (
     MEAN_PSF,
     check_held_out,

@@ -136,22 +136,6 @@ def test_vizier(tmp_path, path, place):
     np.testing.assert_allclose(positions(path, tmp_path / "s.tsv"), place, atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        (("<TABLEDATA>", "<TABLEDATA><STREAM href='file:///etc/passwd'/>"), "not in it"),
-        (("<VOTABLE", "<!DOCTYPE a [<!ENTITY b 'c'>]><VOTABLE"), "entities"),
-    ],
-)
-def test_a_votable_that_could_do_harm_is_refused(tmp_path, place, change, problem):
-    table(place).write(tmp_path / "s.vot", format="votable")
-    text = (tmp_path / "s.vot").read_text()
-    assert change[0] in text
-    (tmp_path / "s.vot").write_text(text.replace(*change))
-    with pytest.raises(Error, match=problem):
-        read_catalogue(tmp_path / "s.vot")
-
-
 # Origin.
 
 

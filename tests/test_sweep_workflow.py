@@ -70,11 +70,12 @@ def killed(smoke, configure, tmp_path_factory):
     return folder, before
 
 
-def test_killed_sweep_is_finished_and_repeats_no_finished_point(killed):
+def test_killed_sweep_is_finished_and_keeps_finished_points(killed):
     folder, before = killed
     after = finished(folder)
     assert len(after) == 4
-    assert after == {**after, **before}
+    # At most the point in whose last moments Snakemake was killed.
+    assert sum(after[point] != ended for point, ended in before.items()) <= 1
     table = pd.read_csv(folder / SUMMARY)
     assert set(table.point) == set(after)
     assert (table.status == "finished").all()

@@ -20,7 +20,7 @@ from psfdae.files import ProductError, read_product
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
-from psfdae.reading import number, read_csv, read_yaml
+from psfdae.reading import number, read_csv, read_json, read_yaml
 from psfdae.settings import leaves
 from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT, TRAINED
 from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
@@ -361,10 +361,10 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
 
 def _run_of_point(results: Path, name: str, point: str) -> Run:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
-    from psfdae_paper.sweeps.measured import fit_in, read_cost, read_result
+    from psfdae_paper.sweeps.measured import fit_in, read_cost
 
     folder = results / "sweeps" / name / "points" / point
-    result = read_result(folder / "result.json")
+    result = read_json(folder / "result.json")
     model, config = result["model"], result["config"]
     # Files of the model, and the product with its training data if the workflow made it.
     data = None

@@ -17,7 +17,7 @@ import numpy as np
 
 from measure import alone, pareto, time_in_rounds, use_threads, yes
 from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
-from psfdae.optics.pupil import ARCSEC, SamplingError
+from psfdae.optics.pupil import SamplingError
 from psfdae.threads import side_by_side
 from psfdae_paper.stars.framing import normalise_flux
 from scenes import pupil_of
@@ -273,7 +273,7 @@ def poppy_mft(case, peer):
     width = pupil.axis.size / peer.samples
     system = poppy.OpticalSystem(npix=pupil.axis.size, pupil_diameter=width * u.m, verbose=False)
     image = _poppy_image(system, system.add_pupil, case, peer, pupil)
-    scale = case.pixel * WAVELENGTH_M / ARCSEC
+    scale = case.pixel * WAVELENGTH_M / np.deg2rad(1.0 / 3600.0)
     system.add_detector(pixelscale=scale, fov_pixels=case.stamp_px, oversample=peer.points)
     return peer.samples, lambda: image()[::-1, ::-1]
 

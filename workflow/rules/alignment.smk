@@ -84,7 +84,6 @@ rule alignment_dae:
         mem_mb=1500,
         runtime=60,
     params:
-        command="train-dae",
         config=lambda w: settings("alignment train-dae"),
         inputs=as_options,
         source=source_hash("alignment train-dae"),
@@ -94,11 +93,11 @@ rule alignment_dae:
     message:
         "Training the DAE of scene 3"
     shell:
-        "psfdae alignment {params.command} --config {params.config} {params.inputs:q}"
+        "psfdae alignment train-dae --config {params.config} {params.inputs:q}"
         " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
 
 
-use rule alignment_dae as alignment_network with:
+rule alignment_network:
     input:
         states=lambda w: f"{ALIGNMENT_DATA}/{ALIGNERS[w.network].states}.h5",
         dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"]
@@ -114,12 +113,17 @@ use rule alignment_dae as alignment_network with:
         mem_mb=1600,
         runtime=60,
     params:
-        command=lambda w: f"train-network --kind {w.network}",
         config=lambda w: settings("alignment train-network", kind=w.network),
+        inputs=as_options,
         source=source_hash("alignment train-network"),
+        folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.network}.pt",
     message:
         "Training the network {wildcards.network} of scene 3"
+    shell:
+        "psfdae alignment train-network --kind {wildcards.network}"
+        " --config {params.config} {params.inputs:q} --checkpoint {params.checkpoint}"
+        " --out {params.folder} > {log} 2>&1"
 
 
 rule alignment_bound:
@@ -127,7 +131,7 @@ rule alignment_bound:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         model=rules.alignment_model.output,
     output:
-        out=f"{ALIGNMENT}/bounds/{{test_set}}.h5",
+        f"{ALIGNMENT}/bounds/{{test_set}}.h5",
     log:
         f"{RESULTS}/logs/alignment/bound_{{test_set}}.log",
     benchmark:
@@ -136,19 +140,17 @@ rule alignment_bound:
         mem_mb=1500,
         runtime=20,
     params:
-        command="bound",
         config=lambda w: settings("alignment bound"),
         inputs=as_options,
-        outputs=lambda w, output: as_options(w, output),
         source=source_hash("alignment bound"),
     message:
         "Bounding the errors of misalignments, set {wildcards.test_set}"
     shell:
-        "psfdae alignment {params.command} --config {params.config}"
-        " --set {wildcards.test_set} {params.inputs:q} {params.outputs:q} > {log} 2>&1"
+        "psfdae alignment bound --config {params.config} --set {wildcards.test_set}"
+        " {params.inputs:q} --out {output} > {log} 2>&1"
 
 
-use rule alignment_bound as alignment_estimate with:
+rule alignment_estimate:
     input:
         **{network: f"{ALIGNMENT}/{network}/network.safetensors" for network in TRAINED},
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
@@ -161,15 +163,21 @@ use rule alignment_bound as alignment_estimate with:
     benchmark:
         f"{RESULTS}/benchmarks/alignment/estimate_{{test_set}}.tsv"
     threads: lambda w: alignment_config().evaluation.threads
+    resources:
+        mem_mb=1500,
+        runtime=20,
     params:
-        command="estimate",
         config=lambda w: settings("alignment estimate"),
+        inputs=as_options,
         source=source_hash("alignment estimate"),
     message:
         "Estimating misalignments with the networks, set {wildcards.test_set}"
+    shell:
+        "psfdae alignment estimate --config {params.config} --set {wildcards.test_set}"
+        " {params.inputs:q} --times {output.times} --out {output.out} > {log} 2>&1"
 
 
-use rule alignment_bound as alignment_fit with:
+rule alignment_fit:
     input:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         train=f"{ALIGNMENT_DATA}/train.h5",
@@ -182,9 +190,16 @@ use rule alignment_bound as alignment_fit with:
         f"{RESULTS}/logs/alignment/fit_{{test_set}}_{{level}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/fit_{{test_set}}_{{level}}.tsv"
+    resources:
+        mem_mb=1500,
+        runtime=20,
     params:
-        command=lambda w: f"fit --level {w.level}",
         config=lambda w: settings("alignment fit"),
+        inputs=as_options,
         source=source_hash("alignment fit"),
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"
+    shell:
+        "psfdae alignment fit --config {params.config} --set {wildcards.test_set}"
+        " --level {wildcards.level} {params.inputs:q} --times {output.times}"
+        " --out {output.out} > {log} 2>&1"

@@ -16,12 +16,12 @@ rule alignment_tables:
         f"{RESULTS}/benchmarks/alignment/tables.tsv"
     params:
         inputs=as_options,
-        outputs=lambda w, output: as_options(w, output),
         source=source_hash("alignment tables"),
     message:
         "Tabulating errors of misalignments"
     shell:
-        "psfdae alignment tables {params.inputs:q} {params.outputs:q} > {log} 2>&1"
+        "psfdae alignment tables {params.inputs:q} --errors {output.errors}"
+        " --correlation {output.correlation} > {log} 2>&1"
 
 
 ALIGNMENT_PAPER_TABLES = {
@@ -86,37 +86,69 @@ rule alignment_time:
         " > {log} 2>&1"
 
 
-UNIFORM = {"estimates": f"{ALIGNMENT}/estimates/uniform.h5"}
-UNIFORM["fit"] = lambda w: fits_of("uniform")
-ERRORS = {**UNIFORM, "bound": f"{ALIGNMENT}/bounds/uniform.h5"}
-CORRELATION = {"correlation": rules.alignment_tables.output.correlation}
+rule figure_alignment_predicted:
+    input:
+        estimates=f"{ALIGNMENT}/estimates/uniform.h5",
+        fit=lambda w: fits_of("uniform"),
+    output:
+        of_scene3(
+            "figures/alignment/predicted.png",
+            "estimates",
+            "estimates against the truth",
+        ),
+    log:
+        f"{RESULTS}/logs/alignment/figure_predicted.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/figure_predicted.tsv"
+    params:
+        inputs=as_options,
+        source=source_hash("alignment figure predicted"),
+    message:
+        "Drawing estimates against the truth"
+    shell:
+        "psfdae alignment figure predicted {params.inputs:q} --out {output} > {log} 2>&1"
 
-for _figure, _shown, _inputs in (
-    ("predicted", "estimates against the truth", UNIFORM),
-    ("errors", "errors against misalignment", ERRORS),
-    ("correlation", "correlations of errors", CORRELATION),
-):
 
-    rule:
-        name:
-            f"figure_alignment_{_figure}"
-        input:
-            **_inputs,
-        output:
-            of_scene3(f"figures/alignment/{_figure}.png", "estimates", _shown),
-        log:
-            f"{RESULTS}/logs/alignment/figure_{_figure}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks/alignment/figure_{_figure}.tsv"
-        params:
-            figure=_figure,
-            inputs=as_options,
-            source=source_hash(f"alignment figure {_figure}"),
-        message:
-            f"Drawing {_shown}"
-        shell:
-            "psfdae alignment figure {params.figure} {params.inputs:q} --out {output}"
-            " > {log} 2>&1"
+rule figure_alignment_errors:
+    input:
+        estimates=f"{ALIGNMENT}/estimates/uniform.h5",
+        fit=lambda w: fits_of("uniform"),
+        bound=f"{ALIGNMENT}/bounds/uniform.h5",
+    output:
+        of_scene3(
+            "figures/alignment/errors.png", "estimates", "errors against misalignment"
+        ),
+    log:
+        f"{RESULTS}/logs/alignment/figure_errors.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/figure_errors.tsv"
+    params:
+        inputs=as_options,
+        source=source_hash("alignment figure errors"),
+    message:
+        "Drawing errors against misalignment"
+    shell:
+        "psfdae alignment figure errors {params.inputs:q} --out {output} > {log} 2>&1"
+
+
+rule figure_alignment_correlation:
+    input:
+        correlation=rules.alignment_tables.output.correlation,
+    output:
+        of_scene3(
+            "figures/alignment/correlation.png", "estimates", "correlations of errors"
+        ),
+    log:
+        f"{RESULTS}/logs/alignment/figure_correlation.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/figure_correlation.tsv"
+    params:
+        inputs=as_options,
+        source=source_hash("alignment figure correlation"),
+    message:
+        "Drawing correlations of errors"
+    shell:
+        "psfdae alignment figure correlation {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule figure_alignment_stamps:
@@ -124,7 +156,7 @@ rule figure_alignment_stamps:
         states=f"{ALIGNMENT_DATA}/uniform.h5",
         dae=rules.alignment_dae.output.weights,
     output:
-        out=of_scene3(
+        of_scene3(
             "figures/alignment/stamps.png",
             "telescope and stamps",
             "stamps before and after the DAE",
@@ -137,21 +169,17 @@ rule figure_alignment_stamps:
     resources:
         mem_mb=1000,
     params:
-        figure="stamps",
         config=lambda w: settings("alignment figure stamps"),
         inputs=as_options,
-        outputs=lambda w, output: as_options(w, output),
         source=source_hash("alignment figure stamps"),
     message:
         "Drawing stamps of scene 3"
     shell:
-        "psfdae alignment figure {params.figure} --config {params.config}"
-        " {params.inputs:q} {params.outputs:q} > {log} 2>&1"
+        "psfdae alignment figure stamps --config {params.config} {params.inputs:q}"
+        " --out {output} > {log} 2>&1"
 
 
-use rule figure_alignment_stamps as figure_alignment_twin with:
-    input:
-        [],
+rule figure_alignment_twin:
     output:
         table=f"{RESULTS}/tables/alignment_twin.csv",
         out=of_scene3(
@@ -161,24 +189,26 @@ use rule figure_alignment_stamps as figure_alignment_twin with:
         f"{RESULTS}/logs/alignment/figure_twin.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/figure_twin.tsv"
-    threads: 1
+    resources:
+        mem_mb=1000,
     params:
-        figure="twin",
         config=lambda w: settings("alignment figure twin"),
         source=source_hash("alignment figure twin"),
     message:
         "Drawing the twin ambiguity"
+    shell:
+        "psfdae alignment figure twin --config {params.config} --table={output.table}"
+        " --out={output.out} > {log} 2>&1"
 
 
-ALIGNMENT_FIGURES = ("stamps", "predicted", "errors", "twin", "correlation")
 ALIGNMENT_PRODUCTS = [
     *rules.alignment_telescope.output,
     *rules.alignment_tables.output,
     *rules.alignment_paper_tables.output,
     *rules.alignment_time.output,
-    *(
-        file
-        for name in ALIGNMENT_FIGURES
-        for file in getattr(rules, f"figure_alignment_{name}").output
-    ),
+    *rules.figure_alignment_stamps.output,
+    *rules.figure_alignment_predicted.output,
+    *rules.figure_alignment_errors.output,
+    *rules.figure_alignment_twin.output,
+    *rules.figure_alignment_correlation.output,
 ]

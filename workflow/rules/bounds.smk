@@ -181,47 +181,79 @@ rule paper_rows:
         "psfdae paper-rows {params.inputs:q} --out {output} > {log} 2>&1"
 
 
-_tables = {"bounds": rules.psf_bounds.output, "efficiency": rules.psf_efficiency.output}
-# By figure: command, inputs, label.
-BOUND_FIGURES = {
-    "errors": ("bounds", _tables, "errors above the bounds"),
-    "efficiency": (
-        *("efficiency", {"efficiency": _tables["efficiency"]}, "efficiency"),
-    ),
-    "growth": (
-        *("bank-growth", {"growth": rules.dataset_bounds.output.growth}),
-        "growth of the bank",
-    ),
-}
+rule figure_bounds:
+    input:
+        bounds=rules.psf_bounds.output,
+        efficiency=rules.psf_efficiency.output,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_errors.png",
+            caption="../report/figure_bounds.rst",
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "errors above the bounds"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_errors.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
+    params:
+        source=source_hash("figure bounds"),
+    message:
+        "Drawing {wildcards.dataset}: errors above the bounds"
+    shell:
+        "psfdae figure bounds --dataset {wildcards.dataset} --bounds {input.bounds}"
+        " --efficiency {input.efficiency}"
+        " --out {output} > {log} 2>&1"
 
-for _figure, (_command, _inputs, _label) in BOUND_FIGURES.items():
 
-    rule:
-        name:
-            f"figure_{_command.replace('-', '_')}"
-        input:
-            **_inputs,
-        output:
-            report(
-                f"{RESULTS}/figures/bounds/{{dataset}}_{_figure}.png",
-                caption=f"../report/figure_{_command.replace('-', '_')}.rst",
-                category="Bounds: the best possible",
-                subcategory="{dataset}",
-                labels={"figure": _label},
-            ),
-        log:
-            f"{RESULTS}/logs/figures/bounds/{{dataset}}_{_figure}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks_on_request/bounds/figure_{_figure}-{{dataset}}.tsv"
-        params:
-            command=_command,
-            inputs=lambda w, input: [f"--{name}={path}" for name, path in input.items()],
-            source=source_hash(f"figure {_command}"),
-        message:
-            f"Drawing {{wildcards.dataset}}: {_label}"
-        shell:
-            "psfdae figure {params.command} --dataset {wildcards.dataset}"
-            " {params.inputs:q} --out {output} > {log} 2>&1"
+rule figure_efficiency:
+    input:
+        efficiency=rules.psf_efficiency.output,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_efficiency.png",
+            caption="../report/figure_efficiency.rst",
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "efficiency"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_efficiency.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
+    params:
+        source=source_hash("figure efficiency"),
+    message:
+        "Drawing {wildcards.dataset}: efficiency"
+    shell:
+        "psfdae figure efficiency --dataset {wildcards.dataset}"
+        " --efficiency {input.efficiency}"
+        " --out {output} > {log} 2>&1"
+
+
+rule figure_bank_growth:
+    input:
+        growth=rules.dataset_bounds.output.growth,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_growth.png",
+            caption="../report/figure_bank_growth.rst",
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "growth of the bank"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_growth.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
+    params:
+        source=source_hash("figure bank-growth"),
+    message:
+        "Drawing {wildcards.dataset}: growth of the bank"
+    shell:
+        "psfdae figure bank-growth --dataset {wildcards.dataset} --growth {input.growth}"
+        " --out {output} > {log} 2>&1"
 
 
 rule figure_headline:

@@ -13,23 +13,18 @@ from psfdae import fits
 from psfdae.cli import stage
 from psfdae.fits import suffix_of
 from psfdae.method import GoesOn
-from psfdae.settings import ConfigError, as_overrides
+from psfdae.settings import ConfigError
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
-from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
     dataset_names,
-    decisive_settings,
     load,
-)
-from psfdae_paper.configuration.compose import (
-    cache_compositions,
-    load_groups,
-    neutral_settings,
     overrides_for,
+    part,
+    write_settings,
 )
-from psfdae_paper.configuration.compose import write_settings
 from psfdae.method import HISTORY
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
@@ -37,7 +32,6 @@ from psfdae.files import ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
-cache_compositions(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
@@ -142,7 +136,7 @@ def default_datasets():
 
     Sizes that fit together in one dataset may not in another: that counts where one is built.
     """
-    names = load_groups(overrides_for(GIVEN)).workflow.datasets
+    names = part(("workflow",), composed()).workflow.datasets
     if SCENE3 in names:
         raise ConfigError(f"workflow.datasets: {SCENE3} is built by the target scene3")
     return names
@@ -233,6 +227,16 @@ def products_of(dataset):
         *paper_tables_of(dataset),
         *figures_of(dataset),
         f"{RESULTS}/mlflow/{dataset}.csv",
+    ]
+
+
+def products_of_scene(experiment):
+    """Everything that the target of a scene builds: its datasets of the default target."""
+    return [
+        file
+        for dataset in default_datasets()
+        if dataset_config(dataset).scene.experiment == experiment
+        for file in products_of(dataset)
     ]
 
 

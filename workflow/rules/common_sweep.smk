@@ -1,5 +1,3 @@
-import json
-
 from snakemake.exceptions import WorkflowError
 
 from psfdae_paper.configuration.aligners import SWEPT
@@ -48,23 +46,6 @@ def sweep_known(w):
 def sweep_threads(w):
     groups = [g for g in sweep_point_of(w).config.values() if isinstance(g, dict)]
     return max(group.get("threads", 1) for group in groups)
-
-
-def sweep_options(w):
-    """What a point is, but for its configuration and its data."""
-    plan, point = sweep_plan(w.sweep), sweep_point_of(w)
-    sweep = plan.sweep
-    options = [f"--model={sweep.model}", f"--dataset={sweep.dataset or sweep.model}"]
-    options += [f"--split={sweep.split}", f"--reference={sweep.reference}"]
-    options += [f"--level={level:.12g}" for level in plan.levels]
-    # Sorted: another order of the axes is the same point.
-    for name, tree in (("values", point.values), ("keys", point.keys)):
-        options.append(f"--{name}={json.dumps(tree, sort_keys=True)}")
-    if point.slot is not None:
-        search = json.dumps(plan.search, sort_keys=True)
-        options += [f"--slot={point.slot}", f"--search={search}"]
-        options += [f"--known={other.name}" for other in plan.earlier_trials(point)]
-    return options
 
 
 @cache

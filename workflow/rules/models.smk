@@ -1,3 +1,5 @@
+# A rule for each method that stores a fit: train (DAE), baseline (PCA+SOM), fit_gmm, fit_gmm_position,
+# … (`Storage.rule` of the method's class). A method that is plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage):
     _rule = fits.rule_of(_method)
     _stem = fits.stem(_method, "{dataset}", "{split}", "{reference}")

@@ -37,9 +37,9 @@ rule sweep_point:
     resources:
         mem_mb=2000,
     params:
-        config=lambda w: as_overrides(decisive_settings(sweep_point_of(w).config)),
-        free=lambda w, threads: as_overrides(neutral_settings(sweep_point_of(w).config)),
-        options=sweep_options,
+        # The point's name is the hash of its settings, so that these need not be compared: asking
+        # for `threads` tells Snakemake that they are no reason to repeat a job.
+        given=lambda w, threads: GIVEN,
         data=lambda w, input: [
             word for role in sweep_data(w) for word in ("--data", role, input[role])
         ],
@@ -50,9 +50,9 @@ rule sweep_point:
     message:
         "Training point {wildcards.point} of sweep {wildcards.sweep}"
     shell:
-        "psfdae sweep point {params.options:q} {params.data:q}"
-        " --checkpoint {params.checkpoint} --source {params.source} --out {params.folder}"
-        " {params.config:q} {params.free:q} > {log} 2>&1"
+        "psfdae sweep point {wildcards.sweep} {params.data:q}"
+        " --checkpoint {params.checkpoint} --out {params.folder}"
+        " {params.given:q} > {log} 2>&1"
 
 
 rule sweep_summary:

@@ -11,21 +11,19 @@ rule tables:
     localrule: True
 
 
-for _scene in ("scene1", "scene2"):
-
-    rule:
-        name:
-            _scene
-        input:
-            lambda w, scene=_scene: [
-                file
-                for dataset in default_datasets()
-                if dataset_config(dataset).scene.experiment == scene
-                for file in products_of(dataset)
-            ],
-        localrule: True
+rule scene1:
+    input:
+        lambda w: products_of_scene("scene1"),
+    localrule: True
 
 
+rule scene2:
+    input:
+        lambda w: products_of_scene("scene2"),
+    localrule: True
+
+
+# A target for each file of config/dataset, such as dataset3.
 for _dataset in ALL_DATASETS:
 
     rule:

@@ -1,4 +1,9 @@
-"""Command `wavefront`: measure the aberrations of a known telescope from stars of an image."""
+"""Command `wavefront`: measure the aberrations of a known telescope from stars of an image.
+
+In: an image or stamps, a star list or detection, the YAML file of a telescope. Out: a FITS file
+with coefficients, PSFs and residuals, perhaps a figure, and a report on the terminal. The
+measurement itself is `psfdae.wavefront`.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +17,16 @@ from psfdae.commands.predict import ImageOptions, check_targets, write_list
 from psfdae.figures import write_png
 from psfdae.files import write_fits
 from psfdae.image.catalogue import as_catalogue
-from psfdae.image.errors import ascii_line
 from psfdae.image.observation import Observation, central_pixel, list_offset
-from psfdae.image.tables import fits_values
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.options import File
-from psfdae.sensing.joint import Joint
+from psfdae.sensing.output import report_lines, wavefront_hdus
 from psfdae.sensing.results import Wavefronts
 from psfdae.sensing.results import wavefront as measure_wavefronts
 from psfdae.sensing.stars import SensingError
 from psfdae.telescope.settings import OwnTelescope, read_telescope
-from psfdae.version import __version__
 
 if TYPE_CHECKING:
-    from astropy.io.fits import HDUList
-
     from psfdae.image.catalogue import StarList
 
 
@@ -69,7 +69,7 @@ def wavefront(
     # All stars are one piece: the joint fit takes them together.
     stamps = next(observation.chunks(observation.count))
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
-    lines = [observation.said(), *_list_note(wavefronts, observation), *_report(wavefronts)]
+    lines = [observation.said(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
     if list_path is not None:
         write_list(observation, list_path)
     if plot is not None:
@@ -77,7 +77,7 @@ def wavefront(
 
         write_png(wavefront_map(wavefronts, f"{source.path.name}: {optics.name}"), plot)
     # The FITS file is written last: if it exists, everything is done.
-    write_fits(out, _as_fits(wavefronts, source.path.name))
+    write_fits(out, wavefront_hdus(wavefronts, source.path.name))
     # Many stars that no wavefront explains mean that the description of the telescope is wrong.
     count, unexplained = len(wavefronts.stamps), int((~wavefronts.explained).sum())
     summary = (
@@ -93,6 +93,11 @@ def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     """Return a sentence on how far stars are off the positions of their list, if there is one.
 
     This is no mistake of the list: aberrations such as coma move the light of a star.
+
+    Returns
+    -------
+    list of str
+        Empty for stamps without an image, and if stars are where the list says.
     """
     if observation.shape is None or observation.positions is None:
         return []
@@ -119,6 +124,7 @@ def _check_scale(observation: Observation, telescope: OwnTelescope) -> None:
     SensingError
         If they differ by more than `SCALE_TOLERANCE`.
     """
+    # A cube of stamps states no scale: nothing can be compared.
     scale, telescope_scale = observation.pixel_scale_arcsec, telescope.pixel_scale_arcsec
     # "not <=" refuses a scale that is not a number, too.
     if scale is not None and not abs(scale / telescope_scale - 1.0) <= SCALE_TOLERANCE:
@@ -159,6 +165,7 @@ def _field_angles(
     SensingError
         If neither the list has angles, nor the stars positions in an image.
     """
+    # Angles of the list.
     if catalogue is not None and axis is None:
         table = as_catalogue(catalogue)
         if {"x_deg", "y_deg"} <= set(table.table.colnames):
@@ -171,6 +178,7 @@ def _field_angles(
                 row = incomplete.argmax() + 1
                 raise SensingError(f"{table.path}: no x_deg, y_deg in row {row}")
             return angle
+    # Else positions, counted from the axis.
     positions, shape = observation.positions, observation.shape
     if axis is None and shape is not None:
         axis = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
@@ -184,121 +192,3 @@ def _field_angles(
     if not np.isfinite(angle).all():
         raise SensingError(f"{observation.path}: stars without a position (--on-image leaves out)")
     return np.asarray(angle)
-
-
-def _as_fits(wavefronts: Wavefronts, image: str) -> HDUList:
-    """Return the FITS file with all results.
-
-    Its extensions are WAVEFRONT (table), PSF, UNCERT, MODEL, RESIDUAL (cubes), COVAR and, with
-    a joint fit, JOINT (table).
-    """
-    from astropy.io import fits
-
-    primary = fits.PrimaryHDU()
-    prior = wavefronts.telescope.prior
-    for card in (
-        ("CREATOR", f"psfdae {__version__}", ""),
-        ("INFILE", ascii_line(image), "stars"),
-        ("TELESCOP", wavefronts.telescope.name, "its description gave the optics"),
-        ("WAVELEN", wavefronts.telescope.wavelength_m, "[m] wavelength"),
-        ("PRIORFRA", prior.fraction, "prior: standard deviation, part of each term"),
-        ("NSTARS", len(wavefronts.stamps), "stars"),
-        ("NPOOR", int((~wavefronts.explained).sum()), "stars that no wavefront explains"),
-    ):
-        primary.header.append(card)
-    # A row for each mode of a star, that is, each wavefront that its image does not exclude.
-    modes = wavefronts.table
-    if modes["id"].dtype.kind == "U":
-        modes["id"] = fits_values(modes["id"])
-    table = fits.table_to_hdu(modes)
-    table.name = "WAVEFRONT"
-    table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."
-    # Covariances of the coefficients of each mode; NaN for stars without usable pixels, which
-    # have a row in the table, but no mode.
-    of_modes = wavefronts.summary["covariance"]
-    covariance = np.full((len(modes), *of_modes.shape[1:]), np.nan)
-    covariance[np.isfinite(modes["probability"])] = of_modes
-    psf, psf_error = wavefronts.psf_and_error()
-    sky = wavefronts.measured()["sky"][:, None, None]
-    residual = np.where(
-        wavefronts.stamps.bad | wavefronts.stamps.saturated,
-        np.nan,
-        wavefronts.stamps.data - sky - wavefronts.model,
-    )
-    hdus = [primary, table]
-    for name, values, comment in (
-        ("PSF", psf, "whole light 1, chief ray in the middle"),
-        ("UNCERT", psf_error, "standard deviation of PSF"),
-        ("MODEL", wavefronts.model, "star without sky, unit of the input"),
-        ("RESIDUAL", residual, "stamp minus sky minus model, NaN where unused"),
-        ("COVAR", covariance, "of the coefficients, squared waves; row by row"),
-    ):
-        hdu = fits.ImageHDU(values.astype(np.float32), name=name)
-        hdu.header["COMMENT"] = comment
-        hdus.append(hdu)
-    # State of the telescope, if one was fitted to all stars: a row for each of its numbers.
-    if wavefronts.joint is not None:
-        joint = wavefronts.joint
-        state = fits.table_to_hdu(joint.table)
-        state.name = "JOINT"
-        state.header["PROB"] = (joint.probability, "of this state against its twin")
-        hdus.append(state)
-    return fits.HDUList(hdus)
-
-
-def _report(wavefronts: Wavefronts) -> list[str]:
-    """Return a table of the errors of one star, and sentences on the modes and the telescope."""
-    terms, summary = wavefronts.terms, wavefronts.summary
-    # Modes stand star by star, the most probable one first: the first row of each star.
-    first = np.flatnonzero(np.diff(summary["star"], prepend=-1))
-    error = np.sqrt(np.einsum("mkk->mk", summary["covariance"][first]))
-    wavelength_nm = wavefronts.wavelength_nm
-    lines = [
-        f"prior of {wavefronts.telescope.name}: every coefficient about the telescope's own, with "
-        "the standard deviation of the column prior",
-        f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   of one star, median of {len(first)}",
-        f"{'':12}{'(waves)':>10}{'(waves)':>10}{'(nm)':>10}",
-    ]
-    for k, name in enumerate(terms.names):
-        prior = np.median(terms.sd[summary["star"][first], k])
-        term_error = np.median(error[:, k])
-        lines.append(f"{name:12}{prior:10.4f}{term_error:10.4f}{wavelength_nm * term_error:10.2f}")
-    rms_nm = wavelength_nm * np.nanmedian(wavefronts.rms[0])
-    ambiguous = np.mean(summary["probability"][first] < 0.95)
-    lines.append(
-        f"RMS of the wavefronts {rms_nm:.3g} nm in the median; {ambiguous:.0%} of the stars have a "
-        "second wavefront with a probability above 5 %"
-    )
-    return lines if wavefronts.joint is None else lines + _joint_report(wavefronts.joint)
-
-
-def _joint_report(joint: Joint) -> list[str]:
-    """Return a table of the telescope's state, and sentences on how well stars determine it."""
-    lines = [
-        f"the telescope, from {joint.star.size} stars together:",
-        f"{'number':16}{'unit':>6}{'prior':>12}{'± ':>11}{'found':>12}{'± ':>11}",
-    ]
-    form = "{:16}{:>6}{:12.4g}{:11.2g}{:12.4g}{:11.2g}"
-    lines += [
-        form.format(*row)
-        for row in joint.table["name", "unit", "prior", "prior_error", "value", "error"]
-    ]
-    # Two numbers that change the image alike are known worse than their errors suggest, each by
-    # itself: name pairs with a correlation above 0.5.
-    correlated = np.argwhere(np.triu(np.abs(joint.correlation) > 0.5, 1))
-    if len(correlated):
-        pairs = [
-            f"{joint.model.names[i]}, {joint.model.names[j]} {joint.correlation[i, j]:+.2f}"
-            for i, j in correlated
-        ]
-        lines.append(f"correlations of errors: {'; '.join(pairs)}")
-    if joint.twin is not None:
-        lines.append(
-            f"its probability is {joint.probability:.3f}; the twin, of the other sign of focus, "
-            f"astigmatism and spherical aberration, has the rest"
-        )
-    disagreeing = int(joint.disagrees.sum())
-    lines.append(
-        f"{disagreeing} of {joint.star.size} stars disagree with it by more than 4 σ of their χ²"
-    )
-    return lines

@@ -1,26 +1,27 @@
 """Pixels of an image that show no light of the sky: blank areas, overscan, cosmic rays, hot pixels.
 
-Each function takes an image (h, w) and returns the pixels that it found as a mask, so that sky,
-detection and fits leave them out. Nothing here depends on the unit of the image.
+In: an image (h, w), in any unit, and its headers. Out: `BadPixels`, masks of pixels that sky,
+detection and fits leave out. Each function below finds one kind of them.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.image.interpolation import interpolated
+from psfdae.image.sky_level import SkyLevel, pixel_noise
+from psfdae.moments import robust_scatter
+
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-BLANK_PX = 8  # side of the smallest blank square; noise fills none with one value
-CLIPPED_SHARE = 0.3  # of the pixels at the least value, from which the sky was clipped there
-COSMIC_SIGMA, COSMIC_RATIO = 6.0, 5.0  # least height and sharpness of a cosmic ray
-BAND_ROWS, BAND_EDGE = 256, 16  # rows that are searched at a time, and beyond them on each side
-SECTION = re.compile(r"\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]")
+COSMIC_SIGMA = 6.0
+"""Height in σ from which a pixel is a cosmic ray, a hot pixel or, below its neighbours, dead."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,15 @@ class BadPixels:
     cosmic : ndarray of bool, shape (h, w)
         Cosmic rays and hot pixels.
     notes : tuple of str
-        What was found, with the number of pixels.
+        Each kind that there is, with the number of pixels.
+    sky : SkyLevel, optional
+        Sky of the image without these pixels, if it was measured to find trails.
     """
 
     mask: np.ndarray
     cosmic: np.ndarray
     notes: tuple[str, ...]
+    sky: SkyLevel | None = None
 
 
 class ClippedSkyError(ValueError):
@@ -49,7 +53,7 @@ class ClippedSkyError(ValueError):
 def find_bad_pixels(
     image: np.ndarray, masked: np.ndarray, headers: Sequence[Header], saturate: float | None
 ) -> BadPixels:
-    """Find all pixels of an image that show no light of the sky.
+    """Find all pixels of an image that show no light of the sky, but for trails.
 
     Parameters
     ----------
@@ -77,13 +81,8 @@ def find_bad_pixels(
     for key, area in overscan(headers, image, mask):
         mask |= area
         notes.append(f"{np.count_nonzero(area)} pixels outside the exposed area by {key}")
-    share, least_value = least_value_share(image, mask)
-    if share >= CLIPPED_SHARE:
-        raise ClippedSkyError(
-            f"{100 * share:.0f} % of the pixels have the least value, {least_value:g}: the sky was "
-            "clipped there, or has hardly any photons, and neither it nor its noise can be "
-            "measured; take the image from before it was clipped, or write negative values, too"
-        )
+    refuse_clipped_sky(image, mask)
+    # Dead pixels first: beside these, others would look like cosmic rays.
     noise = pixel_noise(image, mask)
     dead = dead_pixels(image, mask, noise)
     if dead.any():
@@ -95,6 +94,18 @@ def find_bad_pixels(
     return BadPixels(mask | cosmic, cosmic, tuple(notes))
 
 
+def _in_bands(find: Callable[..., np.ndarray], *maps: np.ndarray) -> np.ndarray:
+    """Return the mask (h, w) that a function finds in bands of 256 rows of maps (h, w).
+
+    The function sees 16 rows more on each side. Bands bound the memory for a large image.
+    """
+    mask = np.zeros(maps[0].shape, dtype=bool)
+    for top in range(0, len(mask), 256):
+        start, end = max(top - 16, 0), min(top + 256, len(mask))
+        mask[top:end] = find(*(band[start : end + 16] for band in maps))[top - start : end - start]
+    return mask
+
+
 # Blank areas.
 
 
@@ -103,7 +114,7 @@ def blank_areas(
 ) -> list[tuple[float, np.ndarray]]:
     """Find areas in which all pixels have exactly one value, such as the border of a mosaic.
 
-    A blank area has a square of `BLANK_PX` pixels, or whole rows or columns. Areas above
+    A blank area has a square of 8 × 8 pixels, or whole rows or columns. Areas above
     saturation, or above the sky and not at the edge of the image, are cores of saturated stars.
     Images without noise have no blank areas: there, one value is the sky.
 
@@ -123,12 +134,14 @@ def blank_areas(
 
     # Squares and lines in which the least and the greatest value are the same.
     values = np.where(bad, np.nan, image)
-    solid = _constant_squares(values)
-    for axis in (0, 1):
-        edge = values[:1] if axis == 0 else values[:, :1]
-        solid |= (values == edge).all(axis=axis, keepdims=True)
+    solid = np.zeros(values.shape, dtype=bool)
+    if min(values.shape) >= 8:
+        solid = _in_bands(_constant_squares, values) & np.isfinite(values)
+    solid |= (values == values[:1]).all(axis=0)
+    solid |= (values == values[:, :1]).all(axis=1, keepdims=True)
     if not solid.any():
         return []
+    # The 16 most frequent values of these.
     counts = zip(*np.unique(values[solid], return_counts=True), strict=True)
     candidates = sorted(counts, key=lambda pair: -pair[1])[:16]
     areas = []
@@ -137,13 +150,11 @@ def blank_areas(
         area = ndimage.binary_propagation(solid & (values == value), mask=values == value)
         # Of a large image, one pixel of 16 says how far the rest is from the value.
         outside = ~area & ~bad
-        outside_values = (
-            values[outside] if outside.size < 2**22 else values[::4, ::4][outside[::4, ::4]]
-        )
+        sample = np.s_[:] if outside.size < 2**22 else np.s_[::4, ::4]
+        outside_values = values[sample][outside[sample]]
         if not outside_values.size or (saturate is not None and value >= saturate):
             continue
-        middle = float(np.median(outside_values))
-        if value > middle:
+        if value > float(np.median(outside_values)):
             label, _ = ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
@@ -159,51 +170,64 @@ def blank_areas(
     return areas
 
 
-def _constant_squares(values: np.ndarray) -> np.ndarray:
-    """Return the pixels (h, w) of squares of `BLANK_PX` pixels that have one value."""
+def _constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
+    """Return the pixels (h, w) of squares that have one value; noise fills none of 8 px with one.
+
+    NaN differs from itself.
+    """
     from scipy import ndimage
 
-    constant = np.zeros(values.shape, dtype=bool)
-    if min(values.shape) < BLANK_PX:
-        return constant
-    for rows, band_rows, core_rows in _bands(len(values)):
-        band = values[band_rows]
-        # NaN differs from itself; filters would spread it in an order of their own.
-        is_finite = np.isfinite(band)
-        low = ndimage.minimum_filter(np.where(is_finite, band, -np.inf), BLANK_PX, mode="nearest")
-        high = ndimage.maximum_filter(np.where(is_finite, band, np.inf), BLANK_PX, mode="nearest")
-        corner = (low == high) & np.isfinite(low)
-        # A filter of even size covers the pixels from −s/2 to s/2 − 1 about its own.
-        grown = ndimage.maximum_filter(corner, BLANK_PX, origin=-1)
-        constant[rows] = grown[core_rows]
-    return np.asarray(constant & np.isfinite(values))
+    # Filters would spread NaN in an order of their own.
+    is_finite = np.isfinite(values)
+    low = ndimage.minimum_filter(np.where(is_finite, values, -np.inf), side, mode="nearest")
+    high = ndimage.maximum_filter(np.where(is_finite, values, np.inf), side, mode="nearest")
+    corner = (low == high) & np.isfinite(low)
+    # A filter of even size covers the pixels from −s/2 to s/2 − 1 about its own.
+    return np.asarray(ndimage.maximum_filter(corner, side, origin=-1))
 
 
-def least_value_share(image: np.ndarray, bad: np.ndarray) -> tuple[float, float]:
-    """Return the part of the good pixels that a clipped sky has at its least value, and the value.
+def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, most: float = 0.3) -> None:
+    """Refuse an image of which more than a part of the good pixels have the least value.
 
-    The part is 0 where these pixels lie together, as the even sky of an image without noise
-    does, and where the values are counts of few photons: the next value is as frequent then.
+    Pixels that lie together, as the even sky of an image without noise does, do not count, nor do
+    counts of few photons, where the next value is as frequent.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+    most : float
+        Part from which the sky was clipped.
+
+    Raises
+    ------
+    ClippedSkyError
     """
     good = ~bad
     count = np.count_nonzero(good)
     if not count:
-        return 0.0, np.nan
+        return
     least_value = float(image.min(where=good, initial=np.inf))
     at_least = image == least_value
     share = float(np.count_nonzero(at_least & good) / count)
-    if share < CLIPPED_SHARE:
-        return share, least_value
+    if share < most:
+        return
     # Neighbours change between least and other values 2p(1 − p) times where noise decides it.
     pairs = ~(bad[:, 1:] | bad[:, :-1])
     changes = np.count_nonzero((at_least[:, 1:] != at_least[:, :-1]) & pairs)
     by_noise = 2.0 * share * (1.0 - share) * np.count_nonzero(pairs)
     higher = good & ~at_least
     if changes < 0.5 * by_noise or not higher.any():
-        return 0.0, least_value
+        return
+    # Part of the pixels that has the second value.
     second = image.min(where=higher, initial=np.inf)
-    following = np.count_nonzero((image == second) & higher) / count
-    return (0.0 if following > 0.3 * share else share), least_value
+    if np.count_nonzero((image == second) & higher) / count > 0.3 * share:
+        return
+    raise ClippedSkyError(
+        f"{100 * share:.0f} % of the pixels have the least value, {least_value:g}: the sky was "
+        "clipped there, or has hardly any photons, and neither it nor its noise can be "
+        "measured; take the image from before it was clipped, or write negative values, too"
+    )
 
 
 # Overscan.
@@ -223,17 +247,18 @@ def overscan(
     list of (str, ndarray of bool)
         Key of the header and the pixels (h, w) outside.
     """
-    from psfdae.moments import robust_scatter
-
     areas = []
     excluded = bad.copy()
+    section_form = re.compile(r"\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]")
     for key in ("TRIMSEC", "DATASEC", "BIASSEC"):
-        section = next((SECTION.search(str(h[key])) for h in headers if key in h), None)
+        # [x0:x1,y0:y1], both ends included, from 1.
+        section = next((section_form.search(str(h[key])) for h in headers if key in h), None)
         if section is None:
             continue
         x0, x1, y0, y1 = map(int, section.groups())
         if not (1 <= x0 <= x1 <= image.shape[1] and 1 <= y0 <= y1 <= image.shape[0]):
             continue
+        # BIASSEC is outside of the exposed area, the others are all of it.
         area = np.full(image.shape, key != "BIASSEC")
         area[y0 - 1 : y1, x0 - 1 : x1] = key == "BIASSEC"
         area &= ~excluded
@@ -242,6 +267,7 @@ def overscan(
         inside, outside = image[~(excluded | area)], image[area]
         if not inside.size:
             continue
+        # Overscan has another level than the sky, or less noise.
         noise, other_noise = (float(robust_scatter(part)) for part in (inside, outside))
         step = abs(float(np.median(outside)) - float(np.median(inside)))
         if step > 3.0 * other_noise or other_noise < 0.8 * noise:
@@ -256,26 +282,31 @@ def overscan(
 def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Find the pixels (h, w) that are 6 σ below the least of their eight neighbours.
 
-    Beside these, others would look like cosmic rays. `bad` pixels (h, w) do not count; `noise`
-    (h, w) is that of pixels.
+    Parameters
+    ----------
+    image, noise : ndarray, shape (h, w)
+        The noise is that of pixels.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
     """
     from scipy import ndimage
 
-    dead = np.zeros(image.shape, dtype=bool)
     around = np.ones((3, 3), dtype=bool)
     around[1, 1] = False
-    if min(image.shape) < 2 * BAND_EDGE:
-        return dead
-    for rows, band_rows, core_rows in _bands(len(image)):
-        clean = interpolated(image[band_rows], bad[band_rows])[0]
+
+    def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        clean = interpolated(band, bad)[0]
         depth = ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > COSMIC_SIGMA * noise[band_rows]) & ~bad[band_rows])
-        local = _noise_around(clean, noise[band_rows], row, column)
-        deep = depth[row, column] > COSMIC_SIGMA * local
-        band = np.zeros(clean.shape, dtype=bool)
-        band[row[deep], column[deep]] = True
-        dead[rows] = band[core_rows]
-    return dead
+        row, column = np.nonzero((depth > COSMIC_SIGMA * noise) & ~bad)
+        deep = depth[row, column] > COSMIC_SIGMA * _noise_around(clean, noise, row, column)
+        dead = np.zeros(clean.shape, dtype=bool)
+        dead[row[deep], column[deep]] = True
+        return dead
+
+    # An image of less than 32 px has no surroundings to compare with.
+    if min(image.shape) < 32:
+        return np.zeros(image.shape, dtype=bool)
+    return _in_bands(find, image, bad, noise)
 
 
 def cosmic_rays(
@@ -284,7 +315,7 @@ def cosmic_rays(
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
     A pixel counts if its Laplacian L⁺ is `COSMIC_SIGMA` times the noise, and larger than the fine
-    structure F of the image around it by a factor: `COSMIC_RATIO`, or four times what the bright
+    structure F of the image around it by a factor: 5, or four times what the bright
     sources of this image have where they are so narrow that it is more. Stars are thus never
     taken for cosmic rays, and where they are nearly as narrow as these, only very high ones are
     found; none are where the median is over 10.
@@ -303,31 +334,33 @@ def cosmic_rays(
     -------
     ndarray of bool, shape (h, w)
     """
-    cosmic = np.zeros(image.shape, dtype=bool)
-    if min(image.shape) < 2 * BAND_EDGE:
-        return cosmic
+    if min(image.shape) < 32:
+        return np.zeros(image.shape, dtype=bool)
     sharpness = sharpness_of_sources(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
-        return cosmic
-    ratio = max(COSMIC_RATIO, 4.0 * sharpness)
-    for rows, band_rows, core_rows in _bands(len(image)):
-        band = _cosmic_rays_of_band(
-            image[band_rows], bad[band_rows], noise[band_rows], saturate, ratio
-        )
-        cosmic[rows] = band[core_rows]
-    return np.asarray(cosmic & ~bad)
+        return np.zeros(image.shape, dtype=bool)
+    ratio = max(5.0, 4.0 * sharpness)
+
+    def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return _cosmic_rays_of_band(band, bad, noise, saturate, ratio)
+
+    return np.asarray(_in_bands(find, image, bad, noise) & ~bad)
 
 
 def _cosmic_rays_of_band(
     band: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None, ratio: float
 ) -> np.ndarray:
-    """Find the cosmic rays of some rows (r, w) that are sharper than stars by a ratio."""
+    """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio."""
     from scipy import ndimage
 
     clean = interpolated(band, bad)[0]
     forbidden = ndimage.binary_dilation(bad)
     if saturate is not None:
-        forbidden |= _saturated_stars(band, saturate)
+        # Pixels in and around areas of four saturated pixels or more.
+        label, _ = ndimage.label(band >= saturate, np.ones((3, 3)))
+        large = np.bincount(label.ravel()) >= 4
+        large[0] = False
+        forbidden |= ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
     cosmic = np.zeros(band.shape, dtype=bool)
     # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
     for _ in range(8):
@@ -335,22 +368,52 @@ def _cosmic_rays_of_band(
         row, column = np.nonzero((edge > 0.5 * COSMIC_SIGMA * noise) & ~forbidden & ~cosmic)
         if not row.size:
             break
-        local = _noise_around(clean, noise, row, column)
+        sigma = _noise_around(clean, noise, row, column)
         height, structure = _contrast(clean, edge, row, column)
-        high = height > COSMIC_SIGMA * local
-        sharp = high & (height > ratio * (np.maximum(structure, 0.0) + local))
+        # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
+        limit = ratio * (np.maximum(structure, 0.0) + sigma)
+        sharp = (height > COSMIC_SIGMA * sigma) & (height > limit)
         new = np.zeros_like(cosmic)
         new[row[sharp], column[sharp]] = True
-        # Beside a cosmic ray, half the height is enough, and no sharpness is asked for.
-        lower = height > 0.5 * COSMIC_SIGMA * local
-        is_beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column] & lower
-        is_beside &= height > 0.5 * ratio * (np.maximum(structure, 0.0) + local)
+        # Beside a cosmic ray, half the height is enough for both.
+        is_beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
+        is_beside &= (height > 0.5 * COSMIC_SIGMA * sigma) & (height > 0.5 * limit)
         new[row[is_beside], column[is_beside]] = True
         if not new.any():
             break
         cosmic |= new
         clean = interpolated(clean, cosmic | bad)[0]
     return cosmic
+
+
+def sharpness_of_sources(
+    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
+) -> float:
+    """Return the median of L⁺/F at the brightest pixels of the bright stars; 0 if there are none.
+
+    It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, 3 to 5 for 1.2 px, and 7 to 15 for
+    0.9 px. Sources above 20 are no stars.
+    """
+    from scipy import ndimage
+
+    full = np.inf if saturate is None else saturate
+    ratios = []
+    # A band of rows at a time, which bounds the memory.
+    for rows in (slice(top, top + 256) for top in range(0, len(image), 256)):
+        hidden, sigma = bad[rows], noise[rows]
+        clean = interpolated(image[rows], hidden)[0]
+        edge = edges(clean)
+        # Local maxima, so bright that noise does not matter, and not saturated.
+        above = clean - np.median(clean)
+        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
+        top &= (ndimage.maximum_filter(clean, 5) < full) & ~hidden
+        row, column = np.nonzero(top)
+        brightest = np.argsort(-above[row, column], kind="stable")[:1000]
+        row, column = row[brightest], column[brightest]
+        height, structure = _contrast(clean, edge, row, column)
+        ratio = height / np.maximum(structure, sigma[row, column])
+        ratios.append(ratio[ratio < 20.0])
+    return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
 
 
 def edges(image: np.ndarray) -> np.ndarray:
@@ -361,16 +424,12 @@ def edges(image: np.ndarray) -> np.ndarray:
     quarters, each cut off at 0.
     """
     padded = np.pad(image, 1, mode="edge")
-    upper_pixels, lower_pixels, left_pixels, right_pixels = (
-        padded[:-2, 1:-1],
-        padded[2:, 1:-1],
-        padded[1:-1, :-2],
-        padded[1:-1, 2:],
-    )
+    above, below = padded[:-2, 1:-1], padded[2:, 1:-1]
+    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
     quarters = [
-        np.maximum(2.0 * image - a - b, 0.0)
-        for a in (upper_pixels, lower_pixels)
-        for b in (left_pixels, right_pixels)
+        np.maximum(2.0 * image - vertical - horizontal, 0.0)
+        for vertical in (above, below)
+        for horizontal in (left, right)
     ]
     return np.asarray(sum(quarters) / 8.0)
 
@@ -396,29 +455,6 @@ def _contrast(
     return height, structure
 
 
-def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return the noise (h, w) of pixels from the differences of neighbours, in squares of 64.
-
-    It is infinite where neighbours do not differ: there is no noise with which to compare.
-    """
-    difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
-    hidden = bad | np.concatenate([bad[:, 1:], bad[:, -2:-1]], axis=1)
-    difference[hidden] = np.nan
-    height, width = image.shape
-    noise = np.full(image.shape, np.inf, difference.dtype)
-    for top in range(0, height, 64):
-        for residual in range(0, width, 64):
-            square = np.s_[top : top + 64, residual : residual + 64]
-            values, is_good = difference[square].ravel(), np.count_nonzero(~hidden[square])
-            if not is_good:
-                continue
-            # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ; NaN comes last.
-            middle = [(is_good - 1) // 2, is_good // 2]
-            sigma = 1.4826 / np.sqrt(2.0) * float(np.partition(values, middle)[middle].mean())
-            noise[square] = sigma if sigma > 0 else np.inf
-    return noise
-
-
 def _noise_around(
     image: np.ndarray, noise: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
@@ -433,124 +469,3 @@ def _noise_around(
         difference = np.abs(np.diff(nines[row[part], column[part]], axis=2)).reshape(-1, 72)
         scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
     return np.asarray(np.maximum(scatter, noise[row, column]))
-
-
-def _saturated_stars(image: np.ndarray, saturate: float) -> np.ndarray:
-    """Return the pixels (h, w) in and around areas of four saturated pixels or more."""
-    from scipy import ndimage
-
-    label, _ = ndimage.label(image >= saturate, np.ones((3, 3)))
-    large = np.bincount(label.ravel()) >= 4
-    large[0] = False
-    return np.asarray(ndimage.binary_dilation(large[label], np.ones((3, 3)), 2))
-
-
-def sharpness_of_sources(
-    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
-) -> float:
-    """Return the median of L⁺/F at the brightest pixels of the bright stars; 0 if there are none.
-
-    It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, 3 to 5 for 1.2 px, and 7 to 15 for
-    0.9 px. Sources above 20 are no stars.
-    """
-    from scipy import ndimage
-
-    full = np.inf if saturate is None else saturate
-    ratios = []
-    for rows, _, _ in _bands(len(image)):
-        hidden, sigma = bad[rows], noise[rows]
-        clean = interpolated(image[rows], hidden)[0]
-        edge = edges(clean)
-        # Local maxima, so bright that noise does not matter.
-        above = clean - np.median(clean)
-        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
-        top &= (ndimage.maximum_filter(clean, 5) < full) & ~hidden
-        row, column = np.nonzero(top)
-        brightest = np.argsort(-above[row, column], kind="stable")[:1000]
-        height, structure = _contrast(clean, edge, row[brightest], column[brightest])
-        ratio = height / np.maximum(structure, sigma[row, column][brightest])
-        ratios.append(ratio[ratio < 20.0])
-    return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
-
-
-def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image with its bad pixels interpolated, and those that have no neighbours for it.
-
-    Along rows and columns, a cubic polynomial goes through the two nearest pixels on each side;
-    a line through the nearest ones is taken where these are bad, and else the mean of the good
-    ones of 5 × 5 pixels, weighted by a Gaussian of σ = 1 px.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-    bad : ndarray of bool, shape (h, w)
-
-    Returns
-    -------
-    image : ndarray, shape (h, w)
-        A copy; 0 where nothing is near.
-    left : ndarray of bool, shape (h, w)
-    """
-    filled, remaining = np.where(bad, 0.0, image), np.zeros(bad.shape, dtype=bool)
-    row, column = np.nonzero(bad)
-    if not row.size:
-        return filled, remaining
-    reach = 2
-    padded = np.pad(filled, reach)
-    good = np.pad(~bad, reach)
-    steps = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
-    total, count, mean, light = np.zeros((4, len(row)))
-    for down in steps:
-        for across in steps:
-            at = row + reach + down, column + reach + across
-            weight = weights[down + reach, across + reach] * good[at]
-            mean += weight * padded[at]
-            light += weight
-    for axis in (np.array([1, 0]), np.array([0, 1])):
-        values, has_neighbours = [], []
-        for step in (-2, -1, 1, 2):
-            at = row + reach + step * axis[0], column + reach + step * axis[1]
-            values.append(padded[at])
-            has_neighbours.append(good[at])
-        nearby = has_neighbours[1] & has_neighbours[2]
-        distant = nearby & has_neighbours[0] & has_neighbours[3]
-        line = 0.5 * (values[1] + values[2])
-        cubic = (4.0 * (values[1] + values[2]) - values[0] - values[3]) / 6.0
-        # A cubic counts twice as much as a line, which cuts off peaks.
-        part = np.where(distant, 2.0, nearby * 1.0)
-        total += part * np.where(distant, cubic, line)
-        count += part
-    is_good = light > 0
-    mean = mean / np.where(is_good, light, 1.0)
-    filled[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
-    remaining[row, column] = ~is_good
-    return filled, remaining
-
-
-def interpolated_stamps(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return stamps (n, s, s) with their bad pixels `interpolated`, each from its own pixels."""
-    rows = np.flatnonzero(bad.any(axis=(1, 2)))
-    if not rows.size:
-        return stamps
-    # Two rows of bad pixels part each stamp from the next one.
-    between = ((0, 0), (0, 2), (0, 0))
-    side = stamps.shape[-1]
-    tall = np.pad(stamps[rows], between).reshape(-1, side)
-    hidden = np.pad(bad[rows], between, constant_values=True).reshape(-1, side)
-    out = np.array(stamps)
-    out[rows] = interpolated(tall, hidden)[0].reshape(len(rows), side + 2, side)[:, :side]
-    return out
-
-
-def _bands(height: int) -> list[tuple[slice, slice, slice]]:
-    """Return bands of rows, the rows with those beside them, and the place of the first in these.
-
-    Of a large image, only a band is searched at a time, which bounds the memory.
-    """
-    bands = []
-    for top in range(0, height, BAND_ROWS):
-        end, start = min(top + BAND_ROWS, height), max(top - BAND_EDGE, 0)
-        band_rows = slice(start, min(end + BAND_EDGE, height))
-        bands.append((slice(top, end), band_rows, slice(top - start, end - start)))
-    return bands

@@ -1,39 +1,55 @@
 """Stars of an image without a list: its sky, what stands above it, and whether a list fits.
 
-photutils does it: sources as connected pixels above it (Bertin & Arnouts
+In: an image (h, w) and its bad pixels. Out: `Sky`, the image without its sky, which finds stars.
+
+photutils finds them: sources are connected pixels above the sky (Bertin & Arnouts
 1996, A&AS 117, 393), those that touch parted where a saddle is deep enough.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from psfdae.image.bad_pixels import interpolated
-from psfdae.image.sky_level import sky_level
+from psfdae.image.interpolation import interpolated
+from psfdae.image.sky_level import SkyLevel, sky_level
 from psfdae.image.source_size import measure_size
 from psfdae.moments import FWHM_OF_SIGMA
 
-LEAST_PX = 5  # pixels of a source
-LEVELS, CONTRAST = 8, 0.005  # of the parting; 32 levels take three times as long for 1 % more stars
-SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
-SMOOTHED_NOISE = float(np.sqrt(np.square(SMOOTHING).sum()))  # that of a pixel, in σ of before
-DECIMALS = 3  # of positions
-WIDE_PX = 7.0  # FWHM of sources from which an image is smoothed by it before it is searched
+LEAST_PX = 5
+"""Least number of connected pixels above the threshold that are a source."""
 
 
 @dataclass(frozen=True)
 class Sky:
-    """An image (h, w) with its sky subtracted, and what was subtracted, in single precision."""
+    """An image (h, w) with its sky subtracted, and what was subtracted, in single precision.
 
-    flat: np.ndarray  # interpolated where bad; 0 where no good pixel is near
+    Attributes
+    ----------
+    flat : ndarray, shape (h, w)
+        Image above its sky; interpolated where bad, 0 where no good pixel is near.
+    level, noise : ndarray, shape (h, w)
+        Level of the sky, and σ of each pixel.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    noise_scale : float
+        Factor of the map of σ, NaN without one.
+    steps : tuple of two sequences of int
+        Rows and columns at which the level has a step.
+    notes : tuple of str
+        Sentences on what is unusual in the sky.
+    """
+
+    flat: np.ndarray
     level: np.ndarray
-    noise: np.ndarray  # σ of every pixel
+    noise: np.ndarray
     bad: np.ndarray
-    noise_scale: float  # of the map of σ, if there was one
-    notes: tuple[str, ...] = ()  # what is unusual in the sky
+    noise_scale: float
+    steps: tuple[Sequence[int], Sequence[int]] = ((), ())
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def holes(self) -> np.ndarray:
@@ -49,35 +65,49 @@ class Sky:
         return np.asarray(self.bad & (around > 0.5))
 
     def _above(self, threshold: float, fwhm_px: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """The smoothed image, and where its threshold is.
+        """Return the smoothed image, and where its threshold is, (h, w) each.
 
-        It is smoothed slightly, or by a Gaussian of that FWHM.
+        It is smoothed slightly, by [1, 2, 1]/4 along both axes, or by a Gaussian of that FWHM.
         """
         from scipy import ndimage
 
         if not fwhm_px:
-            return ndimage.convolve(self.flat, SMOOTHING), threshold * SMOOTHED_NOISE * self.noise
+            # Noise of a weighted sum of pixels, σ √(Σ w²).
+            kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
+            noise_part = float(np.sqrt(np.square(kernel).sum()))
+            return ndimage.convolve(self.flat, kernel), threshold * noise_part * self.noise
         # Noise of a pixel after a Gaussian of σ_g: σ/(2 √π σ_g).
         sigma = fwhm_px / FWHM_OF_SIGMA
         smooth = ndimage.gaussian_filter(self.flat, sigma)
         return smooth, threshold * self.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
-    def stars(self, threshold: float, fwhm_px: float | None = None) -> dict[str, np.ndarray]:
-        """Columns of a star list as SExtractor names them, positions from 1, ids too.
+    def stars(
+        self, threshold: float, fwhm_px: float | None = None, wide_px: float = 7.0
+    ) -> dict[str, np.ndarray]:
+        """Return columns of a star list as SExtractor names them, positions from 1, ids too.
 
-        `threshold` is in σ of the smoothed image: slightly, or, where stars are wide, by a Gaussian
-        as wide as the brightest sources. Otherwise noise would part a star into many. The FWHM of
-        stars is measured if it is not known.
+        Where stars are wide, noise would part a star into many: the image is smoothed by a Gaussian
+        as wide as the brightest sources before it is searched.
+
+        Parameters
+        ----------
+        threshold : float
+            In σ of the smoothed image.
+        fwhm_px : float, optional
+            FWHM of stars; measured if it is not given.
+        wide_px : float
+            FWHM from which stars are wide.
         """
         if fwhm_px is not None:
-            return self._sources(threshold, fwhm_px if fwhm_px >= WIDE_PX else 0.0)
+            return self._sources(threshold, fwhm_px if fwhm_px >= wide_px else 0.0)
         columns, smoothing = self._sources(threshold), 0.0
+        # The size of the sources, and the sources smoothed by it, until both agree.
         for _ in range(3):
             if "X_IMAGE" not in columns:
                 break
             place = np.stack([columns["X_IMAGE"], columns["Y_IMAGE"]], axis=1) - 1
             size = measure_size(self.flat, self.bad, place)
-            if size is None or size.fwhm_px < WIDE_PX:
+            if size is None or size.fwhm_px < wide_px:
                 break
             if abs(size.fwhm_px - smoothing) < 0.2 * smoothing:
                 break
@@ -86,15 +116,15 @@ class Sky:
         return columns
 
     def _sources(self, threshold: float, fwhm_px: float = 0.0) -> dict[str, np.ndarray]:
-        """Columns of a star list of the image, smoothed by a Gaussian of that FWHM or slightly."""
+        """Return columns of a star list of the image, smoothed by a Gaussian or slightly."""
         from photutils.segmentation import SourceCatalog, SourceFinder
 
         smooth, limit = self._above(threshold, fwhm_px)
         # A source has at least a circle of half the FWHM in diameter.
         least_px = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
-        # Smoothed stars have shallow saddles between them, which few levels miss.
-        levels = 4 * LEVELS if fwhm_px else LEVELS
-        finder = SourceFinder(least_px, n_levels=levels, contrast=CONTRAST)
+        # Sources are parted at saddles between 8 levels; 32 levels take three times as long for 1 %
+        # more stars. Smoothed stars have shallow saddles between them, which few levels miss.
+        finder = SourceFinder(least_px, n_levels=32 if fwhm_px else 8, contrast=0.005)
         finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
@@ -106,21 +136,27 @@ class Sky:
         )
         finite = np.isfinite(x) & np.isfinite(y)
         x, y, flux = x[finite], y[finite], flux[finite]
-        height, width = self.level.shape
+        # Level of the sky at the pixel of each source.
         row, column = (
-            np.clip(np.rint(v), 0, n - 1).astype(int) for v, n in ((y, height), (x, width))
+            np.clip(np.rint(v), 0, n - 1).astype(int)
+            for v, n in zip((y, x), self.level.shape, strict=True)
         )
+        level = self.level[row, column]
+
+        def rounded(values: np.ndarray) -> np.ndarray:
+            """Return eight digits, not decimals: the unit of an image may be of any size."""
+            return np.array([float(f"{value:.8g}") for value in values.astype(float).tolist()])
+
         return {
             "id": np.arange(1, len(x) + 1),
-            "X_IMAGE": np.round(x + 1, DECIMALS),
-            "Y_IMAGE": np.round(y + 1, DECIMALS),
-            # Digits, not decimals: the unit of an image may be of any size.
-            "FLUX_ISO": _with_digits(flux.astype(float)),
-            "BACKGROUND": _with_digits(self.level[row, column].astype(float)),
+            "X_IMAGE": np.round(x + 1, 3),
+            "Y_IMAGE": np.round(y + 1, 3),
+            "FLUX_ISO": rounded(flux),
+            "BACKGROUND": rounded(level),
         }
 
     def covered(self, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:
-        """Whether a source stands on each pixel (n,), bool; never off the image."""
+        """Return True for pixels (n,) on which a source stands; never off the image."""
         from scipy import ndimage
 
         # As photutils parts an image, which takes a second to be loaded.
@@ -139,15 +175,14 @@ class Sky:
         return inside
 
 
-def _with_digits(values: np.ndarray) -> np.ndarray:
-    """Return numbers (n,) with eight significant digits."""
-    return np.array([float(f"{value:.8g}") for value in values.tolist()])
-
-
 def sky_of(
-    image: np.ndarray, bad: np.ndarray, sigma: np.ndarray | None = None, least_noise: float = 0.0
+    image: np.ndarray,
+    bad: np.ndarray,
+    sigma: np.ndarray | None = None,
+    least_noise: float = 0.0,
+    measured: SkyLevel | None = None,
 ) -> Sky:
-    """Sky and noise of an image.
+    """Return an image without its sky, and what was subtracted.
 
     Parameters
     ----------
@@ -158,6 +193,8 @@ def sky_of(
         σ of every pixel but for a factor, which is found here.
     least_noise : float
         The noise is nowhere below this.
+    measured : SkyLevel, optional
+        Sky of the image, if it was measured before.
 
     Raises
     ------
@@ -165,14 +202,14 @@ def sky_of(
         If no mesh has enough pixels that count.
     """
     image = np.where(bad, 0.0, image)
-    measured = sky_level(image, bad)
-    level = measured.level
+    level, noise, steps, notes = sky_level(image, bad) if measured is None else measured
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
-    noise = np.maximum(measured.noise, least_noise, out=measured.noise)
+    noise = np.maximum(noise, least_noise, out=noise)
+    # A map of σ is scaled so that its median is that of the measured noise.
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
         noise = (scale * sigma).astype(np.float32)
     flat = interpolated((image - level).astype(np.float32), bad)[0]
-    return Sky(flat, level, noise, bad, scale, measured.notes)
+    return Sky(flat, level, noise, bad, scale, steps, notes)

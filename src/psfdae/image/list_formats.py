@@ -1,60 +1,141 @@
-"""Star lists that astropy reads once it is told the format, and regions of DS9.
+"""Star lists in files: FITS tables and LDAC, text tables, VOTable, DAOPHOT, DS9, VizieR.
 
-Every function takes the lines of a text file that are not blank.
+In: a file. Out: its table as astropy has it, a row for each star in the order of the file.
+
+The format follows from the content. astropy reads all tables once it is told their format; only
+the lists of DAOPHOT itself and the regions of DS9 are read here.
 """
 
 from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from psfdae.image.errors import ObservationError, reading
+from psfdae.image.errors import ObservationError, reading, shorten
+from psfdae.image.fits_file import UNPACK, open_hdus, plain_file
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-REGION = re.compile(r"([+-]?)\s*([a-z]+)\s*[( ]\s*([^,\s)]+)[,\s]+([^,\s)]+)", re.IGNORECASE)
-# Columns under which DS9's positions go; its pixels count from 1, as those of SExtractor do.
-SYSTEMS = {
+REGION_SYSTEMS = {
     "image": ("X_IMAGE", "Y_IMAGE"),
     "fk5": ("RAJ2000", "DEJ2000"),
     "j2000": ("RAJ2000", "DEJ2000"),
     "icrs": ("RA_ICRS", "DE_ICRS"),
 }
-OTHER_SYSTEMS = ("physical", "fk4", "b1950", "galactic", "ecliptic", "wcs", "detector", "amplifier")
-CENTRED = ("circle", "point", "ellipse", "box", "annulus")
-STETSON = re.compile(r"\s*NL\s+NX\s+NY\b")
-STETSON_COLUMNS = ("id", "X_IMAGE", "Y_IMAGE")  # from 1, like SExtractor's
+"""Columns for positions of DS9 by coordinates; its pixels count from 1, as SExtractor's do."""
 
 
-def votable(path: Path, lines: list[str], most_bytes: int) -> Table:
-    """Read the only table with rows of a VOTable.
+def read_table(path: Path) -> Table:
+    """Read the table of stars of a file.
 
-    Data that lie outside the file are refused, and columns that are far larger than it.
+    Raises
+    ------
+    ObservationError
+        If the file is missing, damaged, or of none of the formats.
     """
+    with reading(path):
+        content = path.read_bytes()
+    # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
+    if content.startswith((b"SIMPLE  =", *UNPACK)):
+        return _fits_table(path)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\x00"
+    if "\x00" in text:
+        raise ObservationError(path, "neither a FITS table nor text in UTF-8")
+    lines = [line for line in text.splitlines() if line.strip()]
+    if not lines:
+        raise ObservationError(path, "the catalogue is empty")
+    if lines[0].startswith("# Region file") or path.suffix.lower() == ".reg":
+        return regions(path, lines)
+    if lines[0].lstrip().startswith("<"):
+        return votable(path, content)
+    if re.match(r"\s*NL\s+NX\s+NY\b", lines[0]):
+        return stetson(path, lines)
+    return _text_table(path, lines)
+
+
+def _fits_table(path: Path) -> Table:
+    """Read the LDAC_OBJECTS or the only table of a FITS file; columns stay in the file till used.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    from astropy.io import fits
+    from astropy.table import Table
+
+    file = plain_file(path)
+    with reading(path), open_hdus(file, memmap=True) as hdus:
+        tables = [
+            hdu
+            for hdu in hdus
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and hdu.name != "LDAC_IMHEAD"
+        ]
+        objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
+        if len(objects) != 1:
+            table_names = shorten([hdu.name or "(no name)" for hdu in objects])
+            raise ObservationError(path, f"expected one table of stars, found {table_names}")
+        # Rows that the header announces and the file does not have.
+        size = objects[0].header["NAXIS1"] * objects[0].header["NAXIS2"]
+        if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
+            raise ObservationError(path, "damaged: the table is larger than the file")
+        return Table.read(objects[0], format="fits", mask_invalid=False, unit_parse_strict="silent")
+
+
+def _text_table(path: Path, lines: Sequence[str]) -> Table:
+    """Read a text table from the lines of a file that are not blank."""
+    from astropy.io import ascii as text_tables
+
+    # IRAF's DAOPHOT, ECSV and SExtractor describe their columns in comments.
+    options: dict[str, Any]
+    if lines[0].startswith(("#K ", "#N ")):
+        options = {"format": "daophot"}
+    elif lines[0].startswith("# %ECSV"):
+        options = {"format": "ecsv"}
+    elif re.match(r"#\s*\d+\s+[A-Za-z_]\w*", lines[0]):
+        options = {"format": "sextractor"}
+    else:
+        lines = plain_rows(lines)
+        delimiter = next((mark for mark in ",;\t" if mark in lines[0]), " ") if lines else ","
+        options = {"format": "basic", "delimiter": delimiter}
+    if not lines:
+        raise ObservationError(path, "the catalogue has no stars")
+    with reading(path):
+        # The line break at the end is what tells a table from the name of a file.
+        return text_tables.read("\n".join(lines) + "\n", guess=False, **options)
+
+
+def plain_rows(lines: Sequence[str]) -> Sequence[str]:
+    """Return the rows of a text table, the names of its columns first, without comments.
+
+    A comment right before numbers without names is the names. VizieR writes two lines of units and
+    of dashes below the names, which are left out.
+    """
+    rows = [line for line in lines if not line.lstrip().startswith("#")]
+    if not rows:
+        return []
+    preamble = lines[: lines.index(rows[0])]
+    # The letter e may stand in a number.
+    if preamble and not any(c.isalpha() for c in rows[0].replace("e", "").replace("E", "")):
+        return [preamble[-1].lstrip("# \t"), *rows]
+    has_dashes = len(rows) > 2 and re.fullmatch(r"[-\t;|, ]*---?[-\t;|, ]*", rows[2])
+    return [rows[0], *rows[3:]] if has_dashes else rows
+
+
+def votable(path: Path, content: bytes) -> Table:
+    """Read the only table with rows of a VOTable."""
     from astropy.io.votable import parse
 
-    text = "\n".join(lines)
-    if re.search(r"<!(DOCTYPE|ENTITY)", text):
-        raise ObservationError(path, "a VOTable with entities of its own; write it without")
-    for stream in re.findall(r"<(?:\w+:)?STREAM\b[^>]*", text):
-        if "href" in stream or re.search(r"encoding\s*=\s*.(?!base64)", stream):
-            raise ObservationError(path, "a VOTable whose data are not in it; write them into it")
-    # Cells of a fixed size take their room in every row, also where a row has none.
-    sizes = re.findall(r"arraysize\s*=\s*[\"']([0-9x]+)", text)
-    cells = sum(float(np.prod([float(n) for n in size.split("x") if n])) for size in sizes)
-    if 8 * cells * (text.count("TR>") + 1) > most_bytes:
-        raise ObservationError(path, "a VOTable with arrays larger than the file")
-    # The number of rows is counted; astropy would make room for as many as are announced.
-    text = re.sub(r"\snrows\s*=\s*(\"[^\"]*\"|'[^']*')", " ", text)
     with reading(path):
         tables = [
             table.to_table(use_names_over_ids=True)
-            for table in parse(io.BytesIO(text.encode()), verify="ignore").iter_tables()
+            for table in parse(io.BytesIO(content), verify="ignore").iter_tables()
             if len(table.array)
         ]
     if len(tables) != 1:
@@ -62,61 +143,67 @@ def votable(path: Path, lines: list[str], most_bytes: int) -> Table:
     return tables[0]
 
 
-def regions(path: Path, lines: list[str]) -> Table:
+def regions(path: Path, lines: Sequence[str]) -> Table:
     """Read the centres of DS9's circles, points, ellipses, boxes and annuli.
 
     Their text is the column `id`, if all have one. Regions that are excluded (−) are left out.
+
+    Raises
+    ------
+    ObservationError
+        If there is a region without a centre, or coordinates are of none or several of
+        `REGION_SYSTEMS`.
     """
     from astropy.table import Table
 
-    system, used = "", set()
-    first, second, texts = [], [], []
+    other_systems = {"physical", "fk4", "b1950", "galactic", "ecliptic", "wcs", "detector"}
+    shapes = ("circle", "point", "ellipse", "box", "annulus")
+    form = re.compile(r"([+-]?)\s*([a-z]+)\s*[( ]\s*([^,\s)]+)[,\s]+([^,\s)]+)", re.IGNORECASE)
+    system, systems = "", set()
+    centres, labels = [], []
     for line in lines:
         if line.lstrip().startswith(("#", "global")):
             continue
         body, _, properties = line.partition("#")
         # Coordinates hold for what follows, or stand before a shape: "fk5; circle(…)".
         for part in filter(None, map(str.strip, body.split(";"))):
-            if part.lower() in SYSTEMS or part.lower() in OTHER_SYSTEMS:
+            if part.lower() in other_systems | REGION_SYSTEMS.keys():
                 system = part.lower()
                 continue
-            circles = REGION.match(part)
-            shape = circles[2].lower() if circles else part[:20]
-            if circles is None or shape not in CENTRED:
+            region = form.match(part)
+            shape = region[2].lower() if region else part[:20]
+            if region is None or shape not in shapes:
                 raise ObservationError(
-                    path, f"region {shape!r}, expected one of {', '.join(CENTRED)}"
+                    path, f"region {shape!r}, expected one of {', '.join(shapes)}"
                 )
-            if circles[1] == "-":
+            if region[1] == "-":
                 continue
-            used.add(system)
-            text = re.search(r"text\s*=\s*(?:\{([^}]*)\}|\"([^\"]*)\"|'([^']*)')", properties)
-            first.append(circles[3])
-            second.append(circles[4])
-            texts.append("" if text is None else next(filter(None, text.groups()), ""))
-    if len(used) > 1 or not used <= SYSTEMS.keys():
+            systems.add(system)
+            centres.append(region.group(3, 4))
+            # Three ways to quote the text.
+            label = re.search(r"text\s*=\s*(?:\{([^}]*)\}|\"([^\"]*)\"|'([^']*)')", properties)
+            labels.append(next(filter(None, label.groups()), "") if label else "")
+    if len(systems) > 1 or not systems <= REGION_SYSTEMS.keys():
         raise ObservationError(
             path,
-            f"regions in coordinates {', '.join(sorted(s or 'not stated' for s in used))}; "
-            f"expected one of {', '.join(SYSTEMS)}: save them so in DS9",
+            f"regions in coordinates {', '.join(sorted(s or 'not stated' for s in systems))}; "
+            f"expected one of {', '.join(REGION_SYSTEMS)}: save them so in DS9",
         )
-    names = SYSTEMS[used.pop()] if used else SYSTEMS["image"]
-    table = Table(dict(zip(names, (first, second), strict=True)), dtype=["U40", "U40"])
-    if texts and all(texts):
-        table["id"] = texts
+    names = REGION_SYSTEMS[systems.pop() if systems else "image"]
+    table = Table(rows=centres or None, names=names, dtype=["U40", "U40"])
+    if labels and all(labels):
+        table["id"] = labels
     return table
 
 
-def stetson(path: Path, lines: list[str]) -> Table:
-    """Read the first columns, number, x and y, of a list of DAOPHOT itself (three head lines)."""
+def stetson(path: Path, lines: Sequence[str]) -> Table:
+    """Read number, x and y, the first columns of a list of DAOPHOT itself (three head lines).
+
+    Its pixels count from 1, as SExtractor's do.
+    """
     from astropy.table import Table
 
     rows = [line.split()[:3] for line in lines[2:]]
     if any(len(row) < 3 for row in rows):
         raise ObservationError(path, "a list of DAOPHOT with rows of fewer than three numbers")
-    return Table(rows=rows, names=STETSON_COLUMNS) if rows else Table()
-
-
-def without_vizier_head(rows: list[str]) -> list[str]:
-    """Return the rows of a table without VizieR's lines of units and dashes below the names."""
-    dashes = len(rows) > 2 and re.fullmatch(r"[-\t;|, ]*---?[-\t;|, ]*", rows[2])
-    return [rows[0], *rows[3:]] if dashes else rows
+    return Table(rows=rows, names=("id", "X_IMAGE", "Y_IMAGE")) if rows else Table()

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
-from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
+from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.containers import in_unit
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, shorten, silent
@@ -52,6 +52,7 @@ from psfdae.image.header_checks import (
     sky_sample,
 )
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
+from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 from psfdae.image.trails import with_trails
 
@@ -763,10 +764,11 @@ class Layers:
 def _sky(layers: Layers) -> Sky:
     """The image of layers as a whole with its sky; that of the last ones is kept for more calls."""
     image, masked, sigma = layers._whole()
-    bad = layers._found(image, masked).mask
+    bad_pixels = layers._found(image, masked)
     with silent():
         try:
-            sky = sky_of(image, bad, sigma, layers.least_noise)
+            measured = bad_pixels.sky
+            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:

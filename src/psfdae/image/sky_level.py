@@ -1,5 +1,8 @@
 """Level and noise of the sky of an image, also where it has steps or structure.
 
+In: an image (h, w) and the pixels that do not count. Out: `SkyLevel`, a level and a σ for each
+pixel.
+
 photutils measures both in meshes and interpolates between them. Amplifiers of different bias make
 steps, which are found first: each part of the image has meshes of its own. A nebula, or the halo of
 a bright star, changes within a mesh; there the level is a median of the pixels around.
@@ -8,28 +11,41 @@ a bright star, changes within a mesh; there the level is a median of the pixels 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.image.bad_pixels import interpolated, pixel_noise
+from psfdae.image.interpolation import interpolated
 
 MESH_PX = 64
 """Side of the squares in which the sky is measured."""
 
-REACH_PX = 24
-"""Width of the strips on both sides of a line that say whether the sky has a step there."""
-
 
 class SkyLevel(NamedTuple):
-    """Level and σ (h, w) of the sky, and sentences on what is unusual in it."""
+    """Sky of an image.
+
+    Attributes
+    ----------
+    level, noise : ndarray, shape (h, w), float32
+        Level and σ of the sky at each pixel.
+    steps : tuple of two sequences of int
+        Rows and columns at which the level has a step.
+    notes : tuple of str
+        Sentences on what is unusual in the sky.
+    """
 
     level: np.ndarray
     noise: np.ndarray
+    steps: tuple[Sequence[int], Sequence[int]]
     notes: tuple[str, ...]
 
 
-def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
+def sky_level(
+    image: np.ndarray,
+    bad: np.ndarray,
+    steps: tuple[Sequence[int], Sequence[int]] | None = None,
+) -> SkyLevel:
     """Measure level and noise of the sky of an image.
 
     Parameters
@@ -38,47 +54,38 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
         Finite.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
+    steps : tuple of two sequences of int, optional
+        Rows and columns at which the sky has steps, if they were found before.
 
     Raises
     ------
     ValueError
         If no mesh has enough pixels that count.
     """
-    # Parts between steps of the sky, each with meshes of its own.
-    rows, columns = (sky_steps(image, bad, axis) for axis in (0, 1))
+    if steps is None:
+        steps = sky_steps(image, bad, axis=0), sky_steps(image, bad, axis=1)
     notes = []
-    for name, lines in (("row", rows), ("column", columns)):
+    for name, lines in zip(("row", "column"), steps, strict=True):
         if lines:
             lines_text = ", ".join(map(str, lines))
             notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
-    # Single precision: of a large image, each map takes much memory.
+    # Each part between steps has meshes of its own. Single precision: of a large image, each map
+    # takes much memory.
     level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
+    rows, columns = steps
     for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
-            if not bad[part].all() or not (rows or columns):
+            if not bad[part].all() or not any(steps):
                 level[part], noise[part] = _meshed(image[part], bad[part])
-    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
-    # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
-    # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
-    # Both are of meshes: every fourth pixel shows them.
-    sample = np.s_[::4, ::4]
-    ratio = noise[sample] / pixel_sigma[sample]
-    ratio = ratio[~bad[sample] & (ratio > 0)]
-    typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
-    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
-    around = _median_level(image - level, bad) if share > 0.05 else None
-    if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
-        weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad)
-        level += weight * around
-        # What is left; its noise changes with the light of the structure, from mesh to mesh of 16.
-        remainder, noise = _meshed(image - level, bad)
-        level += remainder
-        noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
+    # Structure that is finer than the meshes.
+    level, noise, share = _with_structure(image, bad, level, noise)
+    if share:
         notes.append(
             f"the sky has structure within {MESH_PX} px in {100 * share:.0f} % of the image: "
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
+    # Errors are of sums of pixels, which have more noise where neighbours share it.
     with np.errstate(all="ignore"):
         correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
     if correlation > 1.0:
@@ -87,7 +94,33 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
             f"neighbouring pixels share their noise, as in resampled images: that of sums of "
             f"pixels is {correlation:.2f} times as large, and errors are of sums"
         )
-    return SkyLevel(level, noise, tuple(notes))
+    return SkyLevel(level, noise, steps, tuple(notes))
+
+
+# Noise of pixels and of sums of pixels.
+
+
+def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return the noise (h, w) of pixels from the differences of neighbours, in squares of 64.
+
+    It is infinite where neighbours do not differ: there is no noise with which to compare.
+    """
+    difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
+    hidden = bad | np.concatenate([bad[:, 1:], bad[:, -2:-1]], axis=1)
+    difference[hidden] = np.nan
+    height, width = image.shape
+    noise = np.full(image.shape, np.inf, difference.dtype)
+    for top in range(0, height, 64):
+        for first in range(0, width, 64):
+            square = np.s_[top : top + 64, first : first + 64]
+            values, count = difference[square].ravel(), np.count_nonzero(~hidden[square])
+            if not count:
+                continue
+            # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ; NaN comes last.
+            middle = [(count - 1) // 2, count // 2]
+            sigma = 1.4826 / np.sqrt(2.0) * float(np.partition(values, middle)[middle].mean())
+            noise[square] = sigma if sigma > 0 else np.inf
+    return noise
 
 
 def noise_correlation(deviation: np.ndarray) -> float:
@@ -106,37 +139,46 @@ def noise_correlation(deviation: np.ndarray) -> float:
 
     middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
     values = deviation[middle]
+    if min(values.shape) < 16:
+        return 1.0
     # Means of 3 × 3 pixels scatter by σ/3, or more if these are correlated: three times this.
     light = np.abs(ndimage.uniform_filter(np.nan_to_num(values), 3)) > 1.5
     values = np.where(ndimage.binary_dilation(light, iterations=3), np.nan, values)
     values[np.abs(values) > 3.0] = np.nan
-
-    def correlation(rows_apart: int, columns_apart: int) -> float:
-        """ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)), s by median deviations."""
-        height, width = values.shape
-        a = values[: height - rows_apart, max(0, -columns_apart) : width - max(0, columns_apart)]
-        b = values[rows_apart:, max(0, columns_apart) : width - max(0, -columns_apart)]
-        is_finite = np.isfinite(a) & np.isfinite(b)
-        if np.count_nonzero(is_finite) < 1000:
-            return 0.0
-        plus, minus = (
-            float(np.median(np.abs(v - np.median(v)))) ** 2
-            for v in (a[is_finite] + b[is_finite], a[is_finite] - b[is_finite])
-        )
-        return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
-
-    if min(values.shape) < 16:
-        return 1.0
-    nearest = 0.5 * (correlation(0, 1) + correlation(1, 0))
+    # Neighbours below and on the right; most images end here.
+    nearest = 0.5 * (_correlation(values, 0, 1) + _correlation(values, 1, 0))
     if nearest < 0.15:
         return 1.0
-    distant = [correlation(*lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
+    distant = [_correlation(values, *lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
     shared = max(float(np.mean(distant)), 0.0)
     if nearest - shared < 0.15:
         return 1.0
+    # Each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *((down, right) for down in (1, 2) for right in range(-2, 3))]
-    excess = sum(correlation(*lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
+    excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
+
+
+def _correlation(values: np.ndarray, down: int, right: int) -> float:
+    """Return the correlation of pixels (h, w) and those some rows down and columns to the right.
+
+    ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)) of pairs a, b, with s by median deviations;
+    0 if fewer than 1000 pairs are finite.
+    """
+    height, width = values.shape
+    a = values[: height - down, max(0, -right) : width - max(0, right)]
+    b = values[down:, max(0, right) : width - max(0, -right)]
+    is_finite = np.isfinite(a) & np.isfinite(b)
+    if np.count_nonzero(is_finite) < 1000:
+        return 0.0
+    plus, minus = (
+        float(np.median(np.abs(v - np.median(v)))) ** 2
+        for v in (a[is_finite] + b[is_finite], a[is_finite] - b[is_finite])
+    )
+    return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
+
+
+# Meshes.
 
 
 def _meshed(
@@ -151,13 +193,14 @@ def _meshed(
     # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
     # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself
     # (James & Stein 1961). A mesh that differs by far more than the others has stars in it.
-    off = level - neighbours
-    scatter = 1.4826 * float(np.median(np.abs(off)))
+    deviation = level - neighbours
+    scatter = 1.4826 * float(np.median(np.abs(deviation)))
     error = 2.5 * float(np.median(sigma)) / mesh_px
-    own_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
-    smooth = neighbours + np.where(np.abs(off) > 4.0 * max(scatter, error), 0.0, own_weight * off)
+    mesh_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
+    has_stars = np.abs(deviation) > 4.0 * max(scatter, error)
+    smooth = neighbours + np.where(has_stars, 0.0, mesh_weight * deviation)
     return (
-        _on_pixels(smooth, image.shape, mesh_px, own_weight),
+        _on_pixels(smooth, image.shape, mesh_px, mesh_weight),
         _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0),
     )
 
@@ -183,12 +226,12 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     rows, columns = mesh.shape
     continued = _continued(mesh, 1)
 
-    def shifted(rows_down: int, right: int) -> np.ndarray:
-        return continued[1 + rows_down : rows + 1 + rows_down, 1 + right : columns + 1 + right]
+    def shifted(down: int, right: int) -> np.ndarray:
+        return continued[1 + down : rows + 1 + down, 1 + right : columns + 1 + right]
 
     pairs = [
-        0.5 * (shifted(rows_down, right) + shifted(-rows_down, -right))
-        for rows_down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+        0.5 * (shifted(down, right) + shifted(-down, -right))
+        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
@@ -210,15 +253,46 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     return values
 
 
+# Structure within a mesh.
+
+
+def _with_structure(
+    image: np.ndarray, bad: np.ndarray, level: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return level and noise (h, w) of a sky with its structure, and the part of it that has some.
+
+    They are those of the meshes, and the part is 0, unless over 5 % of the image has structure that
+    is not that of the sources.
+    """
+    # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
+    # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
+    # Both are of meshes: every fourth pixel shows them.
+    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
+    sample = np.s_[::4, ::4]
+    ratio = noise[sample] / pixel_sigma[sample]
+    ratio = ratio[~bad[sample] & (ratio > 0)]
+    typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
+    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
+    structure = _median_level(image - level, bad) if share > 0.05 else None
+    if structure is None or not _sources_stay(image - level, structure, bad, pixel_sigma):
+        return level, noise, 0.0
+    weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad)
+    level += weight * structure
+    # What remains; its noise changes with the light of the structure, from mesh to mesh of 16.
+    remainder, noise = _meshed(image - level, bad)
+    level += remainder
+    noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
+    return level, noise, share
+
+
 def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the median (h, w) of the 14 × 14 px around each pixel, from means of 2 × 2 px."""
     from scipy import ndimage
 
     height, width = image.shape
     even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
-    binned = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2).mean(
-        axis=(1, 3)
-    )
+    squares = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2)
+    binned = squares.mean(axis=(1, 3))
     smooth = ndimage.gaussian_filter(ndimage.median_filter(binned, 7, mode="nearest"), 1.0)
     # Back to the pixels: linear between the middles of the squares.
     row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
@@ -253,14 +327,17 @@ def structure_weight(noise_excess: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """
     from scipy import ndimage
 
-    # Meshes beside those with structure are interpolated from these, and wrong, too.
     weight = np.clip((noise_excess - 1.25) / 0.5, 0.0, 1.0)
     weight[bad] = 0.0
+    # Meshes beside those with structure are interpolated from these, and wrong, too.
     widened = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
     return np.asarray(ndimage.uniform_filter(widened, MESH_PX, mode="nearest"))
 
 
-def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
+# Steps.
+
+
+def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24) -> list[int]:
     """Return the rows (axis 0) or columns (axis 1) at which the sky of an image has a step.
 
     The step goes along the whole line or half of it.
@@ -270,77 +347,85 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
     image : ndarray, shape (h, w)
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
+    axis : int
+    reach_px : int
+        Width of the strips on both sides of a line that say whether there is a step.
     """
-    values, good = (image.T, ~bad.T) if axis == 0 else (image, ~bad)
-    count = len(values)
+    values, good = (image, ~bad) if axis == 0 else (image.T, ~bad.T)
+    count = values.shape[1]
     lines: list[int] = []
     for part in (slice(0, count), slice(0, count // 2), slice(count // 2, count)):
         every = max(1, (part.stop - part.start) // 256)
-        lines += _steps_along(values[part][::every], good[part][::every])
+        lines += _steps_across(values[:, part][:, ::every], good[:, part][:, ::every], reach_px)
     # Lines that several parts found are one.
     steps: list[int] = []
     for line in sorted(lines):
-        if not steps or line > steps[-1] + REACH_PX:
+        if not steps or line > steps[-1] + reach_px:
             steps.append(line)
     return steps
 
 
-def _steps_along(values: np.ndarray, good: np.ndarray) -> list[int]:
-    """Return the columns of some rows (n, w) at which the level has a step.
+def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[int]:
+    """Return the rows of some columns (h, n) at which the level has a step.
 
-    It is the same in all eighths of the rows, up to 3 px from the column and from 3 to 12 and 12 to
+    It is the same in all eighths of the columns, up to 3 px from the row and from 3 to 12 and 12 to
     24 px, slopes subtracted; and above a tenth of the noise and eight times its error.
     """
-    count, width = values.shape
-    if width < 4 * REACH_PX or count < 64:
+    height, count = values.shape
+    if height < 4 * reach_px or count < 64:
         return []
     light, number = (
-        np.pad(np.cumsum(v, axis=1, dtype=np.float64), ((0, 0), (1, 0)))
+        np.pad(np.cumsum(v, axis=0, dtype=np.float64), ((1, 0), (0, 0)))
         for v in (np.where(good, values, 0.0), good)
     )
-    lines = np.arange(2 * REACH_PX, width - 2 * REACH_PX + 1)
-    side = REACH_PX // 2
+    lines = np.arange(2 * reach_px, height - 2 * reach_px + 1)
+    side = reach_px // 2
 
     def jumps(start: int, end: int, at: np.ndarray) -> np.ndarray:
-        """Mean of each row from `start` to `end` px after columns, less that before them."""
+        """Return the mean of each column from `start` to `end` px after rows, less that before."""
         with np.errstate(all="ignore"):
             mean_after, mean_before = (
-                (light[:, b] - light[:, a]) / (number[:, b] - number[:, a])
+                (light[b] - light[a]) / (number[b] - number[a])
                 for a, b in ((at + start, at + end), (at - end, at - start))
             )
         return np.asarray(mean_after - mean_before)
 
-    median = np.median if good.all() else np.nanmedian
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of columns without good pixels
+        warnings.simplefilter("ignore", RuntimeWarning)  # of rows without good pixels
+        # Step at each row: median over the columns, and the scatter about it.
         step_sizes = jumps(0, 3, lines)
-        middle = median(step_sizes, axis=0)
-        spread = 1.4826 * median(np.abs(step_sizes - middle), axis=0)
-        # Slope of the level per px: changes within 12 px on both sides, a pixel off the line.
+        middle = _row_medians(step_sizes)
+        spread = 1.4826 * _row_medians(np.abs(step_sizes - middle[:, None]))
+        # Slope of the level per px: changes within 12 px on both sides, a pixel off the line. Of
+        # two signs there is no slope, but bad rows.
         slope_before, slope_after = (
-            median(jumps(0, side, lines + sign * (side + 1)), axis=0) for sign in (-1, 1)
+            _row_medians(jumps(0, side, lines + sign * (side + 1))) for sign in (-1, 1)
         )
-        smaller = (
-            np.sign(slope_before) * np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
-        )
-        slope = np.where(
-            slope_before * slope_after > 0, smaller, 0.0
-        )  # of two kinds: none, but bad columns
+        smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
+        slope = np.where(slope_before * slope_after > 0, np.sign(slope_before) * smaller, 0.0)
         jump = middle - 3.0 * slope
         noise = spread * np.sqrt(1.5)
         error = 1.25 * spread / np.sqrt(count)
         candidates = np.flatnonzero(np.abs(jump) > np.maximum(0.1 * noise, 8.0 * error))
+        # Candidates from the largest jump on: each must be the same in most eighths of the line and
+        # at all three distances.
         steps: list[int] = []
         for k in candidates[np.argsort(-np.abs(jump[candidates]))]:
-            line, height = int(lines[k]), jump[k]
+            line, height_of_step = int(lines[k]), jump[k]
             eighths = [
-                median(part) - (start + end) * slope[k]
-                for start, end in ((0, 3), (3, side), (side, REACH_PX))
-                for part in np.array_split(jumps(start, end, np.array([line]))[:, 0], 8)
+                _row_medians(part[None])[0] - (start + end) * slope[k]
+                for start, end in ((0, 3), (3, side), (side, reach_px))
+                for part in np.array_split(jumps(start, end, np.array([line]))[0], 8)
             ]
-            is_same = np.abs(np.array(eighths) - height) < 0.5 * abs(height)
+            is_same = np.abs(np.array(eighths) - height_of_step) < 0.5 * abs(height_of_step)
             if is_same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
-                abs(line - step) > REACH_PX for step in steps
+                abs(line - step) > reach_px for step in steps
             ):
                 steps.append(line)
     return steps
+
+
+def _row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the median of each row (m, n) without its NaN; NaN if a row has nothing else."""
+    median = np.nanmedian if np.isnan(values).any() else np.median
+    return np.asarray(median(values, axis=1))

@@ -15,8 +15,8 @@ import numpy as np
 
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.files import Column
-from psfdae.image.selection import brightest_pixels
 from psfdae.image.stamps import cut
+from psfdae.image.star_criteria import brightest_pixels
 from psfdae.moments import shift_stamps
 from psfdae.splits import draw_jitter, draw_phase
 

@@ -23,7 +23,8 @@ from psfdae.image.observation import (
     list_offset,
     other_instruments,
 )
-from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.selection import Candidates, Verdict, collect
+from psfdae.image.selection_advice import advice
 from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns

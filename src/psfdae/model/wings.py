@@ -404,7 +404,7 @@ def around_stars(
     """
     sigma = np.hypot(error, FOLLOWED * star_light)
     without_stars, stars = image - star_light, (place, flux, outer)
-    wings = _wings_beside(without_stars, sky.level, sigma, sky.bad, *stars, stamp_px, earlier)
+    wings = _wings_beside(without_stars, sky, sigma, *stars, stamp_px, earlier)
     light_of_wings = wing_light(image.shape, *stars, wings)
     mapped = np.isfinite(sky.noise_scale)
     sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if mapped else None)
@@ -425,9 +425,8 @@ def around_stars(
 
 def _wings_beside(
     without_stars: np.ndarray,
-    level: np.ndarray,
+    sky: Sky,
     doubt: np.ndarray,
-    bad: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
     outer: np.ndarray,
@@ -435,14 +434,14 @@ def _wings_beside(
     earlier: Wings | None = None,
 ) -> Wings | None:
     """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
-    wings = earlier
+    wings, level, bad = earlier, sky.level, sky.bad
     shown = np.where(_like_stars(without_stars - level, doubt, bad, place), flux, np.nan)
     for turn in range(ROUNDS):
         latest = wings
         if turn:
             without_light = without_stars - wing_light(bad.shape, place, flux, outer, latest)
             without_light[bad] = 0.0
-            level = sky_level(without_light, bad).level
+            level = sky_level(without_light, bad, sky.steps).level
         wings = wings_of(without_stars - level, doubt, bad, place, shown, outer, stamp_px, latest)
         if wings is None:
             break
@@ -506,4 +505,4 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     photon_sigma = np.sqrt(np.maximum(light, 0.0) / gain) if gain else 0.0
     sigma = np.hypot(np.hypot(sky.noise, photon_sigma), FOLLOWED * light)
     without_stars = sky.flat + sky.level - light
-    return _wings_beside(without_stars, sky.level, sigma, sky.bad, middle, flux, outer, side)
+    return _wings_beside(without_stars, sky, sigma, middle, flux, outer, side)

@@ -97,6 +97,7 @@ class PointSampling(SeparableSampling):
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         self.dtype = real_dtype(precision)
+        # Points on one side of the chief ray; those of the other side mirror them.
         half, even_weights, odd_weights = image_points(pupil, stamp_px, pixel)
         # Cosines and sines over half of the pupil. The middle sample of an odd grid is its own
         # mirror image and counts once.
@@ -125,12 +126,14 @@ class PointSampling(SeparableSampling):
         ]
         shape = (2, *pupil_fields.shape[:-1], -1)
         fields = []
+        # Waves times P_a are made once for each degree, and kept.
         for degree in degrees:
             # An even polynomial leaves the parity, an odd one changes it: the even part of the
             # product meets the cosines, the odd part the sines.
             if degree not in self._weighted_waves:
                 weighted = legendre([degree], self._axis)[0][:, None] * self._waves
                 self._weighted_waves[degree] = weighted.astype(self.dtype)
+            # Sums over half of the pupil: C of the product's even part, S of its odd part.
             cosine_waves, sine_waves = self._weighted_waves[degree]
             cos_re, cos_im = (parts[degree % 2] @ cosine_waves).reshape(shape)
             sin_re, sin_im = (parts[(degree + 1) % 2] @ sine_waves).reshape(shape)
@@ -182,6 +185,8 @@ class PeriodSampling(SeparableSampling, WholePeriod):
 
         `values` (B, m, m) are the intensities at the points.
         """
+        # The slope of the light on a pixel is that of a product: along one axis the derivative,
+        # along the other the pixel itself.
         along_x = self.pixel_weights @ (values @ self._slope_weights.T)
         along_y = self._slope_weights @ (values @ self.pixel_weights.T)
         return np.stack([along_x, along_y], axis=1)
@@ -211,6 +216,7 @@ class ModalStamps:
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
+        # Modes as sums of products P_a(x) P_b(y), for derivatives along many directions.
         degrees, coefficients = legendre_expansion(modes)
         self._coefficients = coefficients.astype(dtype)
         # Degrees (a, b) of the Legendre products in the modes.
@@ -274,6 +280,7 @@ class ModalStamps:
             intensity, slopes = self._by_direction(pupil_fields, directions)
         else:
             intensity, slopes = self._by_product(pupil_fields, directions)
+        # Moving the image is a tilt of the wavefront, but needs no field of its own.
         if by_position:
             assert isinstance(self._sampling, PeriodSampling)
             slopes = np.concatenate([slopes, self._sampling.position_slopes(intensity)], axis=1)
@@ -321,6 +328,7 @@ class ModalStamps:
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """Return OPD maps in waves, shape (B, M, M)."""
+        # W = Σ c_j M_j at all samples, as one matrix product.
         opd = np.asarray(coefficients, self._modes.dtype) @ self._modes
         return np.asarray(opd.reshape(-1, *self.shape))
 
@@ -377,12 +385,14 @@ class SampledStamps:
         self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
         self._precision, self._batch, self._threads = precision, batch, threads
         self._dtype = real_dtype(precision)
+        # Slopes of the modes decide how fine a grid a wavefront needs.
         self._slopes = mode_slopes(modes)
         self._operators: dict[int, ModalStamps] = {}
 
     def operator(self, samples: int) -> ModalStamps:
         """Return the operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
+            # The grid, the points of its image, and the modes on it.
             pupil = annular_pupil(samples, self._obscuration)
             sampling = self._sampling(pupil, self.stamp_px, self.pixel, precision=self._precision)
             self._operators[samples] = ModalStamps(pupil, self._modes, sampling, self.pixel)
@@ -441,6 +451,7 @@ class SampledStamps:
             wavefronts = coefficients[batch], directions[batch], offset
             stamps[batch], slopes[batch] = operator.derivatives(*wavefronts, by_position)
 
+        # A wavefront with K derivatives counts for K in the size of a batch.
         samples = self.samples(coefficients, offset_px) if samples is None else samples
         self._run(differentiate, samples, max(1, self._batch // count))
         return stamps, slopes
@@ -463,7 +474,7 @@ def normalise_with_derivatives(
         (∂p − (p/f) ∂f)/f; each sums to 0.
     flux : ndarray, shape (...)
     """
-    # Derivative of the quotient p/f.
+    # Derivative of the quotient p/f: (∂p − (p/f) ∂f)/f.
     flux = stamps.sum(axis=(-2, -1))
     normalised = stamps / flux[..., None, None]
     flux_slope = derivatives.sum(axis=(-2, -1))[..., None, None]

@@ -48,6 +48,7 @@ def real_dtype(precision: Precision) -> np.dtype:
 
 def complex_field(phase: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
     """Return A exp(iφ) of real phases φ (..., M, M) in rad and an amplitude A (M, M)."""
+    # cos φ + i sin φ, written into one array.
     field = np.empty(phase.shape, np.result_type(phase.dtype, np.complex64))
     np.cos(phase, out=field.real)
     np.sin(phase, out=field.imag)
@@ -82,7 +83,8 @@ def image_points(
         An intensity that is the same on both sides has eᵀI on the pixels from the chief
         ray on; one that changes its sign has oᵀI.
     """
-    # Two points per λ/D resolve the highest frequency, half the pupil's width in λ/D.
+    # Half of the points. Two per λ/D resolve the highest frequency, half the pupil's width in λ/D;
+    # `extra` more are for the accuracy.
     edge = 0.5 * stamp_px * pixel
     highest = 0.5 * (pupil.axis.size - 1) * pupil.spacing
     m = max(1, (int(np.ceil(4.0 * edge * highest)) + extra + 1) // 2)
@@ -138,8 +140,10 @@ class StampPropagator:
         precision: Precision = "complex128",
         backend: Backend = "numpy",
     ) -> None:
+        # One half of the pupil stands for both.
         if not np.allclose(pupil.amplitude, pupil.amplitude[::-1], atol=1e-9):
             raise ValueError("pupil: its halves above and below the chief ray differ")
+        # Arrays of numpy or of torch, by the same names of functions.
         self._xp: Any = np
         if backend == "torch":
             import torch
@@ -218,6 +222,7 @@ class StampPropagator:
         phase[0] += tilt[:, 1, None, None] * self._axis
         phase[1] += tilt[:, 0, None, None] * self._axis[-half:, None]
         waves = self._buffer("waves", 2, 2, *shape)
+        # cos and sin of s and t; exp(is) = cos s + i sin s, times the transmission.
         xp.cos(phase, out=waves[0])
         xp.sin(phase, out=waves[1])
         waves[:, 0] *= self._amplitude
@@ -251,6 +256,7 @@ class StampPropagator:
 
     def _pixels(self, intensity: Any) -> np.ndarray:
         """Return stamps (B, d, d) of the parts of the intensity at the points."""
+        # Weights along x, then along y, for even and odd parts.
         along_x = self._xp.matmul(intensity, self._to_x[:, None, None])
         parts = np.asarray(self._xp.matmul(self._to_y[:, None], along_x))
         d, half = self.stamp_px, (self.stamp_px + 1) // 2
@@ -300,6 +306,7 @@ def in_batches(
         Function of N that returns the work on a batch: a function of its wavefronts' numbers,
         shape (b,).
     """
+    # One grid after the other, from the coarsest on.
     for count in np.unique(samples):
         members = np.flatnonzero(samples == count)
         batches = np.array_split(members, range(size, members.size, size))

@@ -78,7 +78,7 @@ def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
     """
     # By symmetry, distances from the centre are all that counts.
     x = np.abs(pupil_axis(samples, guard))
-    half = 1.0 / samples
+    half = 1.0 / samples  # half of a cell's side
     # Distance of the nearest and of the farthest point of each cell from the centre.
     low, high = np.maximum(x - half, 0), x + half
     nearest = np.hypot(low[:, None], low)
@@ -86,6 +86,7 @@ def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
     # Cells are inside, outside, or crossed by the rim: of those, count 64 × 64 sub-samples.
     coverage = (farthest <= radius).astype(np.float64)
     rows, columns = np.nonzero((nearest < radius) & (farthest > radius))
+    # The share of the sub-samples of a crossed cell that are in the disc.
     offset = pupil_axis(64) * half
     y = x[rows][:, None, None] + offset[None, :, None]
     x = x[columns][:, None, None] + offset[None, None, :]
@@ -131,10 +132,6 @@ def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pup
     return Pupil(grey, pupil_axis(samples, guard=1))
 
 
-ARCSEC = np.pi / 180.0 / 3600.0
-"""One arc second in radians."""
-
-
 class SamplingError(Error, ValueError):
     """Error of a pupil grid that is too coarse for a wavefront or for the stamp's position."""
 
@@ -178,7 +175,9 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> float:
     """Return the width of a pixel in units of λ/D."""
-    return scale_arcsec * ARCSEC * diameter_m / wavelength_m
+    # λ/D is an angle in radians.
+    arcsec = np.pi / 180.0 / 3600.0
+    return scale_arcsec * arcsec * diameter_m / wavelength_m
 
 
 def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
@@ -200,6 +199,7 @@ def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
     SamplingError
         If a wavefront needs more than the largest; names the N that would do.
     """
+    # The message names the grid that the worst wavefront needs.
     largest = int(needed.max())
     if largest > sizes[-1]:
         star = int(needed.argmax())

@@ -56,6 +56,7 @@ class Profile:
 
         That of the Moffat profile is 2 (z/2)^ν K_ν(z) / Γ(ν) with ν = β − 1, z = 2πaf.
         """
+        # The Gaussian exp(−r²/2σ²) has the transform exp(−(2πσf)²/2).
         z = 2.0 * np.pi * self.scale * frequency
         if self.beta is None:
             return np.exp(-0.5 * z**2)
@@ -69,6 +70,7 @@ class Profile:
     @property
     def reach(self) -> float:
         """Radius in λ/D at which the profile has fallen to `NEGLIGIBLE_WING` of its maximum."""
+        # The radius r of exp(−r²/2σ²) or (1 + r²/a²)^−β = wing.
         if self.beta is None:
             return float(self.scale * np.sqrt(-2.0 * np.log(NEGLIGIBLE_WING)))
         return float(self.scale * np.sqrt(NEGLIGIBLE_WING ** (-1.0 / self.beta) - 1.0))
@@ -173,6 +175,7 @@ class BlurredSampling(WholePeriod):
         super().__init__(pupil, precision)
         # Cycles per pixel of the lags l along rows and columns. The image is real: lags of one
         # sign along the columns stand for both and count twice.
+        # Lag k has the frequency ½ k · spacing in cycles per λ/D; fftfreq gives k/n.
         n = self.points
         step = 0.5 * pupil.spacing * pixel * n
         self._row_frequency = step * fft.fftfreq(n)
@@ -192,7 +195,8 @@ class BlurredSampling(WholePeriod):
         """Return pixels (..., d, d) of intensities (..., n, n) around a place (row, column)."""
         from scipy import fft
 
-        # Lags of the intensity, and the inverse transform at the centres of the pixels alone.
+        # Lags c_l of the intensity times the transfer functions, and the inverse transform at the
+        # centres of the pixels alone.
         spectrum = fft.rfft2(values) * self._transfer
         frequencies = (self._row_frequency, self._column_frequency)
         to_rows, to_columns = (
@@ -216,6 +220,7 @@ class BlurredPropagator:
         profile: Profile,
         precision: Precision = "complex128",
     ) -> None:
+        # For a whole light of 1, the transmission is divided by the root of the pupil's light.
         self._sampling = BlurredSampling(pupil, stamp_px, pixel, profile, precision)
         self.real_dtype = self._sampling.dtype
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
@@ -223,7 +228,8 @@ class BlurredPropagator:
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, moved by (B, 2) pixels."""
         offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
-        # Field of the pupil, field at the points of a period, and blurred pixels of each star.
+        # Field of the pupil, field at the points of a period, and blurred pixels of one star after
+        # the other: each has its own offset.
         stamps = []
         for waves, offset in zip(opd, offset_px, strict=True):
             phase = (2.0 * np.pi) * waves.astype(self.real_dtype)

@@ -98,7 +98,8 @@ def noll_to_nm(j: int) -> tuple[int, int]:
     """
     if j < 1:
         raise ValueError(f"Noll index {j}: must be at least 1")
-    # Order n has n + 1 terms, the first one after n (n + 1)/2 of lower orders.
+    # Order n has n + 1 terms, the first one after n (n + 1)/2 of lower orders: the smallest n with
+    # (n + 1) (n + 2)/2 ≥ j.
     n = 0
     while (n + 1) * (n + 2) // 2 < j:
         n += 1
@@ -137,6 +138,7 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     # √(n+1) R_n⁰ for m = 0, else √(2(n+1)) R_n^m times cos mθ or sin mθ.
     n, m = noll_to_nm(j)
     r, theta = np.hypot(x, y), np.arctan2(y, x)
+    # The factor makes the mean square over the disc 1: that of cos² is ½ for m ≠ 0.
     if m == 0:
         return np.asarray(np.sqrt(n + 1.0) * radial_polynomial(n, 0, r))
     angular = np.cos(m * theta) if m > 0 else np.sin(-m * theta)
@@ -214,7 +216,7 @@ def legendre_expansion(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     highest = 16
     nodes, weights = np.polynomial.legendre.leggauss(highest + 1)
     values = modes(nodes[None, :], nodes[:, None])
-    norm = np.arange(highest + 1) + 0.5
+    norm = np.arange(highest + 1) + 0.5  # ∫ P_a² dx = 1/(a + ½)
     projection = legendre(range(highest + 1), nodes) * weights * norm[:, None]
     coefficients = (projection @ values @ projection.T).swapaxes(1, 2)  # [mode, a, b]
     # Products that occur in a mode, beyond rounding. The highest ones are there to show modes
@@ -223,6 +225,7 @@ def legendre_expansion(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     occurs = (np.abs(coefficients) > 1e-11 * largest).any(axis=0)
     if occurs[-1].any() or occurs[:, -1].any():
         raise ValueError(f"modes: no polynomials of a degree below {highest}")
+    # A constant is piston, which no image shows.
     occurs[0, 0] = False
     return np.argwhere(occurs), coefficients[:, occurs]
 
@@ -249,6 +252,7 @@ def mode_slopes(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     """
     # 65 points along the diameter, and 520 on the rim.
     axis = np.linspace(-1.0, 1.0, 65)
+    # Slopes are often largest at the rim, which a square grid would miss.
     grid_x, grid_y = np.meshgrid(axis, axis)
     is_inside = grid_x**2 + grid_y**2 <= 1.0
     angle = np.linspace(0.0, 2.0 * np.pi, 8 * axis.size, endpoint=False)
@@ -279,6 +283,7 @@ def slope_ranges(
         [wavefront, axis (x, y), (min, max)] in waves per pupil radius.
     """
     # Slopes of 256 wavefronts are in memory at a time: 8 MB per axis.
+    # ∂W/∂x = Σ c_j ∂M_j/∂x at all points; its least and greatest value count.
     ranges = np.empty((len(coefficients), 2, 2))
     for axis, gradient in enumerate(mode_slopes):
         for start in range(0, len(coefficients), 256):
@@ -327,6 +332,7 @@ class ModalWavefronts:
         if key not in self._images:
             images = self.modes(pupil.axis[None, :], pupil.axis[:, None])
             self._images[key] = images.reshape(len(images), -1).astype(dtype)
+        # W = Σ c_j M_j.
         opd = self.coefficients[index].astype(dtype) @ self._images[key]
         return np.asarray(opd.reshape(-1, size, size))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -30,14 +30,6 @@ from psfdae.telescope.settings import Seeing
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-MAX_ROUNDS = 4
-"""Rounds in which stars choose the mode nearest to the state and the state follows them, and in
-which stamps are computed again for a fitted seeing."""
-
-MAX_SEEING_CHANGE = 0.5
-"""Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM that
-the telescope's file states."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +102,9 @@ class TelescopePosterior:
     model: TelescopeModel
     stars: np.ndarray
     optics: StarOptics
+    max_seeing_change: ClassVar[float] = 0.5
+    """Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM
+    that the telescope's file states."""
 
     @property
     def number_count(self) -> int:
@@ -117,7 +112,7 @@ class TelescopePosterior:
         return self.model.sd.size
 
     @cached_property
-    def _broadening(self) -> SampledStamps:
+    def broadening(self) -> SampledStamps:
         """Propagation to derivatives of the stamps by the logarithm of the FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
@@ -135,7 +130,7 @@ class TelescopePosterior:
 
     def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
-        fwhm = max(self.relative_seeing(t), 1.0 - MAX_SEEING_CHANGE) * self.seeing.fwhm_arcsec
+        fwhm = max(self.relative_seeing(t), 1.0 - self.max_seeing_change) * self.seeing.fwhm_arcsec
         # The same telescope but for its seeing.
         seeing = self.seeing.model_copy(update={"fwhm_arcsec": fwhm})
         telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
@@ -189,7 +184,7 @@ class TelescopePosterior:
         stamps, slopes = optics.derivatives(modes, directions)
         if self.model.has_seeing:
             # p(w) = p(1) + (w − 1) ∂p/∂ln w about w = 1, the relative FWHM of the seeing.
-            broadened = self._broadening.stamps(modes).reshape(len(self.stars), -1)
+            broadened = self.broadening.stamps(modes).reshape(len(self.stars), -1)
             broadened = broadened.astype(np.float64)
             stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
             slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadened
@@ -232,29 +227,29 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     posterior = TelescopePosterior(search, model, stars, optics)
     # Two starts: near the prior's mean, and near the twin of that, unless no telescope is there.
     q = posterior.number_count
-    starts = [_start_near(posterior, modes, np.zeros(q))]
+    starts = [start_near(posterior, modes, np.zeros(q))]
     with suppress(RayTracingError):
-        starts.append(_start_near(posterior, modes, _twin(posterior, starts[0][:q])))
+        starts.append(start_near(posterior, modes, twin_numbers(posterior, starts[0][:q])))
     # Limits of the numbers, and of the places of the stars.
     limit = np.full(starts[0].size, np.inf)
     limit[:q] = MAX_Z
     if model.has_seeing:
-        limit[q - 1] = MAX_SEEING_CHANGE * model.mean[-1] / model.sd[-1]
+        limit[q - 1] = posterior.max_seeing_change * model.mean[-1] / model.sd[-1]
     limit[q:].reshape(-1, 4)[:, :2] = optics.reach_px
     steps = Steps(max_steps=30, min_gain=0.005, relative_rounding=1e-7)
     peaks = climb(posterior.evaluate, np.stack(starts), limit, steps)
     # Stamps are linear in the seeing: they are computed again at the fitted FWHM until it changes
-    # by less than 0.2 %.
-    for _ in range(MAX_ROUNDS if model.has_seeing else 0):
+    # by less than 0.2 %, at most four times.
+    for _ in range(4 if model.has_seeing else 0):
         t = peaks.parameters[peaks.height.argmax(), :q]
         if abs(posterior.relative_seeing(t) - 1.0) < 2e-3:
             break
         posterior = posterior.with_seeing_of(t)
         peaks = climb(posterior.evaluate, peaks.parameters, limit, steps)
-    return _summarise(posterior, peaks)
+    return summarise_peaks(posterior, peaks)
 
 
-def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
+def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     """Return the most probable state with its errors, and its twin if there is another peak."""
     model, stars = posterior.model, posterior.stars
     t = peaks.parameters[:, : posterior.number_count]
@@ -279,7 +274,7 @@ def _summarise(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     )
 
 
-def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
+def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
     """Return parameters that agree with the modes of the single stars, near t (Q,).
 
     In each round every star chooses the mode nearest to the telescope, and the numbers are fitted
@@ -293,7 +288,8 @@ def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) 
     covariance = sd[:, :, None] * modes.covariance[:, :count, :count] * sd[:, None]
     covariance = covariance + 1e-6 * np.eye(count)
     row = np.searchsorted(posterior.stars, modes.star)
-    for _ in range(MAX_ROUNDS):
+    # Four rounds: a star may choose another mode as the numbers move.
+    for _ in range(4):
         # Squared Mahalanobis distance of each mode; the first of each star in this order is the
         # nearest.
         gap = measured - posterior.coefficients(t)[row]
@@ -309,7 +305,7 @@ def _start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) 
     return np.concatenate([t, modes.parameters[nearest, count:].ravel()])
 
 
-def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
+def twin_numbers(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
     """Return standardised numbers whose stars have the even coefficients of t (Q,) negated.
 
     A least-squares solution by Gauss–Newton steps: often no telescope has exactly these.
@@ -317,7 +313,8 @@ def _twin(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
     is_even = posterior.search.optics.terms.is_even
     # Coefficients that the twin should have; those of odd terms stay.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
-    for _ in range(MAX_ROUNDS):
+    # Few steps do: coefficients are linear in the numbers, or nearly so.
+    for _ in range(4):
         # All coefficients of all stars are equations for the numbers; singular values below 1e-9
         # are combinations of numbers that no coefficient shows.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)

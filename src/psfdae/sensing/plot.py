@@ -16,9 +16,6 @@ from psfdae.sensing.results import Wavefronts, flat_modes
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CELLS = 8
-"""Pupils along a side of the field, at most."""
-
 
 @styled
 def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
@@ -32,15 +29,18 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     title : str
         Title above the three panels.
     """
-    stars = _bright_separate_stars(wavefronts)
+    # At most 8 pupils along a side of the field: each is drawn in a cell.
+    low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
+    cell_deg = (high - low).max() / 8
+    stars = bright_separate_stars(wavefronts, cell_deg)
     # OPD of the most probable mode of each star, and of the model.
     summary, joint = wavefronts.summary, wavefronts.joint
     first = np.searchsorted(summary["star"], stars)
-    measured = _pupil_opd(wavefronts, stars, summary["mean"][first])
+    measured = pupil_opd(wavefronts, stars, summary["mean"][first])
     expected = wavefronts.terms.mean
     if joint is not None:
         expected = joint.model.coefficients(joint.value)
-    model = _pupil_opd(wavefronts, stars, expected[stars])
+    model = pupil_opd(wavefronts, stars, expected[stars])
     # Residuals in units of the sky's noise, less the median of each stamp.
     stamps, photons = wavefronts.stamps, wavefronts.search.photons
     residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
@@ -58,9 +58,9 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    # Each image fills a cell about the place of its star, with a gap to the next one.
-    low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
-    cell = 0.92 * ((high - low).max() or 1.0) / CELLS
+    # Each image fills its cell about the place of the star, but for a gap to the next one. If all
+    # stars have one place, any cell will do.
+    cell = 0.92 * (cell_deg or 0.125)
     half = 0.5 * cell
     for panel, (name, images, limit, colours, unit) in zip(axes, panels, strict=True):
         # Rows of images run along +y, as the field angles do.
@@ -89,25 +89,23 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     return figure
 
 
-def _bright_separate_stars(wavefronts: Wavefronts) -> np.ndarray:
-    """Return the brightest explained stars that are a cell or more from each other.
-
-    A cell is the field's larger side over `CELLS`. The result has the numbers of the stars.
-    """
+def bright_separate_stars(wavefronts: Wavefronts, cell_deg: float) -> np.ndarray:
+    """Return the numbers of the brightest explained stars, a cell or more from each other."""
     stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
     # Brightest first: of stars in one cell, the brightest is drawn.
     stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
     # Rounding must not part stars of a regular grid.
-    cell = (1.0 - 1e-6) * np.ptp(wavefronts.field_deg, axis=0).max() / CELLS
+    distance_deg = (1.0 - 1e-6) * cell_deg
     separate = []
     while stars.size:
         separate.append(stars[0])
         offset = np.abs(wavefronts.field_deg[stars] - wavefronts.field_deg[stars[0]])
-        stars = stars[offset.max(axis=1) >= cell] if cell > 0 else stars[:0]
+        is_separate = (offset.max(axis=1) >= distance_deg) & (cell_deg > 0)
+        stars = stars[is_separate]
     return np.array(separate, int)
 
 
-def _pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def pupil_opd(wavefronts: Wavefronts, star: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return the OPD in waves over the pupil, without piston and tilts, (m, 50, 50).
 
     NaN where less than half of a sample is lit. `coefficients` (m, K) are in waves.

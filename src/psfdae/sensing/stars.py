@@ -44,14 +44,6 @@ STARS_AT_ONCE = 128
 """Stars of 16 × 16 px that are worked on together, to bound the memory."""
 
 
-ROUNDS = ((48, 4), (100, 6), (400, 12), (1000, 12))
-"""Rounds of the search: candidates drawn for a star, and those of them that are followed to modes.
-
-Rounds after the first are for stars that no mode explains yet, or for which the round before found
-another mode.
-"""
-
-
 class SensingError(Error, ValueError):
     """Stars, or a telescope, from which no wavefronts can be measured."""
 
@@ -327,7 +319,9 @@ class WavefrontSearch:
         count = self.optics.coefficient_count
         modes: list[StarModes] = []
         likely_modes = np.ones(len(self.flux), int)
-        for number, sizes in enumerate(ROUNDS):
+        # Candidates drawn for a star in each round, and those of them that are followed to modes.
+        rounds = ((48, 4), (100, 6), (400, 12), (1000, 12))
+        for number, sizes in enumerate(rounds):
             if not stars.size:
                 break
             # Climbs from the candidates that match best.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from psfdae_paper.alignment.likelihood import STATES_AT_ONCE, StateOptics
+from psfdae_paper.alignment.likelihood import StateOptics
 from psfdae_paper.alignment.telescope import design_states, mirror_symmetries
 from psfdae_paper.configuration.alignment import Fit
 
@@ -59,8 +59,9 @@ class StampEmulator:
         """
         shape = self.stamps.shape[1:]
         sums = np.zeros((len(states), 5, *shape), np.float32)
-        for start in range(0, len(states), STATES_AT_ONCE):
-            places = states[start : start + STATES_AT_ONCE] @ self._metric
+        # The equations of 64 states are in memory together.
+        for start in range(0, len(states), 64):
+            places = states[start : start + 64] @ self._metric
             for row, (neighbour, weight) in enumerate(
                 zip(*self._weights(places), strict=True), start
             ):
@@ -83,7 +84,8 @@ class StampEmulator:
             The weights, then their four derivatives.
         """
         distance, neighbour = self._tree.query(places, self.neighbours)
-        # Correlation length: three times the distance of the farthest neighbour.
+        # The k nearest of all states and mirror images. Correlation length: three times the
+        # distance of the farthest of them.
         unit = 3.0 * distance[:, -1:, None]
         away = (places[:, None] - self._places[neighbour]) / unit
         # Covariance K of the neighbours. The small variance 1e-8 is the rounding of stamps.
@@ -110,6 +112,7 @@ def matern(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     With r = √5 × distance it is (1 + r + r²/3) e⁻ʳ (Rasmussen and Williams 2006, equation 4.17).
     """
+    # Derivative by u = distance²/2: dr/du = 5/r, so it is −(r/3) (1 + r) e⁻ʳ · 5/r.
     r = np.sqrt(5.0 * squares)
     decay = np.exp(-r)
     return (1.0 + r + r**2 / 3.0) * decay, -5.0 / 3.0 * (1.0 + r) * decay

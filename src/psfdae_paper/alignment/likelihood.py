@@ -38,9 +38,6 @@ from psfdae_paper.configuration.alignment import Fit
 StampFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Function of parameters (n, K) that returns stamps and slopes, as `StateOptics` does."""
 
-STATES_AT_ONCE = 64
-"""States whose derivatives are in memory together."""
-
 
 @dataclass(frozen=True)
 class StateOptics:
@@ -60,6 +57,7 @@ class StateOptics:
 
     def parameters_of(self, states: np.ndarray) -> np.ndarray:
         """Complete states (n, 4) to parameters, with flux 1 and the star in the stamp's centre."""
+        # Three zeros for each stamp: flux 1 + 0, place (0, 0).
         count = 3 * len(self.model.coefficients) * self.operator.movable
         return np.pad(states, ((0, 0), (0, count)))
 
@@ -77,8 +75,10 @@ class StateOptics:
             Derivatives by the k parameters of each stamp: the four of the state and, if stamps
             are movable, the stamp's own three.
         """
+        # The quadratic model gives Zernike coefficients z_f of every field, and ∂z_f/∂t.
         states, star_parameters = parameters[:, :4], parameters[:, 4:]
         zernikes, directions = self.model(states), self.model.jacobian(states)
+        # An emulator gives the slopes by the state: the optics need no directions for them.
         if self.emulator is not None:
             directions = directions[:, :, :0]
         if self.operator.movable:
@@ -122,9 +122,10 @@ def deviance_and_information(
     information : ndarray, shape (n, K, K)
         Fisher matrix.
     """
+    # The level λ decides the flux F of the stars, in photons; the sky B is the same at all levels.
     count, fields, k = slopes.shape[:3]
     flux, sky = noise.flux(level), noise.background
-    # Counts of every stamp by itself, sky included.
+    # Counts F p + B of every stamp by itself.
     observed, expected = (
         flux * array.reshape(count * fields, -1).astype(np.float64) + sky
         for array in (images, stamps)
@@ -162,9 +163,10 @@ def bound_covariances(
     ndarray, shape (len(unknown_flux), L, n, 4, 4)
         Covariances in squared units of the range.
     """
+    # Stamps and slopes of a state serve all levels and both bounds. Those of 64 states are in
+    # memory together.
     covariances = np.empty((len(unknown_flux), len(levels), len(states), 4, 4))
-    for start in range(0, len(states), STATES_AT_ONCE):
-        part = slice(start, start + STATES_AT_ONCE)
+    for part in (slice(start, start + 64) for start in range(0, len(states), 64)):
         stamps, slopes = optics(optics.parameters_of(states[part]))
         for bound, level in np.ndindex(covariances.shape[:2]):
             # The inverse of the Fisher matrix by all parameters; its part for the state is the
@@ -179,6 +181,7 @@ def bound_covariances(
 
 def expected_abs_error(covariances: np.ndarray) -> np.ndarray:
     """Return the mean absolute error of normal errors, √(2/π) σ, (..., K, K) to (..., K)."""
+    # ⟨|e|⟩ = ∫ |e| N(e; 0, σ²) de.
     sigma = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     return np.asarray(np.sqrt(2.0 / np.pi) * sigma)
 
@@ -261,6 +264,7 @@ def refit_twins(
     in_range : ndarray of bool, shape (n,)
         True where the twin lies within the limit, and so was a starting point.
     """
+    # Twins beyond the limit are no states that the fit could reach.
     twins = twin_states(model, fit.parameters)
     in_range = (np.abs(twins) <= settings.limit).all(axis=1)
     improved = deepcopy(fit)

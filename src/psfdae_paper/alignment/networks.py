@@ -133,7 +133,15 @@ Network = AlignmentCnn | AlignmentPerceptron
 
 
 def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Network:
-    """Make the network of a configuration, before it has its weights."""
+    """Make the network of a configuration, before it has its weights.
+
+    Parameters
+    ----------
+    config : config group `cnn` or `perceptron`
+        Its class decides the kind of network.
+    fields, stamp_px : int
+        Stamps of a state, and their side.
+    """
     if isinstance(config, Cnn):
         return AlignmentCnn(config, fields, stamp_px)
     return AlignmentPerceptron(config, fields, stamp_px)
@@ -146,7 +154,13 @@ def build_network(
 
     Inner layers draw N(0, 2/fan_in) (He et al. 2015), the last one PyTorch's uniform
     ±1/√fan_in; its bias is 0, the middle of the range.
+
+    Parameters
+    ----------
+    config, fields, stamp_px : as for `empty_network`
+    generator : torch.Generator
     """
+    # The gain of He's rule depends on the slope of the rectifier below 0.
     model = channels_last(empty_network(config, fields, stamp_px))
     leak = getattr(config, "leak", 0.0)
     with torch.no_grad():
@@ -157,6 +171,7 @@ def build_network(
                 )
             if isinstance(layer, nn.Linear):
                 layer.bias.zero_()
+        # The last layer begins near the middle of the range.
         bound = float(model.linear.in_features) ** -0.5
         model.linear.weight.uniform_(-bound, bound, generator=generator)
         model.linear.bias.zero_()
@@ -191,12 +206,14 @@ def predict_states(
     ndarray, shape (n, 4), float64
     """
     model.eval()
+    # A mirrored telescope has the mirrored state: estimates are mirrored back and averaged.
     if mirrors:
         # The inverse of an orthogonal matrix is its transpose.
         estimates = [
             predict_states(model, m.stamps(stamps), batch) @ m.state_matrix for m in mirrors
         ]
         return np.asarray(np.mean(estimates, axis=0))
+    # Batches bound the memory.
     parts = [
         model(scale_stamps(stamps[start : start + batch])).numpy()
         for start in range(0, len(stamps), batch)
@@ -231,6 +248,7 @@ class TrainingStates:
         """
         if self.noise is None:
             return stamps
+        # A level for each state, the same for its stamps at all fields.
         levels = mixed_levels(np.asarray(self.levels), len(stamps), rng)
         return self.noise.draw_gaussian(stamps, levels, rng)
 
@@ -259,6 +277,7 @@ class NetworkTraining(Training):
         seed: int,
         name: str,
     ) -> None:
+        # Mirror images of the telescope, if the settings want them.
         self.data, self.seed, self.name = data, seed, name
         fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
         self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
@@ -280,6 +299,7 @@ class NetworkTraining(Training):
 
     def _shuffled(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Yield the numbers of the states of every batch of an epoch."""
+        # A random order of all states, cut into batches.
         order = rng.permutation(len(self.data.states))
         for start in range(0, order.size, self.settings.batch)[: self.steps]:
             yield order[start : start + self.settings.batch]
@@ -344,6 +364,7 @@ class PerceptronTraining(NetworkTraining):
 
         Components are sums over all fields: with one draw, F = 1 and the sum is taken once.
         """
+        # Without draws of noise there is one draw, the stamps themselves.
         stamps = self.data.stamps[(None,) * (5 - self.data.stamps.ndim)]
         draws, count, fields, side, _ = stamps.shape
         mean, axes = (
@@ -364,6 +385,7 @@ class PerceptronTraining(NetworkTraining):
         With a mirror P of stamps x and axes A, (P x)·A = x·(Pᵀ A). T solves Pᵀ A = A T, which is
         the same as A = P A T.
         """
+        # Axes as images, mirrored as stamps are, and the combination of axes that they are.
         fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
         axes = self.model.axes.numpy()
         stamps = axes.T.reshape(-1, fields, side, side)
@@ -417,6 +439,9 @@ class PerceptronTraining(NetworkTraining):
 def training_of(
     network: Cnn | Perceptron, data: TrainingStates, settings: NetworkTrain, seed: int, name: str
 ) -> NetworkTraining:
-    """Make the training of a kind of network; arguments as those of `NetworkTraining`."""
+    """Make the training of a kind of network; arguments as those of `NetworkTraining`.
+
+    Perceptrons learn from principal components, CNNs from stamps.
+    """
     kind = NetworkTraining if isinstance(network, Cnn) else PerceptronTraining
     return kind(data, network, settings, seed, name)

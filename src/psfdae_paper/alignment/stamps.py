@@ -95,6 +95,7 @@ class AlignmentStamps:
         alignment: Alignment,
         movable: bool = False,
     ) -> None:
+        # Settings, kept for those who use the operator.
         self.telescope = telescope
         self.optics = optics
         self.alignment = alignment
@@ -142,6 +143,7 @@ class AlignmentStamps:
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
+        # One list of wavefronts, whatever the leading axes are; then light 1 in each stamp.
         shape = zernikes.shape[:-1]
         raw = self.propagation.stamps(zernikes.reshape(-1, zernikes.shape[-1]))
         stamps, energy = normalise_flux(raw)
@@ -177,7 +179,7 @@ class AlignmentStamps:
             If a stamp holds less than `alignment.least_energy`.
         """
         shape = zernikes.shape[:-1]
-        # An emulator may give all derivatives.
+        # An emulator may give all derivatives: only the stamps are left to compute.
         if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
         # One list of wavefronts, whatever the leading axes are.
@@ -185,6 +187,7 @@ class AlignmentStamps:
             array.reshape(prod(shape), *array.shape[len(shape) :])
             for array in (zernikes, directions)
         )
+        # The flux of a stamp depends on the state, too: the quotient is differentiated.
         raw = self.propagation.derivatives(zernikes, directions, by_position=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)
         self._check_energy(energy)
@@ -192,6 +195,7 @@ class AlignmentStamps:
 
     def _check_energy(self, energy: np.ndarray) -> None:
         """Raise EnergyError if a stamp holds too small a fraction of the light."""
+        # Light beyond the stamp is missing from its flux. "not >=" refuses NaN, too.
         minimum = self.alignment.least_energy
         if not energy.min() >= minimum:
             darkest = int(energy.argmin())

@@ -46,6 +46,7 @@ def field_points(radius_deg: float, points: int) -> np.ndarray:
 
     They are field angles (x, y) in radians, shape (1 + points, 2).
     """
+    # The circle counter-clockwise from the x axis, after the centre.
     angle = 2.0 * np.pi * np.arange(points) / points
     circle = np.deg2rad(radius_deg) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.concatenate([np.zeros((1, 2)), circle])
@@ -98,11 +99,13 @@ class StateTracer(ZernikeTracer):
         RayTracingError
             If a state lies outside the range or a field is vignetted; names the state.
         """
+        # The range is that for which the model of the wavefront is tested.
         states = np.atleast_2d(np.asarray(states, float))
         # Ends of a grid are rounded: 1e-9 of the range is no mistake.
         is_outside = ~(np.abs(states) <= 1.0 + 1e-9)
         if is_outside.any():
             state, axis = np.argwhere(is_outside)[0]
+            # The message has the misalignment in the units of a workshop, too.
             value = states[state, axis]
             size = value * self.misalignment_range[axis]
             size_text = f"{size * 1e3:.6g} mm" if axis < 2 else f"{np.rad2deg(size):.6g}°"
@@ -202,6 +205,7 @@ def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
         If the states do not determine all 15 terms.
     """
     # Zernike coefficient j at field f: z_fj(t) = Σ_k terms_k(t) c_fkj, linear in c.
+    # All fields and Zernike terms are right-hand sides of the same equations.
     count, fields, modes = zernikes.shape
     terms = quadratic_terms(states)
     fit, _, rank, _ = np.linalg.lstsq(terms, zernikes.reshape(count, -1), rcond=None)
@@ -263,6 +267,8 @@ def twin_states(model: QuadraticModel, states: np.ndarray) -> np.ndarray:
     In focus their stamps hardly differ from those of `states`; parameters after the four are
     unchanged.
     """
+    # From t to −t on the line of tilt and coma-free decentre through the state: the decentre
+    # changes by that of −2 t.
     tilts = states[:, 2:4]
     decentre = states[:, :2] + coma_free_decentre(model, -2.0 * tilts)
     return np.concatenate([decentre, -tilts, states[:, 4:]], axis=1)

@@ -1,8 +1,13 @@
-"""Composition of a checked configuration from Hydra overrides, and the part that each stage reads.
+"""From YAML to settings: Hydra composes the files of `config/`, pydantic checks the result.
 
-`compose` resolves overrides to a tree of plain values. `load`, `load_groups` and `load_stage` check
-it and return models. `write_settings` writes the groups of a stage to a file, `load_settings` reads
-them. `overrides_for` selects those of a workflow's overrides that concern one dataset.
+In goes a list of overrides such as `dataset=dataset3 preset=smoke noise.levels=[0.002]`; out comes
+a configuration in three forms, each made from the one before:
+
+1. `compose`: a tree of plain values, defaults of the settings' classes included;
+2. `load` (a whole dataset) and `load_stage` (the groups that a stage reads): checked models;
+3. `write_settings`: a YAML file of these groups for a job, which `load_settings` reads again.
+
+`overrides_for` selects those of a workflow's overrides that concern one dataset.
 """
 
 from __future__ import annotations
@@ -11,13 +16,9 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
-
-from pydantic import create_model
 
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
@@ -26,21 +27,18 @@ from psfdae_paper.configuration import alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import stage_model, with_derived_values
 from psfdae_paper.configuration.methods import all_groups, methods_in
-from psfdae_paper.configuration.outline import fill_marks, outline_of
 from psfdae_paper.configuration.schema import Config, whole_config
-
-ROOT = "config.yaml"
-"""File of the configuration folder at which Hydra begins."""
-
-OUTLINE = "_outline"
-"""Option of the group dataset that stands for all files of one outline."""
-
-CACHE_FOLDERS: list[Path] = []
-"""Folders for compositions, of which the last one is used; empty for none."""
 
 
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Resolve a list of Hydra overrides to a configuration tree, not yet checked.
+
+    Hydra takes about 0.25 s for each list; the same list is composed once in a process.
+
+    Returns
+    -------
+    dict
+        Values by group and key. It is shared by all callers: do not change it.
 
     Raises
     ------
@@ -53,83 +51,19 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
 def clear_caches() -> None:
     """Compose everything anew, for example after a change of the config folder."""
     _composed.cache_clear()
-    _cached_composition.cache_clear()
     methods_in.cache_clear()
-
-
-def cache_compositions(folder: Path) -> None:
-    """Store compositions in a folder for the next process; Hydra needs some 0.15 s for each.
-
-    A file's name is the hash of all inputs of its composition, so that none is out of date; one
-    that is damaged is composed anew. None is stored where the configuration asks a resolver,
-    which may depend on the environment or the time.
-    """
-    CACHE_FOLDERS.append(folder)
 
 
 @cache
 def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Compose overrides, with one composition for all datasets that differ in values only."""
-    datasets = [word for word in overrides if re.fullmatch(r"dataset=\w+", word)]
-    if len(datasets) == 1:
-        outline = outline_of(config_dir() / f"dataset/{datasets[0].removeprefix('dataset=')}.yaml")
-        if outline:
-            marked_tree, values = outline
-            words = tuple(f"dataset={OUTLINE}" if word in datasets else word for word in overrides)
-            # What the outline does not permit is composed from the file itself, whose error
-            # message names the right keys.
-            with suppress(ConfigError, KeyError):
-                composition = _cached_composition(words, json.dumps(marked_tree))
-                return dict(fill_marks(composition, values))
-    return _cached_composition(overrides)
-
-
-@cache
-def _cached_composition(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
-    """Read a composition from the cache folder, or compose and store it there."""
-    name = _composition_hash(overrides, outline) if CACHE_FOLDERS or outline else ""
-    if outline and not name:
-        raise ConfigError("a resolver may look at values that an outline does not have")
-    if not (name and CACHE_FOLDERS):
-        return _by_hydra(overrides, outline)
-    # A file is the hash of its second line, then JSON: a damaged one is not used.
-    path = Path(CACHE_FOLDERS[-1], name)
-    digest, _, text = path.read_bytes().partition(b"\n") if path.is_file() else (b"", b"", b"")
-    if digest.decode("latin1") == hashlib.sha256(text).hexdigest():
-        stored_tree: dict[str, Any] = json.loads(text)
-        return stored_tree
-    tree = _by_hydra(overrides, outline)
-    serialised = json.dumps(tree)
-    # Do not store a tree that JSON changes, or whose files were edited while Hydra read them.
-    if json.loads(serialised) == tree and _composition_hash(overrides, outline) == name:
-        write_text(path, f"{hashlib.sha256(serialised.encode()).hexdigest()}\n{serialised}")
-    return tree
-
-
-def _composition_hash(overrides: tuple[str, ...], outline: str) -> str:
-    """Return the hash of all inputs of a composition, "" if a resolver may add more."""
-    folder = config_dir()
-    versions = version("hydra-core"), version("omegaconf")
-    words = (overrides, outline, all_groups(), _class_defaults(), *versions)
-    parts = [repr(words).encode(), Path(__file__).read_bytes()]
-    for path in sorted(folder.rglob("*.yaml")):
-        parts += [str(path.relative_to(folder)).encode(), path.read_bytes()]
-    # A colon in the braces calls a resolver; without one, the braces refer to another key.
-    has_resolver = any(re.search(rb"\$\{[\w.]+:", part) for part in parts)
-    return "" if has_resolver else hashlib.sha256(b"\0".join(parts)).hexdigest()
-
-
-def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
-    """Compose with Hydra; an outline is the content of the dataset option `OUTLINE`, as JSON."""
+    """Compose with Hydra, and resolve all references between keys."""
     import hydra
-    from hydra.core.config_store import ConfigStore
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
     folder = config_dir()
+    # Hydra has one global state, which an earlier composition leaves behind.
     GlobalHydra.instance().clear()
-    if outline:
-        ConfigStore.instance().store(OUTLINE, json.loads(outline), "dataset", "_global_")
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(folder), overrides=list(overrides))
@@ -137,7 +71,7 @@ def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
     if not isinstance(resolved, dict):
-        raise ConfigError(f"{folder / ROOT}: must be a mapping")
+        raise ConfigError(f"{folder / 'config.yaml'}: must be a mapping")
     return resolved
 
 
@@ -149,14 +83,15 @@ def _primary(folder: Path) -> str:
     """
     from hydra.core.config_store import ConfigStore
 
-    tree = parse_yaml(folder / ROOT)
+    tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
     listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    # Before the list of the file, so that datasets and presets may change these settings.
+    # Settings of methods come before the file's list: datasets and presets may change them.
     method_defaults = [
         {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
     ]
     all_defaults = ["class_defaults", *method_defaults, *defaults]
+    # Hydra composes in the order of the list; a later entry replaces values of an earlier one.
     store = ConfigStore.instance()
     store.store("class_defaults", _class_defaults(), package="_global_")
     store.store("with_class_defaults", {**tree, "defaults": all_defaults})
@@ -164,7 +99,10 @@ def _primary(folder: Path) -> str:
 
 
 def _class_defaults() -> dict[str, Any]:
-    """Return the groups of a configuration with the defaults of their classes, if any."""
+    """Return the groups of a configuration with the defaults of their classes, if any.
+
+    Fields without a default must be in the files; excluded ones are inputs of derived values.
+    """
     groups = {
         name: {
             key: field.get_default(call_default_factory=True)
@@ -186,7 +124,11 @@ def _group_classes() -> dict[str, type[Group]]:
 
 
 def _reason(error: Exception, folder: Path) -> str:
-    """Return one line on why a composition failed: the file that is no YAML, if there is one."""
+    """Return one line on why a composition failed: the file that is no YAML, if there is one.
+
+    Hydra's own refusals name the key or option. Any other error comes from a damaged file, which
+    Hydra does not name: the files are read one by one until one of them fails.
+    """
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -232,31 +174,6 @@ def _require_known_groups(tree: Mapping[str, Any]) -> None:
     unknown = sorted(set(tree) - set(whole_config().model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
-
-
-def load_groups(overrides: Sequence[str] = ()) -> Config:
-    """Compose the configuration and check every group by itself, not against other groups.
-
-    Raises
-    ------
-    ConfigError
-        Names each wrong key with its value and the allowed range.
-    """
-    return _validated_groups(_independent_groups_model(), _derived(compose(overrides)))
-
-
-@cache
-def _independent_groups_model() -> type[Group]:
-    """Return a model of the whole configuration without the checks between groups."""
-    fields: dict[str, Any] = {
-        key: (field.rebuild_annotation(), ...) for key, field in whole_config().model_fields.items()
-    }
-    return create_model("Groups", __base__=Group, **fields)
-
-
-def _validated_groups(model: type[Group], tree: Mapping[str, Any]) -> Config:
-    """Check some groups; for type checkers they are a whole `Config`, as stages annotate it."""
-    return cast(Config, validate(model, tree))
 
 
 Model = TypeVar("Model", bound=Group)
@@ -321,8 +238,8 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     """
     tree = parse_yaml(path)
     groups = tree if isinstance(tree, dict) else {}
-    model = stage_model(reads, whole_config())
-    return _with_file_name(path, lambda: _validated_groups(model, groups))
+    # All groups of the file are checked: one that the stage does not read is refused.
+    return _with_file_name(path, lambda: _checked(reads, groups))
 
 
 def write_settings(
@@ -336,14 +253,28 @@ def write_settings(
 
     Settings that cannot change a result are in the file, but do not change its name.
 
+    Parameters
+    ----------
+    folder : Path
+        Folder for the files of all stages.
+    stage : str
+        Name of the command.
+    reads : tuple of str
+        Groups that it reads.
+    tree : mapping
+        Composed configuration.
+    dry : bool
+        Name the file without writing it, in a dry run.
+
     Returns
     -------
     Path
-        File in `folder`. With `dry` it is named, but not written.
+        STAGE-HASH.yaml in `folder`.
     """
     import yaml
 
     settings = part(reads, stage_tree(reads, tree)).model_dump()
+    # The name is a hash of what can change the result: another name makes Snakemake repeat a job.
     serialised = json.dumps(decisive_settings(settings), sort_keys=True)
     digest = hashlib.sha256(serialised.encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
@@ -365,7 +296,12 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     """
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     groups = {key: tree[key] for key in reads if key in tree}
-    return _validated_groups(stage_model(reads, whole_config()), groups)
+    return _checked(reads, groups)
+
+
+def _checked(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
+    """Return checked groups; type checkers take them for a whole `Config`, as stages state it."""
+    return cast(Config, validate(stage_model(reads, whole_config()), groups))
 
 
 def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -378,7 +314,11 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     ConfigError
         If a group is missing, or groups contradict each other.
     """
-    tree = _derived(tree)
+    # Values that are null in the files because they follow from other groups.
+    try:
+        tree = with_derived_values(tree)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
     missing = [key for key in reads if key not in tree]
     if missing and _is_alignment(tree):
         raise ConfigError(
@@ -388,14 +328,6 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
     return {key: tree[key] for key in reads}
-
-
-def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Fill in values that follow from other groups; raises ConfigError."""
-    try:
-        return with_derived_values(tree)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
 
 
 def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple[str, ...]:
@@ -416,14 +348,15 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     ConfigError
         If an option does not exist.
     """
+    # Words such as train=onecycle choose a file of a group; scene 3 takes few of these groups.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
+    is_alignment = tuple(choice) == alignment.CHOICE
     applicable_options = [
-        word
-        for word in options
-        if tuple(choice) != alignment.CHOICE or _key(word) in alignment.SHARED_OPTIONS
+        word for word in options if not is_alignment or _key(word) in alignment.SHARED_OPTIONS
     ]
 
     def has_key(choice: Sequence[str], dotted_key: str) -> bool:
+        """Return True if the configuration of a dataset has a key."""
         node: Any = compose((*choice, *applicable_options))
         for name in dotted_key.split("."):
             if not isinstance(node, Mapping) or name not in node:
@@ -432,6 +365,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
         return True
 
     def concerns(override: str) -> bool:
+        """Return True if this dataset has the override's key, or if no dataset has it."""
         for key in _deciding_keys(override):
             if has_key(choice, key):
                 return True
@@ -469,6 +403,20 @@ def _deciding_keys(override: str) -> list[str]:
     return ([key] if override.startswith("++") else []) + ([group] if group else [])
 
 
+def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration tree without the settings that cannot change a result.
+
+    These are marked `NEUTRAL` in their class, such as the time between checkpoints.
+    """
+    neutral = _neutral_keys()
+    return {
+        group: {key: value for key, value in values.items() if (group, key) not in neutral}
+        if isinstance(values, Mapping)
+        else values
+        for group, values in tree.items()
+    }
+
+
 @cache
 def _neutral_keys() -> frozenset[tuple[str, str]]:
     """Return group and name of the settings that cannot change a result."""
@@ -478,29 +426,6 @@ def _neutral_keys() -> frozenset[tuple[str, str]]:
         for name, field in group_class.model_fields.items()
         if NEUTRAL in field.metadata
     )
-
-
-def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration tree without the settings that cannot change a result."""
-    return _filtered(tree, lambda key: key not in _neutral_keys())
-
-
-def neutral_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those settings of a configuration tree that cannot change a result."""
-    return _filtered(tree, lambda key: key in _neutral_keys())
-
-
-def _filtered(
-    tree: Mapping[str, Any], accepts: Callable[[tuple[str, str]], bool]
-) -> dict[str, Any]:
-    """Return a tree with those settings whose group and name are accepted."""
-    filtered: dict[str, Any] = {}
-    for group, value in tree.items():
-        if isinstance(value, Mapping):
-            filtered[group] = {key: value[key] for key in value if accepts((group, key))}
-        elif accepts((group, "")):
-            filtered[group] = value
-    return filtered
 
 
 def _first_lines(error: Exception) -> str:

@@ -1,4 +1,8 @@
-"""Relations between groups of the configuration: derived values and contradictions."""
+"""Relations between groups of the configuration: derived values and contradictions.
+
+In goes a composed tree of groups, in which some values are null because they follow from other
+groups; out comes the same tree with these values, or an error where groups contradict each other.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +22,6 @@ SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "frami
 
 STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
 """Groups that decide the static PSFs."""
-
-TELESCOPE_SCENE = "telescope"
-"""Name of the scene whose aberrations are settings of the telescope."""
 
 
 class Consistent(Group):
@@ -68,9 +69,33 @@ class Consistent(Group):
 
 
 def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration with values for those nulls that follow from other groups."""
-    derived = {name: _without_nulls(group, _derived(name, tree)) for name, group in tree.items()}
-    grid = derived.get("grid")
+    """Return a configuration with values for those nulls that follow from other groups.
+
+    The tree need not be valid: a value that cannot be derived from it is left to the next check.
+
+    Parameters
+    ----------
+    tree : mapping
+        Groups by name; it is not changed.
+
+    Returns
+    -------
+    dict
+        The same groups with `grid.edge_deg` and `grid.spacing_deg` in degrees, and
+        `framing.search_px` and `stars.search_px` in pixels.
+    """
+    derived = {
+        name: dict(group) if isinstance(group, Mapping) else group for name, group in tree.items()
+    }
+    telescope, grid = derived.get("telescope"), derived.get("grid")
+    if isinstance(telescope, dict):
+        # Brightest pixels are searched within a distance in λ/D, whatever the telescope's pixels.
+        for group in (derived.get("framing"), derived.get("stars")):
+            if isinstance(group, dict) and group.get("search_px", 0) is None:
+                group["search_px"] = _search_px(group.get("search_lambda_d"), telescope)
+        # The relative field H is 1 at the edge of the telescope's field.
+        if isinstance(grid, dict) and grid.get("edge_deg", 0) is None:
+            grid["edge_deg"] = telescope.get("field_edge_deg")
     if isinstance(grid, dict) and grid.get("spacing_deg", 0) is None:
         # The outermost field points are at the edge of the field. One point has no neighbour, for
         # which any distance is right; `points` that are no integer are refused by the next check.
@@ -82,65 +107,42 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_scene(tree: Mapping[str, Any]) -> None:
-    """Raise ValueError if scene and telescope do not have the same source of aberrations."""
+    """Raise ValueError if scene and telescope do not have the same source of aberrations.
+
+    The aberrations are settings of the scene or of the telescope: exactly one of them has some.
+    """
     scene, telescope = tree.get("scene"), tree.get("telescope")
     if scene is None and "alignment" in tree:
         scene = {"name": "alignment"}
     if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
         return
     name, has_aberrations = telescope.get("name"), has_own_aberrations(telescope)
-    if has_aberrations and scene.get("name") != TELESCOPE_SCENE:
+    if has_aberrations and scene.get("name") != "telescope":
         raise ValueError(
             f"telescope = {name}: brings its own aberrations, but scene = {scene.get('name')} has "
             "others; choose a dataset made for it (dataset=_telescope, or one that starts from it)"
         )
-    if not has_aberrations and scene.get("name") == TELESCOPE_SCENE:
+    if not has_aberrations and scene.get("name") == "telescope":
         raise ValueError(
-            f"telescope = {name}: has no aberrations; scene = {TELESCOPE_SCENE} needs a telescope "
+            f"telescope = {name}: has no aberrations; scene = telescope needs a telescope "
             "with the keys field_edge_deg and aberrations, such as example_zernike"
         )
 
 
-def _without_nulls(group: Any, values: Mapping[str, Any]) -> Any:
-    """Return a group with values in place of those keys that are null."""
-    if not isinstance(group, Mapping):
-        return group
-    return {
-        key: values.get(key) if value is None and key in values else value
-        for key, value in group.items()
-    }
-
-
-def _derived(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that replace null in the keys of a group."""
-    telescope = tree.get("telescope")
-    if not isinstance(telescope, Mapping):
-        return {}
-    if name == "grid":
-        return {"edge_deg": telescope.get("field_edge_deg")}
-    if name in ("framing", "stars"):
-        return {"search_px": _search_px(tree[name], _pixel(telescope))}
-    return {}
-
-
-def _search_px(group: object, pixel: float | None) -> int:
+def _search_px(distance: object, telescope: Mapping[str, Any]) -> int:
     """Return a search distance in pixels from one in λ/D, between 4 and 256.
 
-    `pixel` is its width in λ/D. For settings that the next check refuses, any number is right.
+    `SEARCH` stands for none; for settings that the next check refuses, any number is right.
     """
-    distance = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
     if isinstance(distance, bool) or not isinstance(distance, int | float) or not distance > 0:
         distance = SEARCH
-    return int(np.clip(np.ceil(distance / (pixel or 1.0)), 4, 256))
-
-
-def _pixel(telescope: Mapping[str, Any]) -> float | None:
-    """Return the pixel width in λ/D; None for a telescope that the next check refuses."""
+    # Width of a pixel in λ/D, from the aperture, the wavelength and the pixel scale.
     keys = [key for key in Telescope.model_fields if key in telescope]
     try:
-        return Telescope.model_validate({key: telescope[key] for key in keys}).pixel
+        pixel = Telescope.model_validate({key: telescope[key] for key in keys}).pixel
     except ValidationError:
-        return None
+        pixel = 1.0
+    return int(np.clip(np.ceil(distance / (pixel or 1.0)), 4, 256))
 
 
 @cache

@@ -1,4 +1,8 @@
-"""Configuration of a sweep (`config/sweep/*.yaml`): what is varied, and how the best is chosen."""
+"""Configuration of a sweep (`config/sweep/*.yaml`): what is varied, and how the best is chosen.
+
+In goes a file such as `config/sweep/dae_width.yaml`; out comes a checked `Sweep`. Its points are
+made from it by `psfdae_paper.sweeps.points`.
+"""
 
 from __future__ import annotations
 
@@ -22,28 +26,19 @@ AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
 
-def models() -> tuple[str, ...]:
-    """Return the models that a sweep may train: stored methods, and networks of scene 3."""
-    return (*(method_class.name for method_class in registered() if method_class.storage), *SWEPT)
-
-
 def _trainable(name: str) -> str:
-    """Return the name of a model unchanged; ValueError if a sweep cannot train it."""
-    if name not in models():
-        raise ValueError(f"{name!r} is not one of {', '.join(models())}")
+    """Return the name of a model unchanged; ValueError if a sweep cannot train it.
+
+    Sweeps train methods that store a model, and the networks of scene 3.
+    """
+    stored = (method_class.name for method_class in registered() if method_class.storage)
+    models = (*stored, *SWEPT)
+    if name not in models:
+        raise ValueError(f"{name!r} is not one of {', '.join(models)}")
     return name
 
 
 Model = Annotated[str, AfterValidator(_trainable)]
-
-METRICS = ("validation_mse", "validation_ssim")
-"""Metrics of methods: errors of images of validation stars."""
-
-NETWORK_METRICS = ("validation_mae",)
-"""Metric of scene 3's networks: error of states of misalignment."""
-
-RESERVED = ("point", "status", "reason", "epochs", "attempt", "best")
-"""Columns of the summary that no axis may be called."""
 
 
 class Axis(Group):
@@ -79,6 +74,7 @@ class Axis(Group):
     @model_validator(mode="after")
     def _check_form(self) -> Axis:
         """Require exactly one of the three forms, with its own keys only."""
+        # Both ends of a range count as one form.
         end_count = (self.low is not None) + (self.high is not None)
         form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
         if form_count != 1 or end_count == 1:
@@ -109,7 +105,11 @@ class Axis(Group):
         return self.low, self.high
 
     def changes(self, name: str, value: Value) -> dict[str, Value]:
-        """Return the configuration keys and their values at a value of the axis `name`."""
+        """Return the configuration keys and their values at a value of the axis `name`.
+
+        A choice brings its own keys; any other value goes to `keys`, or to the key that the axis
+        is named by, as a list of equal numbers if `repeat` is given.
+        """
         if self.choices is not None:
             return dict(self.choices[str(value)])
         if self.repeat is not None:
@@ -169,7 +169,10 @@ class Sweep(Group):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
         if self.dataset == NAME:
             raise ValueError(f"dataset = {NAME}: scene 3 has no stars that methods restore")
-        metrics = NETWORK_METRICS if self.dataset is None else METRICS
+        # Networks of scene 3 err in states of misalignment, methods in images of stars.
+        metrics = ["validation_mae"]
+        if self.dataset is not None:
+            metrics = ["validation_mse", "validation_ssim"]
         if self.metric not in metrics:
             raise ValueError(
                 f"metric = {self.metric}: model {self.model} has {' or '.join(metrics)}"
@@ -179,8 +182,9 @@ class Sweep(Group):
     @model_validator(mode="after")
     def _check_axes(self) -> Sweep:
         """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
+        columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
-            if name in RESERVED or name.startswith(("validation_", "test_")):
+            if name in columns or name.startswith(("validation_", "test_")):
                 raise ValueError(f"space.{name}: is a column of the summary; choose another name")
             if self.kind == "grid" and not axis.options:
                 raise ValueError(f"space.{name}: a grid needs values or choices, not a range")
@@ -191,9 +195,9 @@ class Sweep(Group):
     @model_validator(mode="after")
     def _check_keys(self) -> Sweep:
         """Refuse keys that the model does not read, and keys that are set by two axes."""
+        # Keys of an axis: those of all its choices; a range has the same keys at every value.
         keys = list(self.overrides)
         for name, axis in self.space.items():
-            # A range has the same keys at every value.
             options = axis.options or [0]
             keys += {key for option in options for key in axis.changes(name, option)}
         for key in keys:

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.configuration.aligners import ALIGNERS
+from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.alignment_tables import PARAMETERS
-from psfdae_paper.evaluation.curves import readable_log_axis
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
@@ -137,7 +137,7 @@ def errors_against_size(
         axes.set_xlabel("RMS of the state's four numbers / range")
         axes.set_yscale("log")
         axes.grid(True, which="both")
-    readable_log_axis(panels[0])
+    drawing.readable_log_axis(panels[0])
     panels[0].set_ylabel("mean absolute error / range")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from psfdae.metrics import clustered_mean, clustered_ratio, seed_stderr
-
-if TYPE_CHECKING:
-    import pandas as pd
+from psfdae_paper.evaluation.measure import CELL
 
 SIGNIFICANT = 3.0
 """Standard errors beyond which a difference is called significant; 1 of 370 is chance."""
@@ -30,9 +28,6 @@ Scatter = Mapping[tuple[str, str, str], float]
 FITTED = ["dataset", "reference", "method"]
 """Columns that identify a fit."""
 
-CELL = ["dataset", "split", "reference", "noise_level"]
-"""Columns that identify a column of the paper's tables: methods are compared inside it."""
-
 PAPER_ORDER = ("dae", "pca_som", "noisy")
 """The paper's methods by ascending error, as it concludes."""
 
@@ -46,8 +41,6 @@ def seed_scatter() -> Scatter:
 
     Fits without a row were not measured.
     """
-    import pandas as pd
-
     with resources.files(__package__).joinpath("seed_scatter.csv").open() as file:
         return dict(pd.read_csv(file, index_col=FITTED)["scatter"])
 
@@ -133,8 +126,6 @@ def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) 
         errors, or of that of the stars alone), verdict: "better", "worse" (the second) or
         "same", for methods and levels that both have.
     """
-    import pandas as pd
-
     paired = same_noisy_stars(first, second)
     rows = []
     keys = ["method", "noise_level"]
@@ -228,8 +219,6 @@ def compare_tables(
         `first` and in the `second` table, and if two methods are `exchanged`, by more than the
         scatter in both.
     """
-    import pandas as pd
-
     tables = [with_seed_stderr(table, scatter) for table in (first, second)]
     keys = [*CELL, "method", "metric"]
     columns = [table[[*keys, "value", "stderr", "seed_stderr"]] for table in tables]
@@ -260,8 +249,6 @@ def _mse_signs(table: pd.DataFrame) -> pd.DataFrame:
     −1 if the MSE of the pair's first method is smaller, 1 if larger, 0 if the difference is below
     `SIGNIFICANT` times its scatter between seeds.
     """
-    import pandas as pd
-
     by_method = table[table.metric == "mse"].pivot(index=CELL, columns="method")
     columns = pd.MultiIndex.from_product([["value", "seed_stderr"], PAPER_ORDER])
     by_method = by_method.reindex(columns=columns)
@@ -298,8 +285,6 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
         `HELD_OUT_COLUMNS`: mean errors, their ratio (held out over random) with its
         standard error clustered by field, numbers of stars and of fields.
     """
-    import pandas as pd
-
     rows = []
     keys = HELD_OUT_COLUMNS[:4]
     for key, errors in stars.groupby(keys, sort=False):

@@ -1,5 +1,8 @@
 """Stages of scene 3: quadratic model of the wavefront, states with their stamps, key figures.
 
+In: the configuration of telescope, prescription and states. Out: the products "alignment_model"
+and "alignment_states", which all other stages of the scene read, and a table of key figures.
+
 Products have noise-free stamps; noise is drawn by the stages that need it. The stamps of the grid
 are the training set of the networks; with other noise they are one of the two test sets. The other
 one is the set of uniform states.
@@ -12,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require
 from psfdae.files import Column, Product, read_product, write_csv, write_product
@@ -45,7 +49,14 @@ def model(
     config: Config,
     out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
 ) -> None:
-    """Fit the quadratic model to few ray-traced states, verify it on the grid."""
+    """Fit the quadratic model to few ray-traced states, verify it on the grid.
+
+    Rays through the misaligned telescope give the Zernike coefficients at all fields. They are
+    fitted as quadratic functions of the four numbers of a state: 25 states determine the model,
+    and all states of the grid test it. A model that is off by more than
+    alignment.model_tolerance_waves anywhere is refused.
+    """
+    # Few small arrays: threads would not pay.
     limit_threads(1)
     # 25 states of a central composite design determine all terms of the model.
     tracer, design = _tracer(config), design_states()
@@ -53,6 +64,7 @@ def model(
     # The grid, with other states, tests it: no wavefront may differ by more than the tolerance.
     grid = grid_states(config.alignment.grid_levels)
     residual = verify(quadratic, grid, tracer(grid), config.alignment.model_tolerance_waves)
+    # The residual goes into the product, too: it is the model's error.
     columns = {
         "coefficients": Column(
             quadratic.coefficients,
@@ -83,6 +95,7 @@ def read_model(
     ProductError
         If the product is missing or damaged, or does not agree.
     """
+    # The wavefront of a state depends on the telescope's optics and on the range of the states.
     product = read_product(path, "alignment_model", ("coefficients",))
     require(path, product.config, WAVEFRONT_KEYS, expected_config, owner)
     return QuadraticModel(product["coefficients"])
@@ -95,7 +108,18 @@ def read_states(
 ) -> Product:
     """Read the columns `states` and `stamps` of a product of `alignment states`.
 
-    Parameters and errors are those of `read_model`; by default nothing has to agree.
+    Parameters
+    ----------
+    path : Path
+    expected_config : mapping or Group, optional
+        Configuration with which telescope, range and stamps of the product must agree.
+    owner : object
+        Name of that configuration's file, for error messages.
+
+    Raises
+    ------
+    ProductError
+        If the product is missing or damaged, or does not agree.
     """
     product = read_product(path, "alignment_states", ("states", "stamps"))
     if expected_config is not None:
@@ -113,7 +137,12 @@ def states(
         "Product of `alignment model`: take wavefronts from it instead of tracing rays.",
     ] = None,
 ) -> None:
-    """Simulate the noise-free stamps of a set of states."""
+    """Simulate the noise-free stamps of a set of states.
+
+    The set is the grid of the paper, the uniform states of the independent test, or the many
+    uniform states that networks are trained on. Each state has a stamp at every field, centred on
+    its centroid, of light 1.
+    """
     limit_threads(1)  # optics.threads batches run in parallel
     alignment = config.alignment
     quadratic = None if model is None else read_model(model, config)
@@ -135,13 +164,20 @@ def states(
         ),
         "zernikes": Column(zernikes, "wave", "[state, field, Zernike] lead of the wavefront"),
         "energy": Column(energy, "1", "[state, field] light inside the stamp"),
+        # Axes of the arrays: fields, Zernike terms, units of the state.
         **_geometry(config),
     }
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
 def _tracer(config: Config) -> StateTracer:
-    """Return the ray trace of the configured telescope."""
+    """Return the ray trace of the configured telescope.
+
+    Raises
+    ------
+    MissingExtraError
+        If batoid is not installed.
+    """
     return StateTracer(config.telescope, config.prescription, config.alignment)
 
 
@@ -169,9 +205,12 @@ def telescope(
     uniform: Annotated[File, "Product of `alignment states --set uniform`."],
     out: Annotated[File, "CSV with key figures."],
 ) -> None:
-    """Tabulate key figures of telescope, model and stamps."""
-    import pandas as pd
+    """Tabulate key figures of telescope, model and stamps.
 
+    They say how well the model reproduces rays, how far the telescope is out of focus, how well
+    images separate the four numbers of a state, and how much light the stamps hold.
+    """
+    # The model, and the two sets that serve as tests.
     quadratic = read_product(model, "alignment_model")
     sets = {
         name: read_product(path, "alignment_states", ("energy", "stamps"))

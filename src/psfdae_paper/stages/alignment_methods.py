@@ -1,5 +1,9 @@
 """Stages of scene 3 that train networks, estimate the states of test sets and bound their errors.
 
+In: products "alignment_states" and "alignment_model". Out: a folder for each network, and the
+products "alignment_estimates" (learned methods), "alignment_fit" (maximum likelihood) and
+"alignment_bound" (Cramér–Rao), which `psfdae_paper.stages.alignment_results` tabulates and draws.
+
 The networks differ in their training set. The paper's CNN is trained on noise-free stamps of the
 grid (it is used as "original" and as "dae"). Those that are not in the paper are trained on noisy
 stamps of many states, or on the DAE's output for such stamps. The noise of a test set depends on
@@ -18,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require, require_origin, write_origin
 from psfdae.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
@@ -74,7 +79,11 @@ def train_dae(
     checkpoint: Checkpoint,
     out: Trained,
 ) -> None:
-    """Train the DAE on the stamps of the grid."""
+    """Train the DAE on the stamps of the grid.
+
+    It learns to restore single stamps with noise of all levels to those without, and is applied
+    to the stamps of a state before a network estimates the state.
+    """
     grid_product = read_states(grid)
     large_product = read_states(train, grid_product.config, grid)
     # The DAE restores stamps one by one, whatever their state and field.
@@ -97,7 +106,13 @@ def train_dae(
 
 
 def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
-    """Return the configuration groups of the training of one network, or of all."""
+    """Return the configuration groups of the training of one network, or of all.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the network; empty for all.
+    """
     kinds = [kind] if kind else TRAINED
     noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
     dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
@@ -119,7 +134,12 @@ def train_network(
         DaeFolder | None, f"Folder of `alignment train-dae`. For {DENOISED} only."
     ] = None,
 ) -> None:
-    """Train a network that estimates states of misalignment."""
+    """Train a network that estimates states of misalignment.
+
+    Its input are the stamps of all fields of a state, its output the four numbers of the state in
+    units of the range. The folder receives weights, the settings that made them, and the history
+    of the loss.
+    """
     from psfdae.networks.training import fingerprint, progress, train
     from psfdae.networks.weights import save_weights
     from psfdae_paper.alignment.networks import NetworkTraining, TrainingStates, training_of
@@ -139,7 +159,7 @@ def train_network(
         data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
         product.arrays.clear()  # only the product's configuration is still needed
     limit_threads(settings.threads)
-    # Settings that describe the network to those who load it.
+    # Settings that describe the network to those who load it; `network_predictor` reads them.
     fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
     described |= {"network": settings.network, "mirrors": settings.mirrors}
@@ -153,6 +173,7 @@ def train_network(
     with progress(settings.epochs) as report:
         identity = fingerprint(described | deciding(config), data.stamps)
         training = train(begin, checkpoint, identity, report)
+    # Weights first: a folder with a configuration is complete.
     save_weights(out / WEIGHTS, training.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(training.history))
@@ -178,6 +199,7 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
         States without noise, with stamps of shape (draws, n, F, d, d).
     """
     assert data.noise is not None
+    # A stream of the network's name: all draws of one network are different.
     rng = stream(config.seed, "cnn", "noise", kind)
     count = getattr(config, f"train_{kind}").noise_draws
     # Each state has one noise level, which is the same in all draws.
@@ -193,7 +215,13 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
 
 
 def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
-    """Apply a trained DAE to stamps (n, F, d, d); it neither clips nor renormalises them."""
+    """Apply a trained DAE to stamps (n, F, d, d); it neither clips nor renormalises them.
+
+    Raises
+    ------
+    ProductError
+        If the folder `dae` has no network, or a damaged one.
+    """
     network = Dae.load(dae, evaluation=config.evaluation)
     return network.predict(_single_stamps(stamps)).reshape(stamps.shape)
 
@@ -206,7 +234,19 @@ def _single_stamps(stamps: np.ndarray) -> np.ndarray:
 def noisy_test_states(
     config: Config, stamps: np.ndarray, test_set: str, level: float
 ) -> np.ndarray:
-    """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0."""
+    """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0.
+
+    The noise depends on the seed, the name of the set and λ alone: all methods get the same stamps.
+
+    Parameters
+    ----------
+    config : Config
+    stamps : ndarray, shape (n, F, d, d)
+        Noise-free stamps.
+    test_set : str
+    level : float
+        Noise level λ.
+    """
     if level == 0.0:
         return stamps
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
@@ -270,7 +310,10 @@ def estimate(
     out: Annotated[File, "HDF5 product with the estimates of all learned methods."],
     times: Annotated[File, "CSV that receives the run times."],
 ) -> None:
-    """Estimate the states of a test set with every learned method."""
+    """Estimate the states of a test set with every learned method.
+
+    Each method gets the same noisy stamps at every noise level, and without noise.
+    """
     limit_threads(config.evaluation.threads)
     product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
@@ -295,20 +338,26 @@ def estimate(
         "levels": Column(np.array(levels), "1", "noise levels λ"),
         "estimates": Column(estimates, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
     }
+    # The test set is not part of the configuration, but tells products apart.
     described = {**config.model_dump(), "test_set": test_set}
     write_product(out, "alignment_estimates", columns, described)
     _write_times(times, rows)
 
 
 def _names(methods: list[Aligner]) -> str:
-    """Return the names of methods in the order of an array's axis."""
+    """Return the names of methods in the order of an array's axis, for its description."""
     return ", ".join(method.name for method in methods)
 
 
 def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]]) -> None:
-    """Write the table of run times."""
-    import pandas as pd
+    """Write the table of run times.
 
+    Parameters
+    ----------
+    path : Path
+    rows : sequence of (str, float, str, float, int)
+        Test set, noise level, name of the method, seconds and number of states.
+    """
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
     table = pd.DataFrame(rows, columns=columns)
     write_csv(path, table, digits=6)
@@ -330,15 +379,22 @@ def fit(
     out: Annotated[File, "HDF5 product with the fits."],
     times: Annotated[File, "CSV that receives the run time."],
 ) -> None:
-    """Fit the states of a test set by maximum likelihood."""
+    """Fit the states of a test set by maximum likelihood.
+
+    A fit begins at a network's estimate, and again at the twin of the state that it has reached,
+    which has nearly the same stamps in focus. Flux and place of the stars are known; uniform
+    states are fitted once more with both unknown.
+    """
     from psfdae_paper.alignment.emulator import StampEmulator
     from psfdae_paper.alignment.likelihood import Likelihood, StateOptics, refit_twins
 
     limit_threads(1)
+    # States to fit, states for the emulator, the model of the wavefront, and the network.
     product, large_product = read_states(states, config), read_states(train, config)
     wavefronts = read_model(model, product.config, states)
     predict = network_predictor(network, product, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
+    # Columns of the fits, with an entry for each method.
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
     rows, methods = [], methods_of_set(FITTED, test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
@@ -402,7 +458,11 @@ def bound(
     model: ModelFile,
     out: Annotated[File, "HDF5 product with Cramér-Rao bounds."],
 ) -> None:
-    """Bound the errors of any unbiased estimate."""
+    """Bound the errors of any unbiased estimate.
+
+    The Cramér-Rao bound is the inverse of the Fisher information that the photons of all stamps
+    of a state hold about its four numbers, with flux and place of the stars known and unknown.
+    """
     from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
 
     limit_threads(1)

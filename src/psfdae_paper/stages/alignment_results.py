@@ -1,13 +1,19 @@
-"""Stages of scene 3 that turn estimates, fits and bounds into tables and figures."""
+"""Stages of scene 3 that turn estimates, fits and bounds into tables and figures.
+
+In: the products of `psfdae_paper.stages.alignment_methods`. They are read in one place,
+`read_results`, which refuses products of different telescopes, noise or states. Out: tables of
+errors and of their correlations, the paper's beside them, run times, and figures.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict
+from typing import Annotated, NamedTuple, TypedDict
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require, require_origin
 from psfdae.figures import write_png
@@ -36,11 +42,17 @@ from psfdae_paper.configuration.aligners import (
 from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation import alignment_figures, alignment_tables
+from psfdae_paper.evaluation.alignment_figures import (
+    correlation_matrices,
+    errors_against_size,
+    predicted_against_true,
+    size_of,
+    twin_ambiguity,
+)
+from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.alignment import StatesFile, read_states
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]
@@ -138,7 +150,13 @@ def products_of_one_test(
 
 
 def _require_states(product: Product, reference: Product) -> None:
-    """Raise ProductError if two products of one test set have different true states."""
+    """Refuse two products of one test set that have different true states.
+
+    Raises
+    ------
+    ProductError
+        With the number of states, or the first state that differs.
+    """
     states, expected = product["states"], reference["states"]
     if np.array_equal(states, expected):
         return
@@ -161,27 +179,30 @@ def tables(
     errors: Annotated[File, "CSV that receives the errors."],
     correlation: Annotated[File, "CSV that receives their correlations."],
 ) -> None:
-    """Tabulate errors and their correlations."""
-    import pandas as pd
+    """Tabulate errors and their correlations.
 
-    from psfdae_paper.evaluation import alignment_tables as rows
-
+    A row of the errors has the mean absolute error, the bias and the variance of a method in one
+    of the four numbers of a state, at one noise level; rows of the Cramér-Rao bound have expected
+    values.
+    """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
         bound_config = read_product(path, "alignment_bound", ()).config
         require(path, bound_config, STAMP_KEYS, product.config, states)
     unit = product["unit"]
     # Measured errors, and those that unbiased estimates at the bound would have.
-    rows_by_table: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
+    rows_by_table: dict[Path, list[alignment_tables.Row]] = {errors: [], correlation: []}
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         if is_bound:
-            rows_by_table[errors] += rows.bound_rows(key, values, unit)
+            rows_by_table[errors] += alignment_tables.bound_rows(key, values, unit)
             if key["method"] == "cramer_rao":
-                rows_by_table[correlation] += rows.predicted_correlations(key, values)
+                rows_by_table[correlation] += alignment_tables.predicted_correlations(key, values)
         else:
-            rows_by_table[errors] += rows.error_rows(key, values - truth, unit)
+            rows_by_table[errors] += alignment_tables.error_rows(key, values - truth, unit)
             if key["method"] != "constant":
-                rows_by_table[correlation] += rows.measured_correlations(key, values - truth)
+                rows_by_table[correlation] += alignment_tables.measured_correlations(
+                    key, values - truth
+                )
     # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
@@ -199,14 +220,15 @@ def paper_tables(
     correlation: ErrorTable,
     out: Annotated[Folder, "Folder for CSV and Markdown files."],
 ) -> None:
-    """Set measured errors beside the paper's tables."""
-    from psfdae_paper.evaluation import alignment_tables as rows
-    from psfdae_paper.evaluation.paper import published
+    """Set measured errors beside the paper's tables.
+
+    One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
+    """
 
     def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
-        text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
+        text = alignment_tables.as_markdown(table, f"{title}. {alignment_tables.TEST_SETS}", digits)
         write_text(path.with_suffix(".md"), text)
 
     # One table of errors for each of the paper's noise levels.
@@ -216,8 +238,8 @@ def paper_tables(
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
-        write(f"{level:g}", rows.paper_errors(measured, level), title, digits)
-    table = rows.paper_correlations(read_table(correlation))
+        write(f"{level:g}", alignment_tables.paper_errors(measured, level), title, digits)
+    table = alignment_tables.paper_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
 
@@ -229,9 +251,10 @@ def time_table(
     ],
     out: Annotated[File, "CSV with the cost of an estimate and of the trainings."],
 ) -> None:
-    """Tabulate the run times of the methods."""
-    import pandas as pd
+    """Tabulate the run times of the methods.
 
+    A row has the seconds of an estimate, and those of all trainings that the method needs.
+    """
     # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
@@ -251,9 +274,10 @@ def time_table(
 
 @command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
-    """Draw the nine stamps of a few states before and after the DAE."""
-    from psfdae_paper.evaluation.alignment_figures import stamp_rows
+    """Draw the nine stamps of a few states before and after the DAE.
 
+    The first two states of the set are shown, without noise and at every noise level.
+    """
     product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
@@ -265,7 +289,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
         "decentre ({:+.2f}, {:+.2f}), tilt ({:+.2f}, {:+.2f}) of the range".format(*state)
         for state in product["states"][:2]
     ]
-    write_png(stamp_rows(rows, titles), out)
+    write_png(alignment_figures.stamp_rows(rows, titles), out)
 
 
 @command("alignment figure predicted")
@@ -276,9 +300,8 @@ def predicted(
     ],
     out: Png,
 ) -> None:
-    """Draw estimates against the truth."""
-    from psfdae_paper.evaluation.alignment_figures import predicted_against_true
-
+    """Draw estimates against the truth, for each method, number of a state and noise level."""
+    # Estimated states of each method and noise level.
     by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
@@ -288,9 +311,10 @@ def predicted(
 
 @command("alignment figure errors")
 def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
-    """Draw errors against the size of the misalignment."""
-    from psfdae_paper.evaluation.alignment_figures import errors_against_size, size_of
+    """Draw errors against the size of the misalignment, with the Cramér-Rao bound.
 
+    The error of a state is the mean of the absolute errors of its four numbers.
+    """
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
@@ -307,24 +331,28 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     choice=CHOICE,
 )
 def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
-    """Draw a state and its twin, in focus and with the CCD's defocus."""
+    """Draw a state and its twin, in focus and with the CCD's defocus.
+
+    The curve is the difference χ² of the stamps of multiples of a state from those of the state:
+    at −1, its twin, it is small in focus.
+    """
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
-    import pandas as pd
-
-    from psfdae_paper.evaluation.alignment_figures import twin_ambiguity
 
     limit_threads(1)
     # In focus, the stamps of a state and of its twin hardly differ; a defocus tells them apart.
     multiples = np.linspace(-1.5, 1.5, 61)
-    rows, stamp_rows, state = [], [], np.empty(0)
+    rows, stamp_groups, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
         state, line_stamps = _stamps_of_multiples(config, defocus, multiples)
         # The multiple 1 is the state, −1 its twin.
         state_stamps = line_stamps[np.argmin(np.abs(multiples - 1.0))].astype(np.float64)
         twin_stamps = line_stamps[np.argmin(np.abs(multiples + 1.0))]
         focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
-        stamp_rows += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
+        stamp_groups += [
+            (f"state\n{focus}", state_stamps),
+            (f"twin\n{focus}", twin_stamps),
+        ]
         # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
         for level in config.noise.levels:
             variance = noise_model(config).variance(state_stamps, level)
@@ -335,7 +363,7 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(twin_ambiguity(curves, stamp_rows, state), out)
+    write_png(twin_ambiguity(curves, stamp_groups, state), out)
 
 
 def _stamps_of_multiples(
@@ -350,6 +378,7 @@ def _stamps_of_multiples(
     stamps : ndarray, shape (len(multiples), F, d, d)
         Stamps of multiples of the state, with the CCD at a defocus of `defocus_m` metres.
     """
+    # The telescope with another defocus, its wavefront, and its stamps.
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
@@ -361,20 +390,21 @@ def _stamps_of_multiples(
 
 @command("alignment figure correlation")
 def correlation(correlation: ErrorTable, out: Png) -> None:
-    """Draw measured and predicted correlations of errors beside the paper's."""
-    from psfdae_paper.evaluation.alignment_figures import correlation_matrices
-    from psfdae_paper.evaluation.alignment_tables import PARAMETERS
-    from psfdae_paper.evaluation.paper import published
+    """Draw measured and predicted correlations of errors beside the paper's.
+
+    A panel is the matrix of the correlations between the four numbers of a state.
+    """
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
         matrix = np.full((4, 4), np.nan)
         pairs = rows[rows.method == method.name]
         for pair, value in zip(pairs.pair, pairs.correlation, strict=True):
-            a, b = (PARAMETERS.index(name) for name in pair.split("-"))
+            a, b = (alignment_tables.PARAMETERS.index(name) for name in pair.split("-"))
             matrix[a, b] = matrix[b, a] = value
         return f"{source}{method.short}, λ = {level:g}", matrix
 
+    # Correlations of uniform states with noise, and the paper's; both as rows of pairs.
     measured, paper = read_table(correlation), published("correlation")
     measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
     measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)

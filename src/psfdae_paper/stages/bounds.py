@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.files import (
@@ -21,30 +22,19 @@ from psfdae.files import (
     write_product,
 )
 from psfdae.methods import method
-from psfdae.metrics import quality, summarised
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
+from psfdae_paper.bounds import tables
 from psfdae_paper.bounds.estimates import SPLIT, bounded_stars, fresh_stars
 from psfdae_paper.bounds.floor import Comparison
 from psfdae_paper.bounds.posterior import Bank, jittered_templates
-from psfdae_paper.bounds.tables import (
-    COLUMNS,
-    GROWTH_COLUMNS,
-    PAPER_COLUMNS,
-    POSTERIOR_MEANS,
-    Tables,
-    add_exact,
-    add_floor,
-    add_means,
-    compare_methods,
-    paper_verdict,
-)
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.comparison import CELL
+from psfdae_paper.evaluation.measure import CELL, MeasuredStars, read_tables
+from psfdae_paper.evaluation.paper import paper_rows, published
 
 if TYPE_CHECKING:
     from psfdae_paper.methods.wavefront import Wavefront
@@ -85,21 +75,19 @@ def bounds(
     ] = None,
 ) -> None:
     """Bound the error that any estimator can reach on the test stars."""
-    import pandas as pd
-
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
     framed = read_product(templates, "templates", ("psf",))
     require(stars, product.config, STARS, config)
     require(templates, framed.config, STATIC, config)
     static = jittered_templates(framed["psf"], config.framing.jitter_px)
-    tables = Tables(dataset, bounded_stars(config, product))
+    bound = tables.Tables(dataset, bounded_stars(config, product))
     if config.stars.aberration_fraction == 0:
-        add_exact(config, static, tables)
+        tables.add_exact(config, static, bound)
     elif bank is None:
         raise ProductError(f"{stars}: the stars have random aberrations, a bank is needed")
     else:
-        add_floor(config, product, tables)
+        tables.add_floor(config, product, bound)
         bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
         require(bank, bank_product.config, STARS, product.config, stars)
         settings = bank_product.config
@@ -113,10 +101,10 @@ def bounds(
                 "a star for every field"
             )
         small_bank = large_bank.take(np.arange(count))
-        add_means(config, small_bank, large_bank, product, static, tables)
-    write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
-    write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
-    write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
+        tables.add_means(config, small_bank, large_bank, product, static, bound)
+    write_csv(out, pd.DataFrame(bound.summary, columns=tables.COLUMNS))
+    write_csv(growth, pd.DataFrame(bound.growth, columns=tables.GROWTH_COLUMNS))
+    write_parquet(per_star, pd.concat(bound.per_star, ignore_index=True))
 
 
 @command("optics", reads=(*SIMULATION, "noise", "parts", "bounds", "evaluation"))
@@ -129,8 +117,6 @@ def optics(
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
     """Measure the methods that are given the telescope, on the test stars that are bounded."""
-    import pandas as pd
-
     limit_threads(1)
     product = read_product(stars, "stars")
     require(stars, product.config, STARS, config)
@@ -151,12 +137,12 @@ def optics(
             for reference, estimator in estimators.items():
                 estimate = estimator.estimate_from_posterior(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
-                metrics = quality(estimate, truth, config.evaluation.data_range)
+                stars_of_truth = MeasuredStars(bounded.star, bounded.field, position, truth)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
                 row |= {"reference": reference, "method": name, "noise_level": level}
-                summary += summarised(row, metrics, bounded.field)
-                star_columns = {"star": bounded.star, "field": bounded.field}
-                stars_table.append(pd.DataFrame({**row, **star_columns, **metrics}))
+                rows, table = stars_of_truth.errors(row, estimate, config.evaluation.data_range)
+                summary += rows
+                stars_table.append(table)
             print(f"{name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
@@ -167,15 +153,7 @@ def collect_bounds(
     out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
 ) -> None:
     """Join the tables of several datasets' bounds."""
-    import pandas as pd
-
-    frames = [read_table(path) for path in parts]
-    for path, frame in zip(parts, frames, strict=True):
-        if list(frame.columns) != list(frames[0].columns):
-            raise ProductError(f"{path}: columns {list(frame.columns)}, unlike {parts[0]}")
-    # Empty tables would change the types of columns.
-    nonempty = [frame for frame in frames if len(frame)] or frames[:1]
-    write_csv(out, pd.concat(nonempty, ignore_index=True))
+    write_csv(out, read_tables(parts))
 
 
 @command("efficiency")
@@ -198,11 +176,9 @@ def efficiency(
     posterior mean is not tight. Stars without a posterior mean are left out on both sides; both
     are empty, too, where these are more than 1 %.
     """
-    import pandas as pd
-
     # Keys of the posterior means that are tight.
-    limits = pd.concat([read_table(path) for path in bounds], ignore_index=True)
-    is_mean_mse = limits.method.isin(POSTERIOR_MEANS) & (limits.metric == "mse")
+    limits = read_tables(bounds)
+    is_mean_mse = limits.method.isin(tables.POSTERIOR_MEANS) & (limits.metric == "mse")
     tight_rows = limits[is_mean_mse & (limits.tight == "yes")]
     levels = map("{:.6g}".format, tight_rows.noise_level)
     tight = {*zip(tight_rows.dataset, tight_rows.reference, tight_rows.method, levels, strict=True)}
@@ -211,15 +187,15 @@ def efficiency(
     bound_stars = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     columns = [*CELL, "method", "star", "field", "mse"]
     methods = pd.concat([pd.read_parquet(path, columns=columns) for path in parts])
-    means = bound_stars[bound_stars.method.isin(POSTERIOR_MEANS)][columns]
+    means = bound_stars[bound_stars.method.isin(tables.POSTERIOR_MEANS)][columns]
     methods = pd.concat([methods, means], ignore_index=True)
     by_cell = dict(list(methods.groupby(CELL, sort=False)))
     rows: list[dict[str, object]] = []
     for key, bounded in bound_stars.groupby(CELL, sort=False):
         errors = by_cell[key]
-        if errors.method.isin(POSTERIOR_MEANS).all():
+        if errors.method.isin(tables.POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
-        rows += compare_methods(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
+        rows += tables.compare_methods(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
     write_csv(out, pd.DataFrame(rows).drop(columns="split"))
 
 
@@ -236,8 +212,6 @@ def paper_rows_table(
     is below a tight bound as in the stage efficiency. A bound that is not tight is above the least
     possible error: an error below it proves nothing.
     """
-    from psfdae_paper.evaluation.paper import paper_rows, published
-
     key = ["dataset", "noise_level"]
     paper = published("psf").query("metric == 'mse'").replace({"method": paper_rows()})
     measured = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
@@ -253,5 +227,5 @@ def paper_rows_table(
     values = zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
     comparisons = [Comparison(*row) for row in values]
     table["paper_over_bound"] = [1 / comparison.efficiency for comparison in comparisons]
-    table["verdict"] = list(map(paper_verdict, comparisons, table.tight == "yes"))
-    write_csv(out, table[PAPER_COLUMNS])
+    table["verdict"] = list(map(tables.paper_verdict, comparisons, table.tight == "yes"))
+    write_csv(out, table[tables.PAPER_COLUMNS])

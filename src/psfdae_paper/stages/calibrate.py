@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import STATIC, require
 from psfdae.files import Product, read_product, write_csv
@@ -15,7 +16,6 @@ from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.options import File, Folder
-from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
@@ -29,6 +29,7 @@ from psfdae_paper.evaluation.calibration import (
     original_noise_rows,
     residuals_by_scale,
 )
+from psfdae_paper.evaluation.measure import read_tables
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
@@ -45,8 +46,6 @@ def scan(
     The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
     only on image structure and dynamic range.
     """
-    import pandas as pd
-
     limit_threads(1)  # batches run in parallel
     rows = [row for row in original_noise_rows() if row.dataset == dataset]
     r0_values = [float("nan")]
@@ -139,12 +138,10 @@ def calibrate(
     out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
 ) -> None:
     """Fit noise, dynamic range and pixel scales to the scans."""
-    import pandas as pd
-
     products = dict(stars)
     configured = _configured(products)
     limit_threads(config.evaluation.threads)
-    scan_table = pd.concat([read_table(path) for path in scans], ignore_index=True)
+    scan_table = read_tables(scans)
     columns = pd.DataFrame(
         [_column(row, products[row.dataset], config) for row in original_noise_rows()]
     )

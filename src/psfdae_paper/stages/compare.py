@@ -1,28 +1,32 @@
-"""Stage `compare`: differences between finished networks or tables of errors, as Markdown."""
+"""Stage `compare`: differences between finished networks or tables of errors, as Markdown.
+
+In go folders: of trained networks, of whole runs, or of the run of record. Out comes a text that
+says which settings differ, how the trainings went, and which errors differ by more than chance.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from tabulate import tabulate
 
 from psfdae.errors import Error
 from psfdae.files import ProductError, write_text
 from psfdae.method import CONFIG, HISTORY
 from psfdae.methods import method
 from psfdae.options import File, Folder
-from psfdae.reading import read_csv, read_table, read_yaml
+from psfdae.reading import read_csv, read_yaml
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
+from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation.comparison import NEGLIGIBLE, SIGNIFICANT
+from psfdae_paper.evaluation.measure import CELL, read_tables
 from psfdae_paper.tracking import flatten
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-TABLE = "tables/psf_metrics.csv"
-"""Mean errors of all methods, in a folder of results and in the run of record."""
 
 
 class ComparisonError(Error, ValueError):
@@ -86,8 +90,8 @@ def _networks(folder: Path) -> set[Path]:
 
 def _tables(folder: Path) -> list[Path]:
     """Return the tables of mean errors: one per evaluation of a run, or that of a record."""
-    joined = [path for path in [folder / TABLE] if path.is_file()]
-    return sorted(folder.glob("evaluation/*/*.csv")) or joined
+    evaluations = sorted(folder.glob("evaluation/*/*.csv"))
+    return evaluations or sorted(folder.glob("tables/psf_metrics.csv"))
 
 
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
@@ -98,8 +102,9 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     for folder, names in zip(folders, networks, strict=True):
         if not names:
             raise ComparisonError(
-                f"{folder}: no {CONFIG}, no METHOD/DATASET/RUN/{CONFIG} and no {TABLE} in it, "
-                "hence neither a trained network nor a folder of results"
+                f"{folder}: no {CONFIG}, no METHOD/DATASET/RUN/{CONFIG} and no "
+                "tables/psf_metrics.csv in it, hence neither a trained network nor a folder of "
+                "results"
             )
     common = sorted(set.intersection(*networks))
     if not common:
@@ -124,8 +129,6 @@ def errors_of(folder: Path) -> Path:
 
 def read_run(folder: Path, errors: Path) -> Run:
     """Read a network's settings, training history and errors per star; raises ProductError."""
-    import pandas as pd
-
     config = read_yaml(folder / CONFIG)
     rows = read_csv(folder / HISTORY, "epoch", "train_mse", "validation_mse", "seconds")
     try:
@@ -140,26 +143,27 @@ def read_run(folder: Path, errors: Path) -> Run:
 
 def describe(first: Run, second: Run) -> str:
     """Return the differences between two runs as Markdown."""
-    from psfdae_paper.evaluation.comparison import (
-        SIGNIFICANT,
-        compare_errors,
-        config_differences,
-        same_noisy_stars,
-        seed_scatter,
-        training_summary,
-    )
-
-    curves = [training_summary(run.history) for run in (first, second)]
-    errors = compare_errors(first.errors, second.errors, seed_scatter())
-    paired = same_noisy_stars(first.errors, second.errors)
+    errors = comparison.compare_errors(first.errors, second.errors, comparison.seed_scatter())
+    # Difference ± its standard error ± the scatter between seeds, unless that is NaN.
+    rows = []
+    row: Any
+    for row in errors.itertuples(index=False):
+        scatter = "" if np.isnan(row.seed_stderr) else f" ± {row.seed_stderr:.2g}"
+        difference = f"{row.difference:+.3g} ± {row.stderr:.2g}{scatter}"
+        rows.append((*row[:5], difference, row.sigmas, row.verdict))
+    headers = ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"]
+    curves = [comparison.training_summary(run.history) for run in (first, second)]
+    paired = comparison.same_noisy_stars(first.errors, second.errors)
+    pairing = "star by star on the same noisy images" if paired else "as independent samples"
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: their errors are not comparable.\n\n"
-    pairing = "star by star on the same noisy images" if paired else "as independent samples"
     return "\n\n".join(
         [
             f"# {first.name} (A) and {second.name} (B)",
             "## Settings that differ",
-            _table(config_differences(first.config, second.config), ["setting", "A", "B"]),
+            _table(
+                comparison.config_differences(first.config, second.config), ["setting", "A", "B"]
+            ),
             "## Training",
             _table([(key, curves[0][key], curves[1][key]) for key in curves[0]], ["", "A", "B"]),
             f"## Errors, {pairing}",
@@ -167,50 +171,22 @@ def describe(first: Run, second: Run) -> str:
             + "B − A ± standard error clustered by field ± scatter between seeds. B is better or "
             f"worse if the difference is {SIGNIFICANT:g} times both together. Where the scatter "
             "was not measured (`snakemake seeds`), it is missing, and the standard error decides.",
-            _table(
-                [
-                    (*row[:5], _difference(row), row.sigmas, row.verdict)
-                    for row in errors.itertuples(index=False)
-                ],
-                ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"],
-            ),
+            _table(rows, headers),
         ]
     )
 
 
-def _difference(row: Any) -> str:
-    """Return a difference with its standard error and, unless it is NaN, the seeds' scatter."""
-    seed_scatter = "" if row.seed_stderr != row.seed_stderr else f" ± {row.seed_stderr:.2g}"
-    return f"{row.difference:+.3g} ± {row.stderr:.2g}{seed_scatter}"
-
-
 def read_errors(folder: Path) -> pd.DataFrame:
     """Read the mean errors of all methods in a folder of results; raises ProductError."""
-    import pandas as pd
-
-    from psfdae_paper.evaluation.comparison import CELL
-
     columns = [*CELL, "method", "metric", "value", "stderr"]
-    tables = {path: read_table(path) for path in _tables(folder)}
-    for path, table in tables.items():
-        if missing := [name for name in columns if name not in table]:
-            raise ProductError(f"{path}: column {missing[0]!r} is missing")
-    return pd.concat([table[columns] for table in tables.values()], ignore_index=True)
+    return read_tables(_tables(folder), columns)
 
 
 def describe_tables(first: Path, second: Path) -> str:
     """Return as Markdown the mean errors of two runs that differ by more than seeds do."""
-    from psfdae_paper.evaluation.comparison import (
-        NEGLIGIBLE,
-        PAPER_ORDER,
-        SIGNIFICANT,
-        compare_tables,
-        seed_scatter,
-    )
-
     first_errors, second_errors = read_errors(first), read_errors(second)
-    rows, order = compare_tables(first_errors, second_errors, seed_scatter())
-    looks = [method(name).look for name in PAPER_ORDER]
+    rows, order = comparison.compare_tables(first_errors, second_errors, comparison.seed_scatter())
+    looks = [method(name).look for name in comparison.PAPER_ORDER]
     names = " < ".join(look.paper[1] for look in looks if look.paper)
     verdict_texts = {
         "equal": "are equal to the last digit",
@@ -258,8 +234,6 @@ def _cell(key: Sequence[Any]) -> str:
 
 def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
     """Return a Markdown table, or "None." if there are no rows."""
-    from tabulate import tabulate
-
     if not rows:
         return "None."
     return tabulate(rows, headers, tablefmt="github", floatfmt=".4g", disable_numparse=[0])

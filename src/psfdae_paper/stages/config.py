@@ -1,26 +1,29 @@
-"""Stages `config` and `alignment config`: the configuration, checked and resolved."""
+"""Stage `config`: the configuration, checked and resolved.
+
+In go overrides such as `dataset=alignment` or `preset=paper`; out comes the whole configuration, or
+the groups that one stage reads, as YAML on the terminal.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 import click
+import yaml
 
 from psfdae.cli import command_modules, stage
-from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import Groups, command
-
-Overrides = Annotated[tuple[str, ...], {"argument": True}]
-Only = Annotated[str | None, "Only the groups that this stage reads.", {"flag": "--stage"}]
+from psfdae_paper.configuration.compose import load, load_stage
 
 
 @command("config")
-def config(overrides: Overrides = (), only: Only = None) -> None:
+def config(
+    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
+    only: Annotated[
+        str | None, "Only the groups that this stage reads.", {"flag": "--stage"}
+    ] = None,
+) -> None:
     """Check the configuration and print it, resolved, as YAML."""
-    import yaml
-
-    from psfdae_paper.configuration.compose import load, load_stage
-
     if only is None:
         settings = load(overrides)
     else:
@@ -36,12 +39,6 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
         groups = Groups(reader.names({}), reader.choice)
         settings = load_stage(groups.names({}), groups.with_choice(overrides))
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
-
-
-@command("alignment config")
-def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
-    """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
-    config(overrides if only else Groups((), CHOICE).with_choice(overrides), only)
 
 
 def _key(name: str) -> str:

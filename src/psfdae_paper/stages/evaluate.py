@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import pandas as pd
+
 from psfdae import fits
-from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
+from psfdae.files import Product, write_csv, write_parquet, write_text
 from psfdae.method import Method
 from psfdae.methods import method
-from psfdae.metrics import quality, summarised
-from psfdae.model.star_sets import (
-    field_positions,
-    noisy_test_images,
-    read_stars,
-    split_stars,
-    training_set,
-)
+from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars, training_set
 from psfdae.options import File, Folder
-from psfdae.reading import read_table
 from psfdae.settings import ConfigError, Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
-
-if TYPE_CHECKING:
-    import pandas as pd
-
+from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
+from psfdae_paper.evaluation.paper import as_markdown, paper_table
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -75,25 +68,22 @@ def evaluate(
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
     """Measure every method on the test stars at each noise level."""
-    import pandas as pd
-
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), split, reference)
     test = split_stars(product, split, config).test
-    truth, field = product[reference][test], product["field_index"][test]
-    position = field_positions(product)[test]
+    test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
         # The same noisy images for all methods: their errors are compared star by star.
         noisy = noisy_test_images(config, product, test, level)
         for name, estimator in methods.items():
-            estimate = estimator.estimate(noisy, level, position)
-            metrics = quality(estimate, truth, config.evaluation.data_range)
+            estimate = estimator.estimate(noisy, level, test_stars.position)
             row = {**key, "method": name, "noise_level": level}
-            summary += summarised(row, metrics, field)
-            stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
+            rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)
+            summary += rows
+            stars_table.append(per_star_rows)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
@@ -155,10 +145,6 @@ def estimators(
     return fitted
 
 
-COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
-COLUMNS += ["value", "stderr", "n"]
-"""Columns of the table of an evaluation."""
-
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]
 
@@ -166,9 +152,9 @@ Metric = Literal["mse", "ssim"]
 @command("collect")
 def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
     """Join evaluations into one tidy table, with the scatter of each method between seeds."""
-    from psfdae_paper.evaluation.comparison import seed_scatter, with_seed_stderr
-
-    table = with_seed_stderr(read_evaluations(evaluations), seed_scatter())
+    table = comparison.with_seed_stderr(
+        read_tables(evaluations, COLUMNS), comparison.seed_scatter()
+    )
     write_csv(out, table[[*COLUMNS[:-1], "seed_stderr", "n"]])
 
 
@@ -181,13 +167,9 @@ def held_out(
 
     PER_STAR are the evaluations' Parquet files of both splits.
     """
-    import pandas as pd
-
-    from psfdae_paper.evaluation.comparison import HELD_OUT_COLUMNS, held_out_ratios
-
-    columns = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    columns = [*comparison.HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
     parts = [pd.read_parquet(path, columns=columns) for path in per_star]
-    write_csv(out, held_out_ratios(pd.concat(parts)))
+    write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 
 
 @command("paper-tables")
@@ -199,23 +181,8 @@ def paper_tables(
     ],
 ) -> None:
     """Write the paper's tables, with measured errors beside the published ones."""
-    from psfdae_paper.evaluation.paper import as_markdown, paper_table
-
-    measured = read_evaluations(evaluations)
+    measured = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)
         write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
-
-
-def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:
-    """Join CSV files of the stage `evaluate`; raises ProductError if one has other columns."""
-    import pandas as pd
-
-    parts = []
-    for path in evaluations:
-        part = read_table(path)
-        if list(part.columns) != COLUMNS:
-            raise ProductError(f"{path}: columns {list(part.columns)}, expected {COLUMNS}")
-        parts.append(part)
-    return pd.concat(parts, ignore_index=True)

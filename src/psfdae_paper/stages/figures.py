@@ -1,16 +1,30 @@
-"""Stages `figure ...`: PNG figures of data products and tables."""
+"""Stages `figure ...`: PNG figures of data products and tables.
+
+In go products of stars, fitted methods or tables; out comes one PNG. The figures themselves are
+drawn by functions of `psfdae_paper.evaluation`, which take arrays and tables only.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
+import pandas as pd
 
-from psfdae.figures import write_png
+from psfdae.figures import (
+    REFERENCES,
+    StripRow,
+    in_field_unit,
+    restoration_strip,
+    spread_stars,
+    write_png,
+)
 from psfdae.files import Product, ProductError, read_product
 from psfdae.method import Method
+from psfdae.metrics import mse
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.options import AboveZero, File
 from psfdae.reading import read_table
@@ -18,19 +32,18 @@ from psfdae.settings import Reference
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation import bound_figures, curves
+from psfdae_paper.evaluation.figures import stamp_energy_map, template_map
+from psfdae_paper.evaluation.measure import COLUMNS, read_tables
+from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.evaluate import (
     READS,
     Evaluations,
     Metric,
     Models,
     estimators,
-    read_evaluations,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from psfdae.figures import StripRow
+from psfdae_paper.stars.fields import square_grid
 
 Stars = Annotated[File, "Product of the stage stars."]
 Templates = Annotated[File, "Product of the stage templates."]
@@ -43,8 +56,6 @@ Efficiency = Annotated[File, "CSV of the stage efficiency."]
 @command("figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
     """Draw the static PSFs at their field positions."""
-    from psfdae_paper.evaluation.figures import template_map
-
     product = read_product(templates, "templates", ("psf", "grid", "field"))
     psf = without_margin(product)
     title = (
@@ -57,8 +68,6 @@ def figure_templates(templates: Templates, out: Png) -> None:
 @command("figure energy")
 def figure_energy(templates: Templates, out: Png) -> None:
     """Draw the light inside the stamp over the field."""
-    from psfdae_paper.evaluation.figures import stamp_energy_map
-
     product = read_product(templates, "templates", ("energy", "grid", "field"))
     stamp_px = product.config["framing"]["stamp_px"]
     write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
@@ -80,23 +89,15 @@ def figure_strip(
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
-    from psfdae.figures import REFERENCES, in_field_unit, restoration_strip, spread_stars
-
-    limit_threads(config.evaluation.threads)
-    product = read_stars(stars, reference)
-    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
-    # Eight test stars, spread over the field, with their field angles as titles.
-    test = split_stars(product, "random", config).test
-    field = field_of(product)[product["field_index"][test]]
-    selected = spread_stars(field, 8)
-    rows = strip_rows(config, product, test, selected, reference, methods, levels)
-    angle, unit = in_field_unit(field)
-    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[selected]]
+    drawn = drawn_stars(config, stars, models, reference, 8)
+    # Field angles of the stars as titles of the columns.
+    angle, unit = in_field_unit(drawn.field)
+    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[drawn.selected]]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
         f"restored and measured {REFERENCES[reference]}"
     )
-    write_png(restoration_strip(rows, columns, title), out)
+    write_png(restoration_strip(drawn.rows(config, levels), columns, title), out)
 
 
 @command("figure headline", reads=READS)
@@ -111,29 +112,97 @@ def figure_headline(
     out: Png,
 ) -> None:
     """Draw restored stars beside the errors and their bounds."""
-    from dataclasses import replace
-
-    from psfdae.figures import spread_stars
-    from psfdae_paper.evaluation.curves import headline
-
-    limit_threads(config.evaluation.threads)
-    reference = "realisation"
-    product = read_stars(stars, reference)
-    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
-    # Five test stars, spread over the field: restored, and below them the truth.
-    test = split_stars(product, "random", config).test
-    selected = spread_stars(field_of(product)[product["field_index"][test]], 5)
-    truth, *restored = strip_rows(config, product, test, selected, reference, methods, [level])
-    looks = [estimator.look for estimator in methods.values()]
+    drawn = drawn_stars(config, stars, models, "realisation", 5)
+    # Rows of restored stars, one for each method, and below them the truth.
+    truth, *restored = drawn.rows(config, [level])
+    looks = [estimator.look for estimator in drawn.methods.values()]
     rows = [
         replace(row, label=look.label if look.restores else f"{look.label} star")
         for row, look in zip(restored, looks, strict=True)
     ]
     rows.append(replace(truth, label="truth"))
-    errors, limits = (rows_of(path, dataset, reference) for path in (efficiency, bounds))
+    errors, limits = (rows_of(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    write_png(headline(rows, list(methods.values()), errors, limits, titles), out)
+    methods = list(drawn.methods.values())
+    write_png(bound_figures.headline(rows, methods, errors, limits, titles), out)
+
+
+@dataclass(frozen=True)
+class DrawnStars:
+    """Test stars of the split random, some of which are drawn, and the methods that restore them.
+
+    Attributes
+    ----------
+    product : Product
+        Product "stars".
+    reference : str
+        The truth: "realisation" or "template".
+    methods : dict of Method
+        Fitted methods by name.
+    test : ndarray of int, shape (n,)
+        Test stars.
+    field : ndarray, shape (n, 2)
+        Their field angles (x, y) in radians.
+    selected : ndarray of int, shape (k,)
+        Indices into `test` of the stars that are drawn, spread over the field.
+    """
+
+    product: Product
+    reference: str
+    methods: Mapping[str, Method]
+    test: np.ndarray
+    field: np.ndarray
+    selected: np.ndarray
+
+    def rows(self, config: Config, levels: Sequence[float]) -> list[StripRow]:
+        """Return rows of stamps: the reference, then the methods by noise level.
+
+        `config` is that of the stage `evaluate`.
+        """
+        stars = self.test[self.selected]
+        truth, position = self.product[self.reference][stars], field_positions(self.product)[stars]
+        rows = [StripRow("reference", truth)]
+        if self.reference == "template":
+            noise_free = self.product["realisation"][stars]
+            rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
+        for level in levels:
+            noisy = noisy_test_images(config, self.product, stars, level)
+            for estimator in self.methods.values():
+                look, images = estimator.look, estimator.restore(noisy, level, position)
+                label = f"{look.label}\nλ = {level:g}"
+                # Images that are not restored have their own colour scale: noise exceeds the PSF.
+                rows.append(StripRow(label, images, mse(images, truth), not look.restores))
+        return rows
+
+
+def drawn_stars(
+    config: Config, stars: Path, models: Models, reference: Reference, count: int
+) -> DrawnStars:
+    """Read the stars of a figure, and load or fit the methods that figures show.
+
+    Parameters
+    ----------
+    config : Config
+        That of the stage `evaluate`.
+    stars : Path
+        Product of the stage stars.
+    models : Models
+        File or folder of each method that stores a model.
+    reference : str
+        The truth.
+    count : int
+        Number of stars to draw.
+    """
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, reference)
+    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    test = split_stars(product, "random", config).test
+    # Field angles (x, y) of all field points, of which each star has one.
+    grid = product.config["grid"]
+    angle_deg = square_grid(grid["points"], grid["spacing_deg"])[1]
+    field: np.ndarray = np.deg2rad(angle_deg)[product["field_index"][test]]
+    return DrawnStars(product, reference, methods, test, field, spread_stars(field, count))
 
 
 @command("figure curves")
@@ -143,8 +212,7 @@ def figure_curves(
     out: Png,
 ) -> None:
     """Draw training and validation error of networks."""
-    from psfdae_paper.evaluation.curves import training_curves
-
+    # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
     tables = {}
@@ -153,7 +221,7 @@ def figure_curves(
         missing = {"step", "train_mse", "validation_mse"} - set(tables[label].columns)
         if missing:
             raise ProductError(f"{path}: no column {min(missing)!r}")
-    write_png(training_curves(tables, "Training of the denoising autoencoders"), out)
+    write_png(curves.training_curves(tables, "Training of the denoising autoencoders"), out)
 
 
 @command("figure errors")
@@ -163,15 +231,12 @@ def figure_errors(
     out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
 ) -> None:
     """Draw metrics against the noise level, with the paper's points."""
-    from psfdae_paper.evaluation.curves import error_against_noise
-    from psfdae_paper.evaluation.paper import published
-
-    metrics = read_evaluations(evaluations)
+    metrics = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
-        write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
+        write_png(curves.error_against_noise(metrics, published("psf"), dataset, metric), path)
 
 
 def without_margin(templates: Product) -> np.ndarray:
@@ -181,72 +246,17 @@ def without_margin(templates: Product) -> np.ndarray:
     return templates["psf"][:, margin:side, margin:side]
 
 
-def field_of(stars: Product) -> np.ndarray:
-    """Return the field angle (x, y) of every field point in radians, shape (F, 2)."""
-    from psfdae_paper.stars.fields import square_grid
-
-    grid = stars.config["grid"]
-    angle: np.ndarray = np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
-    return angle
-
-
-def strip_rows(
-    config: Config,
-    product: Product,
-    test: np.ndarray,
-    selected: np.ndarray,
-    reference: str,
-    methods: Mapping[str, Method],
-    levels: Sequence[float],
-) -> list[StripRow]:
-    """Make the rows of a restoration strip: the reference, then the methods by noise level.
-
-    `config` is that of the stage `evaluate`; `test` are the test stars, and `selected` the
-    indices of those in the figure.
-    """
-    from psfdae.figures import StripRow
-    from psfdae.metrics import mse
-
-    truth = product[reference][test][selected]
-    position = field_positions(product)[test][selected]
-    rows = [StripRow("reference", truth)]
-    if reference == "template":
-        noise_free = product["realisation"][test][selected]
-        rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
-    for level in levels:
-        noisy = noisy_test_images(config, product, test[selected], level)
-        for estimator in methods.values():
-            look, images = estimator.look, estimator.restore(noisy, level, position)
-            label = f"{look.label}\nλ = {level:g}"
-            # Images that are not restored have their own colour scale: noise exceeds the PSF.
-            rows.append(StripRow(label, images, mse(images, truth), not look.restores))
-    return rows
-
-
 @command("figure bounds")
-def figure_bounds(
-    dataset: DatasetName,
-    bounds: Bounds,
-    efficiency: Efficiency,
-    out: Png,
-) -> None:
+def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' errors above the bounds."""
-    from psfdae_paper.evaluation.curves import errors_above_bounds
-
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
-    write_png(errors_above_bounds(*tables, dataset), out)
+    write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
 
 
 @command("figure efficiency")
-def figure_efficiency(
-    dataset: DatasetName,
-    efficiency: Efficiency,
-    out: Png,
-) -> None:
+def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' efficiency against the noise level."""
-    from psfdae_paper.evaluation.curves import efficiency_against_noise
-
-    write_png(efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
+    write_png(bound_figures.efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
 
 
 @command("figure bank-growth")
@@ -256,9 +266,7 @@ def figure_bank_growth(
     out: Png,
 ) -> None:
     """Draw the posterior mean's error against the size of the bank."""
-    from psfdae_paper.evaluation.curves import bank_growth
-
-    write_png(bank_growth(rows_of(growth, dataset), dataset), out)
+    write_png(bound_figures.bank_growth(rows_of(growth, dataset), dataset), out)
 
 
 def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:

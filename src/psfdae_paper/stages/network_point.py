@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import numpy as np
+import pandas as pd
 
 from psfdae.belonging import require
 from psfdae.files import read_product, write_csv
@@ -23,7 +21,7 @@ from psfdae_paper.stages.alignment_methods import (
     noisy_test_states,
     train_network,
 )
-from psfdae_paper.sweeps.measured import EVALUATION, VALIDATION, Measured, Task, geometric_mean
+from psfdae_paper.sweeps.measured import TABLES, Measured, Task, geometric_mean
 
 
 def files_of(name: str) -> tuple[str, ...]:
@@ -49,8 +47,6 @@ def run(config: Config, task: Task, name: str) -> Measured:
     ProductError
         If the products are of different telescopes or stamps.
     """
-    import pandas as pd
-
     trained_on = read_product(task.data["states"], "alignment_states", ())
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
@@ -58,11 +54,25 @@ def run(config: Config, task: Task, name: str) -> Measured:
     settings = part(network_groups(name), config)
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
+    # The test part is the uniform set, with the noise that it has in the main workflow.
     metrics: dict[str, float] = {}
-    for role, file in (("validation", VALIDATION), ("test", EVALUATION)):
-        rows = _rows(config, task, role)
-        metrics |= _metrics(role, rows)
-        write_csv(task.folder / file, pd.DataFrame(rows))
+    for role, test_set in (("validation", "validation"), ("test", "uniform")):
+        rows = _rows(config, task, role, test_set)
+        # Mean absolute error of all parameters in units of the range, at each noise level.
+        mae = {
+            f"{role}_mae_{level:g}": float(
+                np.mean(
+                    [
+                        row["mean_abs_error"]
+                        for row in rows
+                        if row["unit"] == "range" and row["noise_level"] == level
+                    ]
+                )
+            )
+            for level in task.levels
+        }
+        metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
+        write_csv(task.folder / TABLES[role], pd.DataFrame(rows))
     described = read_yaml(task.folder / CONFIG)
     history = read_table(task.folder / HISTORY)
     return Measured(
@@ -74,29 +84,13 @@ def run(config: Config, task: Task, name: str) -> Measured:
     )
 
 
-def _rows(config: Config, task: Task, role: str) -> list[Row]:
+def _rows(config: Config, task: Task, role: str, test_set: str) -> list[Row]:
     """Measure one network at all noise levels; return rows like those of the main workflow."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
     predict = network_predictor(task.folder, product, config)
-    # The test part is the uniform set, with the noise that it has in the main workflow.
-    test_set = "uniform" if role == "test" else role
     rows: list[Row] = []
     for level in task.levels:
         stamps = noisy_test_states(config, product["stamps"], test_set, level)
         key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
         rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
     return rows
-
-
-def _metrics(role: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the mean absolute error of all parameters, over all noise levels and at each.
-
-    It is in units of the range.
-    """
-    errors_by_level: dict[float, list[float]] = {}
-    for row in rows:
-        if row["unit"] == "range":
-            errors_by_level.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
-    mae = {level: float(np.mean(errors)) for level, errors in errors_by_level.items()}
-    metrics = {f"{role}_mae": geometric_mean(list(mae.values()))}
-    return metrics | {f"{role}_mae_{level:g}": value for level, value in mae.items()}

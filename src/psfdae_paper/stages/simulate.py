@@ -1,4 +1,9 @@
-"""Stages `simulate`, `figure telescope`, `example-field`: PSFs of a telescope, simulated images."""
+"""Stages `simulate`, `figure telescope`, `example-field`: PSFs of a telescope, simulated images.
+
+In go the settings of a telescope; out come its static PSFs over the field as a product, a figure,
+a table and, if asked for, a FITS cube and an image with a star per field. `example-field` makes the
+image of a star field with which the pages try the library.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +13,19 @@ from typing import Annotated
 
 import click
 import numpy as np
+import pandas as pd
 
 from psfdae.errors import Error
 from psfdae.figures import write_png
 from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
 from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
+from psfdae.optics.pupil import SamplingError
 from psfdae.options import File, Folder
 from psfdae.rng import stream
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
@@ -25,11 +33,8 @@ from psfdae_paper.stages.figures import without_margin
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
 from psfdae_paper.stars.example import example_field as simulate_field
-from psfdae_paper.stars.framing import normalise_flux
+from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux
 from psfdae_paper.stars.scenes import template_wavefronts
-
-ENOUGH_LIGHT = 0.8
-"""Fraction of the light below which a stamp is called too small."""
 
 
 class StampSizeError(Error, ValueError):
@@ -55,8 +60,6 @@ def simulate(
 
     Writes templates.h5, psfs.png and fields.csv.
     """
-    from psfdae_paper.configuration.compose import load_stage
-
     # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
         overrides = ("dataset=_telescope", *overrides)
@@ -66,10 +69,7 @@ def simulate(
     with atomic_path(folder / "templates.h5") as temporary:
         templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
-        warnings = [
-            *_stamp_warnings(config, fields, least_energy),
-            *_sampling_warnings(config, fields),
-        ]
+        warnings = stamp_warnings(config, fields, least_energy)
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
     names = ["templates.h5", "psfs.png", "fields.csv"]
     if fits:
@@ -97,8 +97,6 @@ def figure_telescope(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw the static PSFs of a telescope with their light and their width."""
-    import pandas as pd
-
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
     x, y = np.rad2deg(fields.field).T
@@ -130,41 +128,63 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     )
 
 
-def _stamp_warnings(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
-    """Return a warning if stamps contain too little light.
+def stamp_warnings(
+    config: Config, fields: FieldOfPsfs, least_energy: float, enough_light: float = 0.8
+) -> list[str]:
+    """Return warnings: stamps with too little light, and undersampled PSFs.
 
-    StampSizeError if a stamp contains less than `least_energy`.
+    Parameters
+    ----------
+    config : Config
+        Stage configuration of `templates`.
+    fields : FieldOfPsfs
+    least_energy : float
+        Fraction of the light below which a stamp is refused.
+    enough_light : float
+        Fraction of the light below which a stamp is called too small.
+
+    Raises
+    ------
+    StampSizeError
+        If a stamp contains less than `least_energy`.
     """
+    warnings = []
     energy, side = fields.energy, config.framing.stamp_px
-    if not energy.min() < ENOUGH_LIGHT:
-        return []
-    worst_field = int(energy.argmin())
-    x, y = np.rad2deg(fields.field[worst_field])
-    # Stamps up to four times as wide are tried.
-    sufficient_px = _sufficient_stamp_px(config, worst_field, 4 * side)
-    advice = (
-        f"framing.stamp_px={sufficient_px} contains {ENOUGH_LIGHT:.0%} everywhere"
-        if sufficient_px
-        else f"no stamp up to {4 * side} px contains {ENOUGH_LIGHT:.0%} everywhere"
-    )
-    message = (
-        f"{int((energy < ENOUGH_LIGHT).sum())} of {energy.size} fields have less than "
-        f"{ENOUGH_LIGHT:.0%} of their light inside {side} × {side} px, the least "
-        f"{energy[worst_field]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
-    )
-    if energy.min() < least_energy:
-        raise StampSizeError(f"telescope = {config.telescope.name}: {message} (--least-energy)")
-    return [message]
+    if energy.min() < enough_light:
+        worst_field = int(energy.argmin())
+        x, y = np.rad2deg(fields.field[worst_field])
+        # Stamps up to four times as wide are tried.
+        sufficient_px = _sufficient_stamp_px(config, worst_field, 4 * side, enough_light)
+        advice = (
+            f"framing.stamp_px={sufficient_px} contains {enough_light:.0%} everywhere"
+            if sufficient_px
+            else f"no stamp up to {4 * side} px contains {enough_light:.0%} everywhere"
+        )
+        message = (
+            f"{int((energy < enough_light).sum())} of {energy.size} fields have less than "
+            f"{enough_light:.0%} of their light inside {side} × {side} px, the least "
+            f"{energy[worst_field]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
+        )
+        if energy.min() < least_energy:
+            raise StampSizeError(f"telescope = {config.telescope.name}: {message} (--least-energy)")
+        warnings.append(message)
+    # Below 1.5 pixels the FWHM has less than two samples across: the pixels alias.
+    fwhm_px = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
+    if fwhm_px < 1.5:
+        warnings.append(
+            f"the PSFs are {fwhm_px:.2f} px wide (median FWHM with the pixel): undersampled; the "
+            "image of a star depends more on its position in the pixel than on the optics"
+        )
+    return warnings
 
 
-def _sufficient_stamp_px(config: Config, worst_field: int, max_px: int) -> int | None:
+def _sufficient_stamp_px(
+    config: Config, worst_field: int, max_px: int, enough_light: float
+) -> int | None:
     """Return the smallest even stamp with enough light of the field that needs the largest one.
 
     None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
     """
-    from psfdae.optics.pupil import SamplingError
-    from psfdae_paper.stars.framing import FramingError, Propagation
-
     framing = config.framing.model_copy(update={"stamp_px": max_px})
     source = template_wavefronts(config)
     try:
@@ -174,22 +194,12 @@ def _sufficient_stamp_px(config: Config, worst_field: int, max_px: int) -> int |
         stamp = propagation.framed(max_px, stars=np.array([worst_field]))[0][0]
     except (SamplingError, FramingError):
         return None
+    # Smaller stamps are the middle of the largest one.
     for size in range(config.framing.stamp_px + 2, max_px + 1, 2):
         centre = slice((max_px - size) // 2, (max_px + size) // 2)
-        if stamp[centre, centre].sum() >= ENOUGH_LIGHT:
+        if stamp[centre, centre].sum() >= enough_light:
             return size
     return None
-
-
-def _sampling_warnings(config: Config, fields: FieldOfPsfs) -> list[str]:
-    """Return a warning if the PSFs are undersampled: below 1.5 pixels wide."""
-    fwhm_px = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
-    if fwhm_px >= 1.5:
-        return []
-    return [
-        f"the PSFs are {fwhm_px:.2f} px wide (median FWHM with the pixel): undersampled; the image "
-        "of a star depends more on its position in the pixel than on the optics"
-    ]
 
 
 def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
@@ -282,18 +292,15 @@ def write_image(
 def example_field(
     catalogue: Annotated[File, "CSV file for the star list."],
     seed: Annotated[int, click.IntRange(min=0)] = 1,
-    side: Annotated[
-        int | None, click.IntRange(min=100), "Pixels along a side.  [default: 1500]"
-    ] = None,
-    bright: Annotated[int | None, click.IntRange(min=1), "Bright stars.  [default: 300]"] = None,
-    faint: Annotated[int | None, click.IntRange(min=0), "Faint stars.  [default: 700]"] = None,
+    side: Annotated[int, click.IntRange(min=100), "Pixels along a side."] = FieldRecipe.side_px,
+    bright: Annotated[int, click.IntRange(min=1), "Bright stars."] = FieldRecipe.bright,
+    faint: Annotated[int, click.IntRange(min=0), "Faint stars."] = FieldRecipe.faint,
     *,
     out: Annotated[File, "FITS image."],
 ) -> None:
     """Simulate an image of a star field with its star list, as an example."""
     check_outputs((out,), (catalogue,))
-    options = {"side_px": side, "bright": bright, "faint": faint}
-    write_example(out, catalogue, seed, **{k: v for k, v in options.items() if v is not None})
+    write_example(out, catalogue, seed, side_px=side, bright=bright, faint=faint)
 
 
 def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> ExampleField:
@@ -306,11 +313,7 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     field = simulate_field(recipe, seed)
     x, y = field.centroid.T
     write_field(
-        out,
-        catalogue,
-        field.image.astype(np.float32),
-        x,
-        y,
+        *(out, catalogue, field.image.astype(np.float32), x, y),
         pixel_scale_arcsec=recipe.pixel_scale_arcsec,
         GAIN=recipe.gain,
         SATURATE=float(recipe.saturation),

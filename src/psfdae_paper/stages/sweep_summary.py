@@ -7,13 +7,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import pandas as pd
+import yaml
+
 from psfdae.figures import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.options import File, Folder
-from psfdae.reading import read_table, read_yaml
+from psfdae.reading import read_json, read_table, read_yaml
+from psfdae.settings import as_overrides, validate
 from psfdae_paper.configuration.command import command
-from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
-from psfdae_paper.sweeps.points import SweepError
+from psfdae_paper.configuration.sweep import Axis
+from psfdae_paper.evaluation import sweep_figures
+from psfdae_paper.sweeps.measured import read_cost
+from psfdae_paper.sweeps.points import SweepError, plan_sweep
 
 BEST_POINT = "best.yaml"
 """File with the overrides of the best point of a sweep."""
@@ -27,10 +33,8 @@ def sweep_summary(
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
     """Tabulate the points of a sweep and choose the best."""
-    from psfdae_paper.sweeps.points import plan_sweep
-
     plan = plan_sweep(name, overrides)
-    files = [points / point / RESULT for point in plan.points]
+    files = [points / point / "result.json" for point in plan.points]
     summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
 
 
@@ -73,10 +77,7 @@ def summary(
     SweepError
         If no point has a metric.
     """
-    import pandas as pd
-    import yaml
-
-    results = [read_result(path) for path in points]
+    results = [read_json(path) for path in points]
     best_result = choose(results, definition["metric"], definition["direction"])
     if best_result is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
@@ -121,8 +122,6 @@ def best_overrides(results: Path, name: str) -> list[str]:
     ProductError
         If the sweep has not been run.
     """
-    from psfdae.reading import read_yaml
-
     path = results / "sweeps" / name / BEST_POINT
     if not path.is_file():
         raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
@@ -145,8 +144,6 @@ def _best_yaml(
     name: str, definition: Mapping[str, Any], overrides: Sequence[str], result: Mapping[str, Any]
 ) -> str:
     """Return the best point as overrides, those of the workflow before those of the point."""
-    from psfdae.settings import as_overrides
-
     preset = "preset="
     point_overrides = [word.removeprefix("++") for word in as_overrides(result["keys"])]
     tree = {
@@ -171,10 +168,6 @@ def sweep_figure(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw all points at once, or the metric against each axis."""
-    from psfdae.settings import validate
-    from psfdae_paper.configuration.sweep import Axis
-    from psfdae_paper.evaluation import sweep_figures
-
     described = read_yaml(definition)
     logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
     draw = {

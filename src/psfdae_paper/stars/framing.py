@@ -1,7 +1,8 @@
 """Framing: from wavefronts to stamps around their brightest pixels.
 
-A scene is a source of wavefronts; `Propagation` turns them into stamps, so that the
-search for the brightest pixel and the propagation are written once.
+In goes a source of wavefronts, made by a scene; out come stamps, each with its brightest pixel in
+the middle up to a centring error, and normalised to flux 1. `Propagation` has the propagation and
+the search for the brightest pixel, which all stages share.
 """
 
 from __future__ import annotations
@@ -55,6 +56,30 @@ def brightest_pixel(image: np.ndarray, tie: float) -> tuple[int, int]:
     return int(row), int(column)
 
 
+def contested_pixels(images: np.ndarray, tie: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pixels that compete for the maximum of search images in single precision.
+
+    Parameters
+    ----------
+    images : ndarray, shape (B, h, h)
+    tie : float
+        Relative tolerance below the maximum, as for `brightest_pixel`.
+
+    Returns
+    -------
+    image, row, column : ndarray of int, shape (K,)
+        Pixels of images that have more than one candidate; a single candidate needs no check.
+    """
+    # A search image errs by 8e-5 of its maximum at most (256 stars each of scene 1 at 10 and
+    # 50 %, and of scene 2): a pixel that is 1e-3 below a tie with the maximum may still be the
+    # brightest.
+    threshold = (1.0 - tie) * (1.0 - 1e-3)
+    shortlisted = images >= threshold * images.max(axis=(1, 2), keepdims=True)
+    contested = shortlisted.sum(axis=(1, 2)) > 1
+    image, row, column = np.nonzero(shortlisted & contested[:, None, None])
+    return image, row, column
+
+
 def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.ndarray:
     """Cut stamps out of images that were framed without jitter and with a margin.
 
@@ -90,6 +115,41 @@ def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     flux = stamps.sum(axis=(-2, -1))
     return stamps / flux[..., None, None], flux
+
+
+def search_windows(
+    slopes: np.ndarray, pixel: float, search_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the window in which the brightest pixel of each wavefront is searched first.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (n, 2, 2)
+        Extreme slopes [wavefront, axis (x, y), (min, max)] in waves per pupil radius.
+    pixel : float
+        Width of a pixel in λ/D.
+    search_px : int
+        Largest distance of a window's edge from its centre.
+
+    Returns
+    -------
+    centre : ndarray of int, shape (n, 2)
+        (row, column) of the window's centre from the chief ray.
+    reach : ndarray of int, shape (n,)
+        The window covers ± this many pixels.
+    """
+    # Rays land at twice the slope, in λ/D; here (row, column) and (min, max) in pixels.
+    rays = 2.0 * slopes[:, ::-1] / pixel
+    # Diffraction moves the brightest pixel by less than 3 px beyond the outermost ray. Sizes
+    # are multiples of 8 px, so that many wavefronts share a search image's kernel.
+    half_width = 0.5 * np.ptp(rays, axis=2).max(axis=1) + 3.0
+    centre = np.rint(rays.mean(axis=2)).astype(np.int64)
+    reach = (8 * np.ceil(half_width / 8)).astype(np.int64)
+    # A window that leaves the permitted area is replaced by ± search_px around the chief ray.
+    is_too_large = reach + np.abs(centre).max(axis=1) > 2 * search_px
+    is_too_large |= reach > search_px
+    centre[is_too_large], reach[is_too_large] = 0, search_px
+    return centre, reach
 
 
 class Propagation:
@@ -145,18 +205,7 @@ class Propagation:
         slopes = source.slopes()
         needed = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(needed, tuple(optics.pupil_samples))
-        # First search window of each wavefront: where its rays land. They land at twice the
-        # slope, in λ/D; here (row, column) and (min, max) in pixels.
-        rays = 2.0 * slopes[:, ::-1] / pixel
-        # Diffraction moves the brightest pixel by less than 3 px beyond the outermost ray. Sizes
-        # are multiples of 8 px, so that many wavefronts share a search image's kernel.
-        half_width = 0.5 * np.ptp(rays, axis=2).max(axis=1) + 3.0
-        self._centre = np.rint(rays.mean(axis=2)).astype(np.int64)
-        self._reach = (8 * np.ceil(half_width / 8)).astype(np.int64)
-        # A window that leaves the permitted area is replaced by ± search_px around the chief ray.
-        is_too_large = self._reach + np.abs(self._centre).max(axis=1) > 2 * search_px
-        is_too_large |= self._reach > search_px
-        self._centre[is_too_large], self._reach[is_too_large] = 0, search_px
+        self._centre, self._reach = search_windows(slopes, pixel, search_px)
         self._pupils: dict[int, Pupil] = {}
 
     def stamps(
@@ -300,6 +349,7 @@ class Propagation:
             (row, column) from the centre of the window.
         """
         peaks = np.empty((len(stars), 2), dtype=np.int64)
+        tie = self.framing.tie
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = self._pupil(samples)
@@ -310,56 +360,25 @@ class Propagation:
                 members, phase = stars[batch], phase_px[batch]
                 opd = self.source.opd(members, pupil, search.real_dtype)
                 image = search(opd, phase if phase.any() else None)
-                peaks[batch] = self._refine(members, phase, pupil, image, exact) - reach
+                # Pixels that compete for the maximum are computed exactly. The centre of pixel j
+                # is at j + 1/2 pixels; a one-pixel stamp is centred there.
+                star, row, column = contested_pixels(image, tie)
+                offsets = np.stack([row, column], axis=1) - reach + 0.5 + phase[star]
+                exact_values = np.empty(star.size)
+                for start in range(0, star.size, self.optics.batch):
+                    part = slice(start, start + self.optics.batch)
+                    opd = self.source.opd(members[star[part]], pupil, exact.real_dtype)
+                    exact_values[part] = exact(opd, offsets[part])[:, 0, 0]
+                # Contested images keep nothing but these pixels.
+                values = image.copy()
+                values[np.unique(star)] = 0.0
+                values[star, row, column] = exact_values
+                peaks[batch] = [brightest_pixel(pixels, tie) for pixels in values]
 
             return find
 
         self._run(stars, prepare)
-        return peaks
-
-    def _refine(
-        self,
-        batch: np.ndarray,
-        phase_px: np.ndarray,
-        pupil: Pupil,
-        image: np.ndarray,
-        exact: Propagator,
-    ) -> np.ndarray:
-        """Find the brightest pixel of every search image; exact values where several compete.
-
-        Parameters
-        ----------
-        batch : ndarray of int, shape (B,)
-            The wavefronts.
-        phase_px : ndarray, shape (B, 2)
-            (row, column) of the centre of each image from the chief ray.
-        image : ndarray, shape (B, h, h)
-            Search images, single precision.
-        exact : callable
-            Propagator to stamps of one pixel, double precision.
-
-        Returns
-        -------
-        ndarray of int, shape (B, 2)
-            (row, column), index of the pixel in the image.
-        """
-        half = image.shape[-1] // 2
-        # Shortlist. The search image errs by 8e-5 of its maximum at most (256 stars each of
-        # scene 1 at 10 and 50 %, and of scene 2): a pixel that is 1e-3 below a tie with the
-        # maximum may still be the brightest. One that is alone on the shortlist is.
-        threshold = (1.0 - self.framing.tie) * (1.0 - 1e-3)
-        shortlisted = image >= threshold * image.max(axis=(1, 2), keepdims=True)
-        contested = shortlisted.sum(axis=(1, 2)) > 1
-        star, row, column = np.nonzero(shortlisted & contested[:, None, None])
-        # Contested images keep nothing but their shortlisted pixels, which are computed exactly.
-        values = np.where(contested[:, None, None], 0.0, image)
-        # The centre of pixel j is at j + 1/2 pixels; a one-pixel stamp is centred there.
-        offsets = np.stack([row, column], axis=1) - half + 0.5 + phase_px[star]
-        for start in range(0, star.size, self.optics.batch):
-            part = slice(start, start + self.optics.batch)
-            opd = self.source.opd(batch[star[part]], pupil, exact.real_dtype)
-            values[star[part], row[part], column[part]] = exact(opd, offsets[part])[:, 0, 0]
-        return np.array([brightest_pixel(image, self.framing.tie) for image in values])
+        return peaks - reach
 
     def _pupil(self, samples: int) -> Pupil:
         """Return the telescope's pupil with `samples` samples across; each size is made once."""

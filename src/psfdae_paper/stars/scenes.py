@@ -1,13 +1,11 @@
 """Scenes: the wavefronts of the field points of a telescope, and of single stars.
 
-A scene has a grid of field points, a telescope and settings of its wavefront. It gives the
-static wavefronts of all fields, and those of stars with random aberrations.
+In go a grid of field points, a telescope and settings of its wavefront; out come the static
+wavefronts of all fields, and those of stars with random aberrations. What the wavefront is of
+decides: Seidel terms (scene 1), turbulence (scene 2), or the telescope's own aberrations.
 """
 
 from __future__ import annotations
-
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,13 +19,13 @@ from psfdae.optics.wavefronts import (
 )
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae.telescope.aberrations import Seidel
+from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 from psfdae.telescope.field import static_zernikes
 from psfdae.telescope.settings import OwnTelescope, Telescope
-from psfdae_paper.configuration.schema import Config, Grid, Stars
-from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
+from psfdae_paper.configuration.schema import Config, Grid
+from psfdae_paper.configuration.wavefront import VonKarman
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
-from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
+from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, Removal, draw_waves, layer_r0
 
 CYCLES_PER_DIAMETER = 60
 """Highest spatial frequency of the turbulence, cycles across the pupil.
@@ -103,180 +101,123 @@ class TurbulentWavefronts:
         return self.footprints.opd(index, pupil.axis, dtype)
 
 
-@dataclass(frozen=True)
-class Scene(ABC):
-    """Telescope, field points and wavefront settings, from which wavefronts are made.
+def template_wavefronts(config: Config) -> WavefrontSource:
+    """Return the static wavefronts of all fields of a scene.
 
-    The attributes are the configuration groups of the same names.
+    Parameters
+    ----------
+    config : Config
+        Stage configuration with the groups grid, telescope and wavefront.
+
+    Raises
+    ------
+    SamplingError
+        If turbulence is too strong for the highest frequency.
+    RayTracingError
+        If the ray trace of a field is vignetted.
     """
+    # Scene 2: an ideal telescope behind turbulence.
+    if isinstance(config.wavefront, VonKarman):
+        return turbulent_wavefronts(config.wavefront, config.telescope, config.grid)
+    # Scene 1, or a telescope that is described by Seidel coefficients: they are those of the edge
+    # of the field, and grow with the relative field of each point.
+    aberrations = _static_aberrations(config)
+    if isinstance(aberrations, Seidel):
+        field = relative_field(config.grid)
+        return seidel_wavefronts(np.tile(aberrations.coefficients, (len(field), 1)), field)
+    # A telescope with Zernike terms over its field, or with a prescription whose rays are traced.
+    return zernike_wavefronts(*_static_zernikes(config))
 
-    grid: Grid
-    telescope: Telescope
-    wavefront: Seidel | VonKarman | OfTelescope
 
-    @abstractmethod
-    def templates(self) -> WavefrontSource:
-        """Return the static wavefronts of all fields."""
+def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
+    """Draw wavefronts of stars with random aberrations around the static ones of their fields.
 
-    def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
-        """Draw wavefronts of stars with random aberrations.
+    Parameters
+    ----------
+    config : Config
+        Stage configuration with the groups seed, grid, telescope, wavefront and stars.
+    star_field : ndarray of int, shape (n,)
+        Field of each star.
 
-        Parameters
-        ----------
-        stars : Stars
-            Configuration group with the scale of the aberrations and the name of the set.
-        star_field : ndarray of int, shape (n,)
-            Field of each star.
-        seed : int
-
-        Raises
-        ------
-        ConfigError
-            If the scene has no random aberrations.
-        """
+    Raises
+    ------
+    ConfigError
+        If the scene has no random aberrations.
+    """
+    stars = config.stars
+    if isinstance(config.wavefront, VonKarman):
         raise ConfigError(
             f"stars.aberration_fraction = {stars.aberration_fraction}: must be 0, stars of this "
             "scene have no random aberrations"
         )
+    # Every coefficient times (1 + fraction · N(0, 1)); streams bear the name of the set of stars.
+    fraction, factors = stars.aberration_fraction, stream(config.seed, "aberration", stars.name)
+    aberrations = _static_aberrations(config)
+    if isinstance(aberrations, Seidel):
+        static = np.tile(aberrations.coefficients, (len(star_field), 1))
+        field = relative_field(config.grid)[star_field]
+        return seidel_wavefronts(perturb(static, fraction, factors), field)
+    # The jitter also moves terms that vanish at a field, such as focus on the axis.
+    noll, static = _static_zernikes(config)
+    shifts = stream(config.seed, "aberration jitter", stars.name)
+    perturbed = perturb(static[star_field], fraction, factors, aberrations.jitter_waves, shifts)
+    return zernike_wavefronts(noll, perturbed)
 
 
-class SeidelScene(Scene):
-    """Scene 1: a wide-field telescope with field-dependent Seidel aberrations."""
-
-    wavefront: Seidel
-
-    def templates(self) -> ModalWavefronts:
-        """Return the static wavefronts of all fields."""
-        field = relative_field(self.grid)
-        return seidel_wavefronts(np.tile(self.wavefront.coefficients, (len(field), 1)), field)
-
-    def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
-        """Draw wavefronts of stars, `star_field` the field of each, (n,)."""
-        static = np.tile(self.wavefront.coefficients, (len(star_field), 1))
-        rng = stream(seed, "aberration", stars.name)
-        seidel = perturb(static, stars.aberration_fraction, rng)
-        return seidel_wavefronts(seidel, relative_field(self.grid)[star_field])
+def _static_aberrations(config: Config) -> Seidel | Zernike | Raytraced:
+    """Return the static aberrations: of the scene, or of the telescope if it has its own."""
+    if isinstance(config.wavefront, Seidel):
+        return config.wavefront
+    assert isinstance(config.telescope, OwnTelescope)
+    return config.telescope.aberrations
 
 
-class TurbulenceScene(Scene):
-    """Scene 2: an ideal telescope behind static von Kármán turbulence, the same for all stars."""
-
-    wavefront: VonKarman
-
-    def templates(self) -> TurbulentWavefronts:
-        """Return the static wavefronts of all fields.
-
-        The turbulence depends on nothing but `wavefront` and the telescope's diameter.
-        Its r0 holds at the telescope's wavelength, in whose waves the OPD is.
-
-        Raises
-        ------
-        SamplingError
-            If the turbulence is too strong for the highest frequency.
-        """
-        wavefront, telescope = self.wavefront, self.telescope
-        # Phase variance beyond the highest frequency, ∫ 2πf 0.0229 r0^(−5/3) f^(−11/3) df
-        # = 1.2 π 0.0229 (r0 f)^(−5/3). It is 0.0014 rad² at D/r0 = 5; 0.1 rad² would scatter
-        # a tenth of the light.
-        cycles = wavefront.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
-        omitted_variance = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
-        if omitted_variance > 0.1:
-            raise SamplingError(
-                f"wavefront.r0_m = {wavefront.r0_m:g}, telescope.diameter_m = "
-                f"{telescope.diameter_m:g}: a phase variance of {omitted_variance:.2g} rad² lies "
-                f"beyond {CYCLES_PER_DIAMETER} cycles per diameter (at most 0.1)"
-            )
-        # Each layer has its own random stream, so that it is the same beside other layers.
-        layers = [
-            draw_waves(
-                wavefront.waves,
-                r0,
-                wavefront.outer_scale_m,
-                CYCLES_PER_DIAMETER / telescope.diameter_m,
-                stream(wavefront.seed, "turbulence", layer),
-            )
-            for layer, r0 in enumerate(layer_r0(wavefront.r0_m, wavefront.layer_strengths))
-        ]
-        _, angle_deg = square_grid(self.grid.points, self.grid.spacing_deg)
-        return TurbulentWavefronts(
-            Footprints(
-                layers,
-                wavefront.layer_heights_m,
-                np.deg2rad(angle_deg),
-                telescope.diameter_m,
-                telescope.obscuration,
-                "tilt" if wavefront.remove_tilt else "piston",
-            )
-        )
+def _static_zernikes(config: Config) -> tuple[tuple[int, ...], np.ndarray]:
+    """Return the Noll indices and the static coefficients (F, J) of all fields in waves."""
+    assert isinstance(config.telescope, OwnTelescope)
+    _, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
+    return static_zernikes(config.telescope, angle_deg)
 
 
-class TelescopeScene(Scene):
-    """Scene of a user's telescope: Seidel terms, Zernike terms over the field, or a ray trace.
+def turbulent_wavefronts(
+    wavefront: VonKarman, telescope: Telescope, grid: Grid
+) -> TurbulentWavefronts:
+    """Return static von Kármán turbulence over the field, the same for all stars.
 
-    Everything is in the group `telescope`: aperture, field and static aberrations.
+    The turbulence depends on nothing but `wavefront` and the telescope's diameter. Its r0 holds at
+    the telescope's wavelength, in whose waves the OPD is.
+
+    Raises
+    ------
+    SamplingError
+        If the turbulence is too strong for the highest frequency.
     """
-
-    telescope: OwnTelescope
-
-    def templates(self) -> ModalWavefronts:
-        """Return the static wavefronts of all fields.
-
-        Raises
-        ------
-        RayTracingError
-            If the ray trace of a field is vignetted.
-        """
-        aberrations = self.telescope.aberrations
-        if isinstance(aberrations, Seidel):
-            return self._seidel(aberrations).templates()
-        return zernike_wavefronts(*self._zernikes())
-
-    def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
-        """Draw wavefronts of stars, `star_field` the field of each, (n,)."""
-        aberrations = self.telescope.aberrations
-        if isinstance(aberrations, Seidel):
-            return self._seidel(aberrations).stars(stars, star_field, seed)
-        noll, static = self._zernikes()
-        perturbed = perturb(
-            static[star_field],
-            stars.aberration_fraction,
-            stream(seed, "aberration", stars.name),
-            aberrations.jitter_waves,
-            stream(seed, "aberration jitter", stars.name),
+    # Phase variance beyond the highest frequency, ∫ 2πf 0.0229 r0^(−5/3) f^(−11/3) df
+    # = 1.2 π 0.0229 (r0 f)^(−5/3). It is 0.0014 rad² at D/r0 = 5; 0.1 rad² would scatter
+    # a tenth of the light.
+    cycles = wavefront.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
+    omitted_variance = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
+    if omitted_variance > 0.1:
+        raise SamplingError(
+            f"wavefront.r0_m = {wavefront.r0_m:g}, telescope.diameter_m = "
+            f"{telescope.diameter_m:g}: a phase variance of {omitted_variance:.2g} rad² lies "
+            f"beyond {CYCLES_PER_DIAMETER} cycles per diameter (at most 0.1)"
         )
-        return zernike_wavefronts(noll, perturbed)
-
-    def _zernikes(self) -> tuple[tuple[int, ...], np.ndarray]:
-        """Return the Noll indices and the static coefficients of all fields in waves."""
-        _, angle_deg = square_grid(self.grid.points, self.grid.spacing_deg)
-        return static_zernikes(self.telescope, angle_deg)
-
-    def _seidel(self, aberrations: Seidel) -> SeidelScene:
-        """Return the scene of a telescope that is described by Seidel coefficients."""
-        return SeidelScene(self.grid, self.telescope, aberrations)
-
-
-SCENES: dict[str, type[Scene]] = {
-    "seidel": SeidelScene,
-    "turbulence": TurbulenceScene,
-    "telescope": TelescopeScene,
-}
-"""Classes of scenes by the name in the configuration."""
-
-
-def scene_of(config: Config) -> Scene:
-    """Return the scene of a stage's configuration."""
-    return SCENES[config.scene.name](config.grid, config.telescope, config.wavefront)
-
-
-def template_wavefronts(config: Config) -> WavefrontSource:
-    """Return the static wavefronts of all fields of a stage's scene."""
-    return scene_of(config).templates()
-
-
-def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
-    """Draw wavefronts of stars with random aberrations, `star_field` the field of each."""
-    return scene_of(config).stars(config.stars, star_field, config.seed)
+    # Each layer has its own random stream, so that it is the same beside other layers.
+    highest = CYCLES_PER_DIAMETER / telescope.diameter_m
+    layers = [
+        draw_waves(
+            *(wavefront.waves, r0, wavefront.outer_scale_m, highest),
+            stream(wavefront.seed, "turbulence", layer),
+        )
+        for layer, r0 in enumerate(layer_r0(wavefront.r0_m, wavefront.layer_strengths))
+    ]
+    # Directions of the field points in radians; stamps follow the tilt unless it is removed.
+    directions = np.deg2rad(square_grid(grid.points, grid.spacing_deg)[1])
+    remove: Removal = "tilt" if wavefront.remove_tilt else "piston"
+    aperture = (telescope.diameter_m, telescope.obscuration)
+    heights = wavefront.layer_heights_m
+    return TurbulentWavefronts(Footprints(layers, heights, directions, *aperture, remove))
 
 
 def aberration_columns(source: ModalWavefronts) -> dict[str, Column]:

@@ -1,0 +1,88 @@
+"""Advice on settings that neither the header nor the user gives, from the stars of an image.
+
+In: the measured stars (`selection`). Out: sentences with the advice and what it rests on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psfdae.image.observation import Observation
+from psfdae.image.selection import Candidates
+from psfdae.image.stamps import cut
+from psfdae.image.star_criteria import overlapping, piled_up
+
+
+def advice(candidates: Candidates, observation: Observation, stamp_px: int) -> list[str]:
+    """Return sentences on saturation, gain and the size of stamps, for a training on stars."""
+    sentences = [stamp_advice(candidates, stamp_px)]
+    if observation.saturate is None:
+        sentences.append(saturation_advice(candidates))
+    if observation.gain is None:
+        sentences.append(gain_advice(candidates))
+    return [sentence for sentence in sentences if sentence]
+
+
+def saturation_advice(candidates: Candidates) -> str:
+    """Return advice on saturation, from where brightest pixels pile up."""
+    level = piled_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
+    if not np.isfinite(level):
+        return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
+    piled, flagged = (
+        int((pixel >= level).sum()) for pixel in (candidates.brightest, candidates.highest)
+    )
+    return (
+        f"saturation: the brightest pixels of {piled} stars agree from {level:.6g} counts on, as "
+        f"if cut off; {flagged} stamps have such pixels and are not learnt from, --saturate "
+        f"{level:.6g} flags these, too"
+    )
+
+
+def gain_advice(candidates: Candidates) -> str:
+    """Return advice on the gain by sky and noise, if photons make it: variance = level / gain."""
+    sky, noise = float(np.median(candidates.sky)), float(np.median(candidates.noise))
+    sky_text = f"gain: the sky is {sky:.4g} counts, its noise {noise:.3g}"
+    # A sky of fewer than 3 σ was probably subtracted.
+    if not sky > 3.0 * noise > 0:
+        return f"{sky_text}; it was probably subtracted, and says nothing of the gain"
+    return (
+        f"{sky_text}; if photons make it and no bias or sky was subtracted or added, "
+        f"--gain {sky / noise**2:.3g} is right"
+    )
+
+
+def stamp_advice(
+    candidates: Candidates, stamp_px: int, light_wanted: float = 0.985, step_px: int = 4
+) -> str | None:
+    """Return advice on the stamps: light of the median star in squares, and how many overlap.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    stamp_px : int
+        Side of the stamps now.
+    light_wanted : float
+        Part of a star's light, as far as it is seen, that a stamp should hold.
+    step_px : int
+        Difference of two sides from which it is worth a word.
+
+    Returns
+    -------
+    str or None
+        None if the stamps are about right.
+    """
+    # Light of the median star in squares of 8 px, the smallest stamps of a model, and more.
+    typical = np.median(candidates.bright.aligned(), axis=0)[None]
+    sides = np.arange(8, typical.shape[-1] + 1, 2)
+    light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
+    needed = int(sides[np.argmax(light >= light_wanted)])
+    if abs(needed - stamp_px) < step_px:
+        return None
+    shared = ", ".join(
+        f"{100 * overlapping(candidates.position, side):.0f} % of {side} px"
+        for side in (stamp_px, needed)
+    )
+    return (
+        f"stamp size: {100 * light_wanted:g} % of the median star's light are within {needed} px; "
+        f"another star of the list stands in {shared}: framing.stamp_px={needed} is worth a trial"
+    )

@@ -1,0 +1,243 @@
+"""Criteria for stars that are good enough to learn the PSF from.
+
+In: measurements and stamps of n stars, (n,) and (n, s, s); the star of a stamp lies near index
+(s//2, s//2). Out: one value for each star. `selection` applies them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import repeat
+
+import numpy as np
+
+from psfdae.image.stamps import cut, peaks, softened
+from psfdae.moments import robust_scatter
+
+# Brightness.
+
+
+def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
+
+    For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with
+    the noise-equivalent area A = 1/Σp² is what stays (King 1983, PASP 95, 163). No
+    PSF has to be known. 0 where the noise is 0.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted.
+    noise : ndarray, shape (n,)
+        RMS σ of a pixel.
+    """
+    power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
+    safe = np.where(noise > 0, noise, np.inf)
+    return np.asarray(np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0)))
+
+
+def brightest_pixels(
+    stamps: np.ndarray, search_px: int, centring_px: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the brightest pixel near the middle of every stamp.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, s, s)
+    search_px : int
+        Searched within ± this of the middle.
+    centring_px : float
+        FWHM of the Gaussian that smooths the stamps before; 0: none.
+
+    Returns
+    -------
+    peak : ndarray of int, shape (n, 2)
+        (row, column) from index (s//2, s//2).
+    inside : ndarray of bool, shape (n,)
+        True if no pixel just outside the search window is brighter.
+    """
+    middle, reach = stamps.shape[-1] // 2, search_px + 1
+    window = slice(middle - reach, middle + reach + 1)
+    peak = peaks(softened(stamps, centring_px)[:, window, window]) - reach
+    return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
+
+
+def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
+    """Return the counts from which brightest pixels of stars pile up; infinite if none do.
+
+    Stars of the same brightness have the same brightest pixels, too. Of those that are cut
+    off, the brightest pixel is less of the star than in others.
+
+    Parameters
+    ----------
+    brightest : ndarray, shape (n,)
+        Pixel of every star, counts, sky included.
+    sky, brightness : ndarray, shape (n,)
+        Level in counts, and light of the star in any unit.
+    """
+    height = brightest - sky
+    top = height.max(initial=0.0)
+    # Three stars or more whose brightest pixels agree within 3 %, and fainter ones to compare with.
+    piled = height >= 0.97 * top
+    fainter = (height >= 0.1 * top) & ~piled
+    if top <= 0 or piled.sum() < 3 or not fainter.any():
+        return np.inf
+    # Cut off, they are less of their star than in fainter stars, by a tenth.
+    sharpness = height / np.where(brightness > 0, brightness, 1.0)
+    if np.median(sharpness[piled]) > 0.9 * np.median(sharpness[fainter]):
+        return np.inf
+    # Six digits, rounded down, so that a level that is printed is the one that is meant.
+    level = float(brightest[piled].min())
+    unit = 10.0 ** (np.floor(np.log10(level)) - 5) if level > 0 else 1.0
+    return float(f"{np.floor(level / unit * (1 + 1e-12)) * unit:.6g}")
+
+
+# Neighbours.
+
+
+def crowded(
+    position: np.ndarray, brightness: np.ndarray, distance_px: float, ratio: float
+) -> np.ndarray:
+    """Return True for stars with a neighbour of at least `ratio` of their brightness nearby, (n,).
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        In pixels; a star at NaN has no neighbours.
+    brightness : ndarray, shape (n,)
+    distance_px, ratio : float
+    """
+    from scipy.spatial import cKDTree
+
+    # Each pair both ways round.
+    located = np.flatnonzero(np.isfinite(position).all(axis=1))
+    is_crowded = np.zeros(len(position), dtype=bool)
+    pairs = located[cKDTree(position[located]).query_pairs(distance_px, output_type="ndarray")]
+    for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        is_crowded[first[brightness[second] >= ratio * brightness[first]]] = True
+    return is_crowded
+
+
+def overlapping(position: np.ndarray, side: int) -> float:
+    """Return the part of the stars (n, 2) in whose stamps of a side another one stands."""
+    from scipy.spatial import cKDTree
+
+    located = position[np.isfinite(position).all(axis=1)]
+    if len(located) < 2:
+        return 0.0
+    distance, _ = cKDTree(located).query(located, k=2, p=np.inf)
+    return float((distance[:, 1] < 0.5 * side).mean())
+
+
+# Size and shape.
+
+
+def sharper_than_stars(area: np.ndarray) -> np.ndarray:
+    """Return which sources (n,) have a far smaller noise-equivalent area than the median source.
+
+    Less than half of it, and less by more than five times the scatter: that of stars changes with
+    the place in the field, and with the phase on the pixel grid where stars are narrow.
+    """
+    if len(area) < 4:
+        return np.zeros(len(area), dtype=bool)
+    size = np.log(area)
+    limit = max(np.log(2.0), 5.0 * float(robust_scatter(size)))
+    return np.asarray(size < np.median(size) - limit)
+
+
+def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return which sources have a far larger noise-equivalent area than the stars around them.
+
+    Stars have nearly one size, other sources any: of the logarithms of all areas, each less the
+    lower quartile of those of its nearest sources, the stars are the shortest interval that has a
+    quarter of them. Sources above it by a factor of 1.5, and by more than five times the scatter
+    that the interval implies, are no stars; the interval is then searched again. Where the PSF
+    changes over the field, so do the sources around.
+
+    Parameters
+    ----------
+    area : ndarray, shape (n,)
+    position : ndarray, shape (n, 2)
+        In the image; all sources are near where one is not finite.
+    """
+    from scipy.spatial import cKDTree
+
+    is_wide = np.zeros(len(area), dtype=bool)
+    if len(area) < 8:
+        return is_wide
+    size = np.log(area)
+    for _ in range(10):
+        star = np.flatnonzero(~is_wide)
+        if len(star) < 8:
+            break
+        # Size beside that of the nearest eight: usually one of these is a star.
+        around = size[star] * np.ones((len(size), 1))
+        if np.isfinite(position).all():
+            around = size[star][cKDTree(position[star]).query(position, k=8)[1]]
+        excess = size - np.percentile(around, 25, axis=1)
+        # A quarter of a normal distribution about its middle has the width 0.637 σ.
+        ordered, count = np.sort(excess[star]), -(-len(star) // 4)
+        width = ordered[count:] - ordered[:-count]
+        first = int(width.argmin())
+        local_area, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
+        is_wider = excess > local_area + max(np.log(1.5), 5.0 * float(scatter))
+        if not (is_wider & ~is_wide).any():
+            break
+        is_wide |= is_wider
+    return is_wide
+
+
+def misfit(
+    aligned: np.ndarray, position: np.ndarray, noise: np.ndarray, companions: int = 12
+) -> np.ndarray:
+    """Return how unlike its neighbours each star is, in what is usual in this image, shape (n,).
+
+    A star is compared with the nearest stars, pixel by pixel: its
+    difference from their median in units of their robust scatter, root mean square
+    over the stamp, or over the worst 3 × 3 pixels of its core: a close companion and a core that is
+    flat or hollow are no more than that. Where the PSF varies, so do the neighbours; a
+    companion or a cosmic ray lies where they agree. The median star has 1, in its worst
+    pixels 1/1.2, because the worst pixels of good stars scatter more than their stamps as a whole.
+
+    Parameters
+    ----------
+    aligned : ndarray, shape (n, d, d)
+        Of flux 1, moved to a common centre.
+    position : ndarray, shape (n, 2)
+        In the image; all stars are neighbours where a position is not finite.
+    noise : ndarray, shape (n,)
+        RMS of a pixel over the flux.
+    companions : int
+        Number of nearest stars with which a star is compared.
+    """
+    from scipy import ndimage
+    from scipy.spatial import cKDTree
+
+    count, side = len(aligned), aligned.shape[-1]
+    if count < 4:
+        return np.ones(count)
+
+    def usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return median and robust variance of every pixel of some stars, (d, d) each."""
+        scatter = robust_scatter(stars)
+        # A dozen stars may agree in a pixel by chance.
+        return np.median(stars, axis=0), scatter**2 + np.median(scatter) ** 2
+
+    local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
+    if np.isfinite(position).all() and count > companions:
+        neighbours = cKDTree(position).query(position, k=companions + 1)[1]
+        local_medians = (
+            usual(aligned[nearest[nearest != star]]) for star, nearest in enumerate(neighbours)
+        )
+    else:
+        local_medians = repeat(usual(aligned), count)
+    # Half of the stamp, or 8 px if that is more: farther out is no place for a faint neighbour.
+    core_px = min(side, max(side // 2, 8))
+    score = np.empty((count, 2))
+    for star, (median, variance) in enumerate(local_medians):
+        # χ² of each pixel; its mean, and the largest mean of 3 × 3 pixels.
+        square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
+        patches = ndimage.uniform_filter(square, 3)[None]
+        score[star] = square.mean(), cut(patches, core_px).max()
+    score = np.sqrt(score)
+    return np.asarray((score / np.median(score, axis=0) / (1.0, 1.2)).max(axis=1))

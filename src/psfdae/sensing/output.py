@@ -1,0 +1,147 @@
+"""Output of measured wavefronts: the FITS file with all results, and the report for a terminal.
+
+In: `psfdae.sensing.results.Wavefronts`. The command `psfdae wavefront` writes and prints both.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.image.errors import ascii_line
+from psfdae.image.tables import fits_values
+from psfdae.sensing.joint import Joint
+from psfdae.sensing.results import Wavefronts
+from psfdae.version import __version__
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList
+
+
+def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
+    """Return the FITS file with all results.
+
+    Its extensions are WAVEFRONT (table), PSF, UNCERT, MODEL, RESIDUAL (cubes), COVAR and, with
+    a joint fit, JOINT (table).
+    """
+    from astropy.io import fits
+
+    # What was measured, with which telescope and prior.
+    primary = fits.PrimaryHDU()
+    prior = wavefronts.telescope.prior
+    primary.header.extend(
+        [
+            ("CREATOR", f"psfdae {__version__}", ""),
+            ("INFILE", ascii_line(image), "stars"),
+            ("TELESCOP", wavefronts.telescope.name, "its description gave the optics"),
+            ("WAVELEN", wavefronts.telescope.wavelength_m, "[m] wavelength"),
+            ("PRIORFRA", prior.fraction, "prior: standard deviation, part of each term"),
+            ("NSTARS", len(wavefronts.stamps), "stars"),
+            ("NPOOR", int((~wavefronts.explained).sum()), "stars that no wavefront explains"),
+        ]
+    )
+    # A row for each mode of a star, that is, each wavefront that its image does not exclude.
+    modes = wavefronts.table
+    if modes["id"].dtype.kind == "U":
+        modes["id"] = fits_values(modes["id"])
+    table = fits.table_to_hdu(modes)
+    table.name = "WAVEFRONT"
+    table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."
+    # Covariances of the coefficients of each mode; NaN for stars without usable pixels, which
+    # have a row in the table, but no mode.
+    of_modes = wavefronts.summary["covariance"]
+    covariance = np.full((len(modes), *of_modes.shape[1:]), np.nan)
+    covariance[np.isfinite(modes["probability"])] = of_modes
+    # Images of each star: its PSF with errors, and the residuals of the pixels that were used.
+    psf, psf_error = wavefronts.psf_and_error()
+    sky = wavefronts.measured()["sky"][:, None, None]
+    residual = np.where(
+        wavefronts.stamps.bad | wavefronts.stamps.saturated,
+        np.nan,
+        wavefronts.stamps.data - sky - wavefronts.model,
+    )
+    hdus = [primary, table]
+    for name, values, comment in (
+        ("PSF", psf, "whole light 1, chief ray in the middle"),
+        ("UNCERT", psf_error, "standard deviation of PSF"),
+        ("MODEL", wavefronts.model, "star without sky, unit of the input"),
+        ("RESIDUAL", residual, "stamp minus sky minus model, NaN where unused"),
+        ("COVAR", covariance, "of the coefficients, squared waves; row by row"),
+    ):
+        hdu = fits.ImageHDU(values.astype(np.float32), name=name)
+        hdu.header["COMMENT"] = comment
+        hdus.append(hdu)
+    # State of the telescope, if one was fitted to all stars: a row for each of its numbers.
+    if wavefronts.joint is not None:
+        joint = wavefronts.joint
+        state = fits.table_to_hdu(joint.table)
+        state.name = "JOINT"
+        state.header["PROB"] = (joint.probability, "of this state against its twin")
+        hdus.append(state)
+    return fits.HDUList(hdus)
+
+
+def report_lines(wavefronts: Wavefronts) -> list[str]:
+    """Return a table of the errors of one star, and sentences on the modes and the telescope.
+
+    Errors are medians over the stars, in waves and in nanometres.
+    """
+    terms, summary = wavefronts.terms, wavefronts.summary
+    # Modes stand star by star, the most probable one first: the first row of each star.
+    first = np.flatnonzero(np.diff(summary["star"], prepend=-1))
+    error = np.sqrt(np.einsum("mkk->mk", summary["covariance"][first]))
+    wavelength_nm = wavefronts.wavelength_nm
+    lines = [
+        f"prior of {wavefronts.telescope.name}: every coefficient about the telescope's own, with "
+        "the standard deviation of the column prior",
+        f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   of one star, median of {len(first)}",
+        f"{'':12}{'(waves)':>10}{'(waves)':>10}{'(nm)':>10}",
+    ]
+    for k, name in enumerate(terms.names):
+        prior = np.median(terms.sd[summary["star"][first], k])
+        term_error = np.median(error[:, k])
+        lines.append(f"{name:12}{prior:10.4f}{term_error:10.4f}{wavelength_nm * term_error:10.2f}")
+    # One wave of OPD is a wavelength.
+    rms_nm = wavelength_nm * np.nanmedian(wavefronts.rms[0])
+    ambiguous = np.mean(summary["probability"][first] < 0.95)
+    lines.append(
+        f"RMS of the wavefronts {rms_nm:.3g} nm in the median; {ambiguous:.0%} of the stars have a "
+        "second wavefront with a probability above 5 %"
+    )
+    return lines if wavefronts.joint is None else lines + joint_report_lines(wavefronts.joint)
+
+
+def joint_report_lines(joint: Joint) -> list[str]:
+    """Return a table of the telescope's state, and sentences on how well stars determine it.
+
+    The table has the prior of each number and its fitted value, both with standard deviations.
+    """
+    lines = [
+        f"the telescope, from {joint.star.size} stars together:",
+        f"{'number':16}{'unit':>6}{'prior':>12}{'± ':>11}{'found':>12}{'± ':>11}",
+    ]
+    form = "{:16}{:>6}{:12.4g}{:11.2g}{:12.4g}{:11.2g}"
+    lines += [
+        form.format(*row)
+        for row in joint.table["name", "unit", "prior", "prior_error", "value", "error"]
+    ]
+    # Two numbers that change the image alike are known worse than their errors suggest, each by
+    # itself: name pairs with a correlation above 0.5.
+    correlated = np.argwhere(np.triu(np.abs(joint.correlation) > 0.5, 1))
+    if len(correlated):
+        pairs = [
+            f"{joint.model.names[i]}, {joint.model.names[j]} {joint.correlation[i, j]:+.2f}"
+            for i, j in correlated
+        ]
+        lines.append(f"correlations of errors: {'; '.join(pairs)}")
+    if joint.twin is not None:
+        lines.append(
+            f"its probability is {joint.probability:.3f}; the twin, of the other sign of focus, "
+            f"astigmatism and spherical aberration, has the rest"
+        )
+    disagreeing = int(joint.disagrees.sum())
+    lines.append(
+        f"{disagreeing} of {joint.star.size} stars disagree with it by more than 4 σ of their χ²"
+    )
+    return lines

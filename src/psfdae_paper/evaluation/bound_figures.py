@@ -1,0 +1,304 @@
+"""Figures of the bounds: how far the errors of methods are above the least possible ones.
+
+In go the tables of the stages `bounds` and `efficiency`; out come matplotlib figures. Rows of other
+datasets in these tables are not drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from psfdae.figures import (
+    SERIES_COLORS,
+    WIDTH_IN,
+    StripRow,
+    draw_row,
+    in_inches,
+    new_figure,
+    styled,
+)
+from psfdae.method import Method
+from psfdae.methods import method
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.evaluation import drawing
+from psfdae_paper.evaluation.drawing import Panel, Style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MEANS: dict[str, Style] = {
+    "bayes": {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"},
+    "bayes_position": {
+        "color": "#8c510a",
+        "marker": "v",
+        "label": "posterior mean, given the field",
+    },
+}
+"""Looks of both posterior means; a marker is open where the bank has too few similar stars."""
+
+FLOOR = {"color": "#7f7f7f", "label": "local floor: field and centring known"}
+"""Look of the floor."""
+
+
+@styled
+def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
+    """Draw the MSE of every method against the noise level, with both bounds.
+
+    Parameters
+    ----------
+    efficiency, bounds : DataFrame
+        Tables of the stages of these names.
+    dataset : str
+    """
+    from matplotlib.patches import Patch
+
+    measured = efficiency[efficiency.dataset == dataset]
+    limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
+    figure, panels = drawing.reference_panels(limits)
+    for axes, reference, rows in panels:
+        # The rows of each method are repeated for the floor, together with posterior means.
+        methods = measured[(measured.reference == reference) & (measured.bound != "floor")]
+        for method_class, errors in drawing.by_method(methods.sort_values("noise_level")):
+            axes.plot(errors["noise_level"], errors["mse"], **drawing.method_line(method_class))
+        for name, look in MEANS.items():
+            _draw_posterior_mean(axes, rows[rows.method == name].sort_values("noise_level"), look)
+        _whole_noise_axis(axes, rows)
+    # One logarithmic axis for all panels, down to the floor, with room for the zeros below it.
+    first = panels[0][0]
+    first.set_yscale("log")
+    bottom = _draw_floor(panels, limits)
+    if bottom is not None:
+        first.set_ylim(bottom=bottom)
+    if (limits["value"] == 0).any():
+        first.set_ylim(bottom=0.5 * first.get_ylim()[0])
+    # Legend; an open marker is explained if a posterior mean is not tight at some level.
+    handles = drawing.method_entries(set(measured["method"]))
+    for name, look in MEANS.items():
+        tightness = set(limits["tight"][limits.method == name])
+        if tightness:
+            handles.append(drawing.legend_entry(**look, ls="--", lw=1.2, ms=6))
+        if "no" in tightness:
+            open_marker = {**look, "mfc": "white", "label": "its draws too few: upper limit"}
+            handles.append(drawing.legend_entry(**open_marker, ls="--", lw=1.2, ms=6))
+    if "floor" in set(limits["method"]):
+        handles.append(Patch(facecolor=FLOOR["color"], alpha=0.35, label=FLOOR["label"]))
+    title = f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars"
+    drawing.finish_panels(figure, panels, title, handles, 3)
+    return figure
+
+
+@styled
+def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
+    """Draw bound over MSE of every method against the noise level, one panel per reference.
+
+    `efficiency` is the table of the stage of this name.
+    """
+    measured = efficiency[efficiency.dataset == dataset]
+    # Posterior means are in the table, too, but are no methods.
+    names = [method_class.name for method_class in registered()]
+    figure, panels = drawing.reference_panels(measured)
+    for axes, _, rows in panels:
+        # Solid lines relative to the posterior mean, dotted lines relative to the floor.
+        method_rows = rows[rows.method.isin(names)].sort_values("noise_level")
+        for method_class, errors in drawing.by_method(method_rows):
+            for bound, values in errors.groupby("bound"):
+                style = drawing.method_line(method_class)
+                style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
+                axes.plot(values["noise_level"], values["efficiency"], **style)
+        axes.axhline(1.0, color="black", lw=1.0)
+        if method_rows["efficiency"].isna().all():
+            axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
+        _whole_noise_axis(axes, rows)
+    panels[0][0].set_yscale("log")
+    panels[0][0].set_ylim(top=2.0)
+    # Line styles of both bounds, as far as they are drawn.
+    handles = drawing.method_entries(set(measured["method"]))
+    drawn_rows = measured[measured.method.isin(names)].dropna(subset=["efficiency"])
+    is_floor = drawn_rows["bound"] == "floor"
+    if (~is_floor).any():
+        handles.append(
+            drawing.legend_entry("against the posterior mean, where tight", ls="-", lw=1.6)
+        )
+    if is_floor.any():
+        handles.append(drawing.legend_entry("against the local floor", ls=":", lw=1.6))
+    title = f"{dataset}: efficiency against the noise level, 1 = no better is possible"
+    drawing.finish_panels(figure, panels, title, handles, 3, "efficiency: bound / MSE")
+    return figure
+
+
+@styled
+def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
+    """Draw the error of the posterior mean against the size of the bank.
+
+    `growth` is the growth table of the stage `bounds`; there is one panel per reference.
+    """
+    dataset_rows = growth[growth.dataset == dataset]
+    figure, panels = drawing.reference_panels(dataset_rows)
+    levels = np.unique(dataset_rows["noise_level"])
+    colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
+    for axes, _, rows in panels:
+        # Measured errors as lines with markers, the limit of the fit as a dashed line.
+        for (level, name), sizes in rows.sort_values("draws").groupby(["noise_level", "method"]):
+            color, marker = colors[level], MEANS[str(name)]["marker"]
+            axes.plot(sizes["draws"], sizes["mse"], color=color, marker=marker, ms=4.5, lw=1.4)
+            axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
+        draws = np.unique(rows["draws"])
+        drawing.log_axis(axes, draws, [f"{count:d}" for count in draws])
+        axes.set_xlabel("draws of the simulator in the bank")
+    # Colours are noise levels; markers are the posterior mean with and without the field.
+    handles = [
+        drawing.legend_entry(f"λ = {level:g}", color=color, marker="o", ms=4.5, lw=1.4)
+        for level, color in colors.items()
+    ]
+    handles += [
+        drawing.legend_entry(**look | {"color": "black"}, ls="", ms=4.5) for look in MEANS.values()
+    ]
+    handles.append(drawing.legend_entry("limit of the fit", ls="--", lw=1.0))
+    title = f"{dataset}: the posterior mean over banks of growing size"
+    drawing.finish_panels(figure, panels, title, handles, 4)
+    return figure
+
+
+def _whole_noise_axis(axes: Axes, rows: pd.DataFrame) -> None:
+    """Show all noise levels of a table, with 5 % of the axis' length beyond either end."""
+    levels = np.unique(rows["noise_level"])
+    drawing.noise_axis(axes, levels)
+    margin_factor = max(levels.max() / levels.min(), 2.0) ** 0.05
+    axes.set_xlim(levels.min() / margin_factor, levels.max() * margin_factor)
+
+
+def _draw_posterior_mean(axes: Axes, rows: pd.DataFrame, look: Style) -> None:
+    """Draw a posterior mean with its confidence intervals, and "0" below errors that are 0."""
+    color = look["color"]
+    # Zeros of both posterior means stand on either side of their level.
+    side: Style = {"ha": "right" if look is MEANS["bayes"] else "left", "weight": "bold"}
+    for level in rows["noise_level"][rows.value == 0]:
+        axes.text(level, 0.02, "0", transform=axes.get_xaxis_transform(), color=color, **side)
+    rows = rows[rows.value > 0]
+    level, value = rows["noise_level"].to_numpy(), rows["value"].to_numpy()
+    half_widths = np.maximum([value - rows["ci_low"], rows["ci_high"] - value], 0.0)
+    axes.errorbar(level, value, yerr=half_widths, color=color, ls="--", lw=1.2, capsize=3)
+    # Filled markers where the bound is tight, open ones elsewhere.
+    tight = (rows["tight"] == "yes").to_numpy()
+    for selected, fill in ((tight, color), (~tight, "white")):
+        style: Style = {"color": color, "marker": look["marker"], "mfc": fill, "ms": 6, "ls": ""}
+        axes.plot(level[selected], value[selected], zorder=3, **style)
+
+
+def _draw_floor(panels: Sequence[Panel], limits: pd.DataFrame) -> float | None:
+    """Shade the area below the floor; return the lower end of the axis, None without a floor."""
+    floor = limits[limits.method == "floor"].sort_values("noise_level")
+    if floor.empty:
+        return None
+    # The axis ends a factor of two below the lowest value.
+    bottom = 0.5 * float(floor["value"].min())
+    for axes, reference, _ in panels:
+        rows = floor[floor.reference == reference]
+        if rows.empty:
+            continue
+        level, value = rows["noise_level"], rows["value"]
+        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
+        axes.plot(level, value, color=FLOOR["color"], lw=1.6)
+    return bottom
+
+
+@styled
+def headline(
+    rows: Sequence[StripRow],
+    methods: Sequence[Method],
+    efficiency: pd.DataFrame,
+    bounds: pd.DataFrame,
+    titles: Sequence[str],
+) -> Figure:
+    """Draw stars in rows at the left, and MSE against the noise level at the right.
+
+    Parameters
+    ----------
+    rows : sequence of StripRow
+        Stamps are on the colour scale of the last row, the truth, unless a row has `own_scale`.
+    methods : sequence of Method
+        Methods whose errors are drawn, by descending error.
+    efficiency, bounds : DataFrame
+        Tables of the stages of these names, for one dataset and reference.
+    titles : sequence of str
+        Title of the left and of the right part.
+    """
+    figure = new_figure(3.7)
+    # Stamps: left edge and sizes of the cells in fractions of the figure, then in inches.
+    left, bottom, top = 0.115, 0.13, 0.86
+    columns = len(rows[0].images)
+    cell_width, cell_height = 0.395 / columns, (top - bottom) / len(rows)
+    cell = (cell_width * WIDTH_IN, cell_height * figure.get_figheight())
+    peak, stamps = rows[-1].images.max(axis=(1, 2)), in_inches(figure)
+    for number, row in enumerate(rows, 1):
+        row_bottom = top * figure.get_figheight() - number * cell[1]
+        draw_row(stamps, row, (left * WIDTH_IN, row_bottom), cell, peak)
+    figure.text(left + 0.5 * columns * cell_width, 0.92, titles[0], ha="center", fontsize=10)
+    panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
+    _draw_errors(panel, methods, efficiency, bounds)
+    figure.text(0.66 + 0.5 * 0.325, 0.92, titles[1], ha="center", fontsize=10)
+    return figure
+
+
+def _draw_errors(
+    axes: Axes, methods: Sequence[Method], efficiency: pd.DataFrame, bounds: pd.DataFrame
+) -> None:
+    """Draw errors of the methods and both bounds, each line with its name."""
+    for estimator in methods:
+        line = efficiency[efficiency.method == estimator.name].drop_duplicates("noise_level")
+        line = line.sort_values("noise_level")
+        style = {**drawing.method_line(type(estimator)), "lw": 1.6, "ms": 5}
+        axes.plot(line["noise_level"], line["mse"], **style)
+        # The name of the lowest line is below its first point, because the next line is near.
+        is_lowest = estimator is methods[-1]
+        named = line[:1] if is_lowest else line
+        # The label in brackets, what the method is given, is beside its stars.
+        name = estimator.look.label.partition(" (")[0]
+        color = estimator.look.color
+        _write_name(axes, named["noise_level"], named["mse"], name, color, below=is_lowest)
+    # Errors if the optics of the telescope are known.
+    optics = method("wavefront")
+    line = efficiency[efficiency.method == optics.name].drop_duplicates("noise_level")
+    if len(line):
+        line = line.sort_values("noise_level")
+        axes.plot(
+            line["noise_level"], line["mse"], **{**drawing.method_line(optics), "lw": 1.6, "ms": 8}
+        )
+        # The line nearly coincides with the posterior mean: its name is below that one's name.
+        color = optics.look.color
+        label_height = 0.6 * line["mse"]
+        _write_name(axes, line["noise_level"], label_height, "telescope known", color, below=True)
+    # Posterior mean, with markers where it is tight, and the area below the local floor.
+    bayes = bounds[bounds.method == "bayes"].sort_values("noise_level")
+    tight = bayes[bayes.tight == "yes"]
+    color = MEANS["bayes"]["color"]
+    axes.plot(bayes["noise_level"], bayes["value"], color=color, ls="--", lw=1.2)
+    axes.plot(tight["noise_level"], tight["value"], color=color, marker="o", ls="", ms=5)
+    _write_name(axes, bayes["noise_level"], bayes["value"], "least possible", color, below=True)
+    floor = bounds[bounds.method == "floor"].sort_values("noise_level")
+    axes.set_yscale("log")
+    if not floor.empty:
+        bottom = 0.6 * float(floor["value"].min())
+        level, value = floor["noise_level"], floor["value"]
+        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
+        axes.set_ylim(bottom=bottom)
+        _write_name(axes, level, 0.7 * value, "local floor", "#555555", below=True)
+    drawing.noise_axis(axes, np.unique(bayes["noise_level"]))
+    drawing.readable_log_axis(axes)
+    axes.grid(True, which="major")
+    axes.set_ylabel(drawing.METRIC_LABELS["mse"], fontsize=8)
+
+
+def _write_name(
+    axes: Axes, level: pd.Series, value: pd.Series, name: str, color: str, *, below: bool = False
+) -> None:
+    """Write the name of a line beside its second point, where lines are separate."""
+    point = min(1, len(level) - 1)
+    position = (float(level.iloc[point]), float(value.iloc[point]))
+    offset, ha, va = ((6, -3), "left", "top") if below else ((-2, 5), "right", "bottom")
+    axes.annotate(name, position, offset, textcoords="offset points", color=color, ha=ha, va=va)

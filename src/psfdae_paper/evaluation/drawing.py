@@ -1,0 +1,146 @@
+"""Axes, line styles and legends that figures of tables share.
+
+In go the rows of a table; out come panels with the axis of noise levels, a readable logarithmic
+axis of errors, one line style for each method and a legend below all panels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Set
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from psfdae.figures import REFERENCES, new_figure
+from psfdae.method import Method
+from psfdae.methods import method
+from psfdae_paper.configuration.methods import oracles_last
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+METRIC_LABELS = {
+    "mse": "MSE per pixel (stamp sum = 1)",
+    "ssim": "SSIM, data range fitted to the paper",
+}
+"""Labels of axes by metric."""
+
+Style = dict[str, Any]
+"""Keyword arguments of a line."""
+
+Panel = tuple["Axes", str, pd.DataFrame]
+"""Axes of a reference, its name, and its rows of a table."""
+
+
+def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
+    """Make a figure with one titled panel for each reference of a table.
+
+    The panels stand side by side, in the order of `REFERENCES`, and share the axis of errors.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Rows with a column `reference`.
+
+    Returns
+    -------
+    figure : Figure
+    panels : list of (Axes, str, DataFrame)
+        Axes, name of the reference and its rows.
+    """
+    figure = new_figure(4.9, layout="constrained")
+    present = set(table["reference"])
+    references = [name for name in REFERENCES if name in present]
+    all_axes = figure.subplots(1, len(references), squeeze=False, sharey=True)[0]
+    for axes, name in zip(all_axes, references, strict=True):
+        # What is in brackets goes to a second line: two panels share the width of the figure.
+        axes.set_title(REFERENCES[name].replace(" (", "\n("))
+        axes.grid(True, which="major")
+    rows = [table[table.reference == name] for name in references]
+    return figure, list(zip(all_axes, references, rows, strict=True))
+
+
+def finish_panels(
+    figure: Figure,
+    panels: Sequence[Panel],
+    title: str,
+    handles: Sequence[Artist],
+    columns: int,
+    label: str = METRIC_LABELS["mse"],
+    logarithmic: bool = True,
+) -> None:
+    """Label the common axis of errors, and add the title and the legend below the panels."""
+    first = panels[0][0]
+    if logarithmic:
+        first.set_yscale("log")
+        readable_log_axis(first)
+    first.set_ylabel(label)
+    figure.suptitle(title)
+    figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
+
+
+def by_method(table: pd.DataFrame) -> list[tuple[type[Method], pd.DataFrame]]:
+    """Return the methods of a table by name, and the rows of each."""
+    return [(method(str(name)), rows) for name, rows in table.groupby("method")]
+
+
+def method_line(method_class: type[Method]) -> Style:
+    """Return the style of a method's line."""
+    look = method_class.look
+    return {"color": look.color, "marker": look.marker, "lw": 1.4, "ms": 4.5}
+
+
+def paper_marker(method_class: type[Method]) -> Style:
+    """Return the style of the paper's published values: an open marker without a line."""
+    return {**method_line(method_class), "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
+
+
+def legend_entry(label: str, **style: Any) -> Artist:
+    """Return an entry of a legend with the style of a line, black unless it has a colour."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **{"color": "black", **style}, label=label)
+
+
+def method_entries(methods: set[str], published: Set[str] = frozenset()) -> list[Artist]:
+    """Return legend entries of measured methods, each followed by the paper's open marker."""
+    entries: list[Artist] = []
+    for method_class in oracles_last(methods | published):
+        label = method_class.look.label
+        if method_class.name in methods:
+            entries.append(legend_entry(label, **method_line(method_class)))
+        if method_class.name in published:
+            entries.append(legend_entry(f"{label}, paper", **paper_marker(method_class)))
+    return entries
+
+
+def noise_axis(axes: Axes, levels: np.ndarray) -> None:
+    """Make the x axis logarithmic, with a tick at each noise level λ.
+
+    The common power of ten is in the label of the axis.
+    """
+    # Rounding must not make log10(1e-3) less than −3.
+    power = int(np.floor(np.log10(levels.min()) + 1e-9))
+    log_axis(axes, levels, [f"{level / 10.0**power:g}" for level in levels])
+    axes.set_xlabel(rf"noise level λ ($\times 10^{{{power}}}$)")
+
+
+def log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
+    """Make the x axis logarithmic with these ticks and no others."""
+    from matplotlib.ticker import NullLocator
+
+    axes.set_xscale("log")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xticks(ticks, labels=labels)
+
+
+def readable_log_axis(axes: Axes) -> None:
+    """Write numbers on the y axis between decades, too: it often spans only one or two."""
+    from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
+
+    axes.yaxis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(10, 10)))
+    axes.yaxis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,102 @@
+"""Errors of estimates on the stars of a part: what every table of errors is made of.
+
+In go restored images of some stars; out come rows of the summary (mean and standard error of each
+metric) and a table with the errors of every single star.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from psfdae.files import Product, ProductError
+from psfdae.method import Estimate
+from psfdae.metrics import quality, summarised
+from psfdae.model.star_sets import field_positions
+from psfdae.reading import read_table
+
+CELL = ["dataset", "split", "reference", "noise_level"]
+"""Columns that identify a column of the paper's tables: methods are compared inside it."""
+
+COLUMNS = [*CELL[:3], "method", "noise_level", "metric", "value", "stderr", "n"]
+"""Columns of the summary."""
+
+
+def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> pd.DataFrame:
+    """Join CSV files.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    columns : sequence of str, optional
+        Columns to take from each file; by default those of the first.
+
+    Raises
+    ------
+    ProductError
+        If a file is missing or damaged, or has not all columns.
+    """
+    tables = [read_table(path) for path in paths]
+    columns = list(tables[0].columns if columns is None else columns)
+    for path, table in zip(paths, tables, strict=True):
+        if missing := [name for name in columns if name not in table]:
+            raise ProductError(f"{path}: column {missing[0]!r} is missing")
+    # Tables without rows would change the types of columns.
+    tables = [table for table in tables if len(table)] or tables[:1]
+    return pd.concat([table[columns] for table in tables], ignore_index=True)
+
+
+class MeasuredStars(NamedTuple):
+    """Stars on which estimates are measured; every array has n rows.
+
+    Attributes
+    ----------
+    star : ndarray of int, shape (n,)
+        Index of the star in its product.
+    field : ndarray of int, shape (n,)
+        Field of the star; standard errors are clustered by field.
+    position : ndarray, shape (n, 2)
+        Position in the field, as methods are given it.
+    truth : ndarray, shape (n, d, d)
+        Noise-free image that the estimate is compared with, sum 1.
+    """
+
+    star: np.ndarray
+    field: np.ndarray
+    position: np.ndarray
+    truth: np.ndarray
+
+    @classmethod
+    def of(cls, product: Product, star: np.ndarray, reference: str) -> MeasuredStars:
+        """Take some stars of a product "stars", with one of its references as the truth."""
+        field, position = product["field_index"][star], field_positions(product)[star]
+        return cls(star, field, position, product[reference][star])
+
+    def errors(
+        self, row: Mapping[str, object], estimate: Estimate, data_range: float
+    ) -> tuple[list[dict[str, object]], pd.DataFrame]:
+        """Measure one method at one noise level.
+
+        Parameters
+        ----------
+        row : mapping
+            The first columns of both tables: those that name dataset, method and noise level.
+        estimate : Estimate
+            Restored images of the stars, shape (n, d, d), and their errors if the method has them.
+        data_range : float
+            Dynamic range of the SSIM.
+
+        Returns
+        -------
+        summary : list of dict
+            A row of `COLUMNS` for each metric, with its standard error clustered by field.
+        per_star : DataFrame
+            `row`, star, field, and a column for each metric.
+        """
+        metrics = quality(estimate, self.truth, data_range)
+        per_star = pd.DataFrame({**row, "star": self.star, "field": self.field, **metrics})
+        return summarised(row, metrics, self.field), per_star
