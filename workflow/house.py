@@ -61,10 +61,10 @@ def measured(folder):
         text = path.read_text(encoding="utf-8")
         tree = ast.parse(text)
         texts = list(text_nodes(tree))
-        spoken = {i for node, _ in texts for i in range(node.lineno, node.end_lineno + 1)}
+        docstring_lines = {i for node, _ in texts for i in range(node.lineno, node.end_lineno + 1)}
         for number, line in enumerate(text.splitlines(), 1):
             bare = line.strip()
-            is_code = bool(bare) and not bare.startswith("#") and number not in spoken
+            is_code = bool(bare) and not bare.startswith("#") and number not in docstring_lines
             count["code"] += is_code
             count["comments"] += bare.startswith("#") or (is_code and "  # " in line)
         count["vague"] += sum(
@@ -92,17 +92,17 @@ def main():
             writer.writerow(["folder", *next(iter(current.values()))])
             writer.writerows([folder, *count.values()] for folder, count in current.items())
         return 0
-    worse = [
+    regressions = [
         f"{folder}: {name} {value}, {table[folder][name]} before"
         for folder, count in current.items()
         for name, value in count.items()
         # Of comments there are to be more.
         if (value - int(table[folder][name])) * (-1 if name == "comments" else 1) > 0
     ]
-    if worse:
-        print("Reads worse than tests/house.csv says:", *worse, sep="\n  ")
+    if regressions:
+        print("Reads worse than tests/house.csv says:", *regressions, sep="\n  ")
         print("Lower another number by as much, then: python workflow/house.py --renew")
-    return bool(worse)
+    return bool(regressions)
 
 
 if __name__ == "__main__":

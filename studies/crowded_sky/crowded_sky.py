@@ -2,7 +2,7 @@
 
     python crowded_sky.py image SEED OUT                   # OUT.fits and OUT.csv
     python crowded_sky.py photometry OUT TABLE NAME=GRID   # appends a row
-    python crowded_sky.py found OUT TABLE NAME=CATALOGUE   # likewise, stars that a program found
+    python crowded_sky.py completeness OUT TABLE NAME=CATALOGUE  # likewise, a program's catalogue
     python crowded_sky.py with_truth OUT CATALOGUE         # psfdae's search with the true PSF
     python crowded_sky.py pipeline OUT CATALOGUE GRID      # photutils' own search, for the same
     python crowded_sky.py apertures OUT TABLE BUNDLE       # aperture corrections over the field
@@ -73,9 +73,9 @@ def image(seed: str, out: str) -> None:
         stamp = moffat(dx, dy, px, py).reshape(shape).mean(axis=(1, 3))
         rows, columns = (slice(a - half + edge, a + half + 1 + edge) for a in (row, column))
         light[rows, columns] += f * stamp
-    seen = light[edge:-edge, edge:-edge] + SKY
-    seen = rng.poisson(seen) + rng.normal(0, READ_NOISE, seen.shape)
-    hdu = fits.PrimaryHDU(seen.astype(np.float32))
+    counts = light[edge:-edge, edge:-edge] + SKY
+    counts = rng.poisson(counts) + rng.normal(0, READ_NOISE, counts.shape)
+    hdu = fits.PrimaryHDU(counts.astype(np.float32))
     hdu.header.update({"GAIN": 1.0, "PIXSCALE": 0.5, "RDNOISE": READ_NOISE})
     hdu.writeto(f"{out}.fits", overwrite=True)
     columns = {"id": np.arange(STARS), "x": x, "y": y, "flux": flux}
@@ -95,7 +95,7 @@ def nodes():
 
 
 def true_psf():
-    """What whole pixels get of the true profile."""
+    """Return the true profile, integrated over whole pixels, at the nodes of the field."""
     side = 2 * HALF_PX[0] * OVERSAMPLING + 1
     axis = (np.arange(side) - side // 2) / OVERSAMPLING
     inside = (np.arange(INTEGRATED) - INTEGRATED // 2) / INTEGRATED
@@ -147,9 +147,9 @@ def photometry(stem: str, table: str, named: str) -> None:
     name, path = named.split("=", 1)
     grouper = SourceGrouper(4.5)
     fit = PSFPhotometry(of_file(path), (7, 7), grouper=grouper, aperture_radius=3)
-    found = fit(counts, error=error, init_params=Table(stars["x", "y", "flux"]))
-    found.sort("id")
-    ratio = (np.array(found["flux_fit"]) / np.array(stars["flux"]))[order]
+    fitted = fit(counts, error=error, init_params=Table(stars["x", "y", "flux"]))
+    fitted.sort("id")
+    ratio = (np.array(fitted["flux_fit"]) / np.array(stars["flux"]))[order]
 
     append(table, {"image": Path(stem).name, "psf": name} | compared(ratio))
 
@@ -160,7 +160,7 @@ def scatter(part):
 
 
 def compared(ratio):
-    """What is said of fluxes over the true ones, of bright stars, the brightest first."""
+    """Return bias and scatter of fluxes over the true ones, of bright stars in order of flux."""
     half = len(ratio) // 2
     row = {"bias_percent": 100 * (np.median(ratio) - 1), "scatter_percent": scatter(ratio)}
     return row | {"brighter_half": scatter(ratio[:half]), "fainter_half": scatter(ratio[half:])}
@@ -173,7 +173,7 @@ def append(table, row):
     pd.DataFrame([row]).to_csv(table, mode="a", header=new, index=False, float_format="%.4g")
 
 
-def found(stem: str, table: str, named: str) -> None:
+def completeness(stem: str, table: str, named: str) -> None:
     """Compare a catalogue with the true stars: those within a pixel of one are found."""
     name, path = named.split("=", 1)
     stars, rows = Table.read(f"{stem}.csv"), Table.read(path)
@@ -181,18 +181,18 @@ def found(stem: str, table: str, named: str) -> None:
     true, place = (np.stack([t["x"], t["y"]], axis=1) for t in (stars, rows))
     off, nearest = cKDTree(place).query(true)
     bright = np.argsort(-np.array(stars["flux"]))[:BRIGHT]
-    seen = bright[off[bright] < 1]
+    detected = bright[off[bright] < 1]
     flux, error = (np.array(rows[c])[nearest] for c in ("flux", "flux_error"))
     pull = ((flux - stars["flux"]) / error)[off < 1]
     row = {"image": Path(stem).name, "catalogue": name, "stars": len(rows)}
-    row |= {"completeness": np.mean(off < 1), "bright_completeness": len(seen) / BRIGHT}
+    row |= {"completeness": np.mean(off < 1), "bright_completeness": len(detected) / BRIGHT}
     row |= {"false": int((cKDTree(true).query(place)[0] > FALSE_PX).sum())}
-    row |= compared(flux[seen] / stars["flux"][seen])
+    row |= compared(flux[detected] / stars["flux"][detected])
     append(table, row | {"coverage68": np.mean(np.abs(pull) < 1)})
 
 
 class TrueField:
-    """What `psfdae photometry` asks of a model, of the true profile."""
+    """The true profile with the attributes that `psfdae photometry` asks of a model."""
 
     stamp_px, wings = 2 * HALF_PX[0], None
 
@@ -250,5 +250,5 @@ def apertures(stem: str, table: str, bundle: str) -> None:
 
 
 if __name__ == "__main__":
-    commands = (image, photometry, found, with_truth, pipeline, apertures)
-    {one.__name__: one for one in commands}[sys.argv[1]](*sys.argv[2:])
+    commands = (image, photometry, completeness, with_truth, pipeline, apertures)
+    {function.__name__: function for function in commands}[sys.argv[1]](*sys.argv[2:])

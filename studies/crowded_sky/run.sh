@@ -31,5 +31,5 @@ for psf in "$@"; do sky photometry "$stem" table.csv "$psf"; done
 psfdae photometry "$stem.fits" --detect --model "$stem-psfdae/$stem.psf.safetensors" --out "$stem-psfdae.ecsv" --overwrite
 sky with_truth "$stem" "$stem-truth.ecsv"
 sky pipeline "$stem" "$stem-photutils.ecsv" true
-for name in psfdae truth photutils; do sky found "$stem" found.csv "$name=$stem-$name.ecsv"; done
+for name in psfdae truth photutils; do sky completeness "$stem" found.csv "$name=$stem-$name.ecsv"; done
 sky apertures "$stem" apertures.csv "$stem-psfdae/$stem.psf.safetensors"

@@ -51,22 +51,22 @@ def exposure(rng, count, conditions):
     place = rng.uniform(20, SIZE_PX - 20, (count, 2))
     flux = 10 ** rng.uniform(4.3, 5.3, count)
     light = np.array([f * psf(p, WIDE_PX, *conditions) for f, p in zip(flux, place, strict=True)])
-    wide = rng.poisson(light + SKY) + rng.normal(0, READ_NOISE, light.shape) - SKY
+    wide_stamps = rng.poisson(light + SKY) + rng.normal(0, READ_NOISE, light.shape) - SKY
     margin = (WIDE_PX - STAMP_PX) // 2
-    stamps = wide[:, margin:-margin, margin:-margin]
+    stamps = wide_stamps[:, margin:-margin, margin:-margin]
     noise = np.full(count, np.sqrt(SIZES[0]))
     snr = np.sqrt(np.square(stamps).sum(axis=(1, 2))) / noise
     phase = (place - np.floor(place + 0.5))[:, ::-1]
     at = np.zeros((count, 2), int), phase, place, stamps.sum(axis=(1, 2)), noise, snr
-    return BrightStars(wide, *at, np.arange(count), phase, np.full(count, np.nan))
+    return BrightStars(wide_stamps, *at, np.arange(count), phase, np.full(count, np.nan))
 
 
 def error(model, conditions):
     """Mean squared error of PSFs of the sum 1 in their stamps."""
     place = np.hstack([PLACES, np.full(PLACES.shape, np.nan)])
-    found = model.images(model.terms(place), np.zeros((len(PLACES), 2)), STAMP_PX)
+    psfs = model.images(model.terms(place), np.zeros((len(PLACES), 2)), STAMP_PX)
     true = np.array([psf(p, STAMP_PX, *conditions) for p in PLACES])
-    unit = (a / a.sum(axis=(1, 2), keepdims=True) for a in (found, true))
+    unit = (a / a.sum(axis=(1, 2), keepdims=True) for a in (psfs, true))
     return np.square(np.subtract(*unit)).mean()
 
 

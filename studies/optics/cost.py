@@ -73,20 +73,20 @@ def main(results: Path, out: Path, picture: Path) -> None:
     for estimator in estimators(config, product, models, "random", REFERENCE).values():
         if type(estimator).look.restores:
             add(type(estimator), estimator, {"starts": None, "draws": None})
-    drawn = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
-    usual = sampling.SEARCH
+    bank = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
+    preset = sampling.SEARCH
     for optics in ("wavefront", "wavefront_position"):
         kind = method(optics)
         data = training_set(config, kind, product, "random", REFERENCE)
-        fitted = kind.with_bank(drawn, config, data)
+        fitted = kind.with_bank(bank, config, data)
         _ = fitted.mixture  # fitted here, where no clock runs
         for effort in EFFORTS:
             starts = effort["starts"]
-            few = {"fields": starts, "offsets": starts} if starts else {}
-            sampling.SEARCH = usual._replace(**few)
+            fewer_starts = {"fields": starts, "offsets": starts} if starts else {}
+            sampling.SEARCH = preset._replace(**fewer_starts)
             wavefront.DRAWS_PER_STAR = effort["draws"]
-            chosen = usual.offsets if kind.needs.position else usual.fields
-            add(kind, fitted, effort | {"starts": starts or chosen}, repeats=1)
+            default_starts = preset.offsets if kind.needs.position else preset.fields
+            add(kind, fitted, effort | {"starts": starts or default_starts}, repeats=1)
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()

@@ -107,7 +107,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
             strengths = best_strengths(name, data)
             for level, noisy in stars.noisy.items():
                 started = time.process_time()
-                nearest = min(strengths, key=lambda known: abs(np.log(known / level)))
+                nearest = min(strengths, key=lambda candidate: abs(np.log(candidate / level)))
                 psf = denoised(name, noisy, data.noise.kappa * level, strengths[nearest])
                 took = time.process_time() - started
                 add(name, level, reference, mse(psf, stars.truth[reference]), took)

@@ -37,35 +37,37 @@ def main(results: Path, dataset: str, out: Path) -> None:
     config = load([f"dataset={dataset}"])
     name = config.stars.name
     product = read_product(results / "data" / config.scene.name / f"{name}.h5", "stars")
-    drawn = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
-    found = pd.read_parquet(results / "wavefront" / f"{dataset}.parquet")
+    bank = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
+    estimates = pd.read_parquet(results / "wavefront" / f"{dataset}.parquet")
     bounds = pd.read_parquet(results / "bounds" / f"{dataset}.parquet")
     summary = pd.read_csv(results / "bounds" / f"{dataset}.csv").query("metric == 'mse'")
     floors = bounds[bounds.method == "floor"].rename(columns={"mse": "mse_floor"})
     rows = []
     for optics, bound in BOUND_OF.items():
-        missed = misses(config, product, drawn, optics)
+        missed = misses(config, product, bank, optics)
         limits = bounds[bounds.method == bound]
-        both = found[found.method == optics].merge(limits, on=KEY, suffixes=("", "_bound"))
-        for (reference, level), pairs in both.groupby(["reference", "noise_level"]):
+        joined = estimates[estimates.method == optics].merge(
+            limits, on=KEY, suffixes=("", "_bound")
+        )
+        for (reference, level), pairs in joined.groupby(["reference", "noise_level"]):
             pair = pairs[np.isfinite(pairs.mse_bound)]
             mse, stderr = clustered_mean(pair.mse.to_numpy(), pair.field.to_numpy())
-            apart = (pair.mse - pair.mse_bound).to_numpy()
-            least = pair.mse_bound.mean()
+            gap = (pair.mse - pair.mse_bound).to_numpy()
+            limit = pair.mse_bound.mean()
             tight = summary.query("method == @bound and reference == @reference")
             tight = tight[np.isclose(tight.noise_level, level)].tight.iloc[0]
             row = {"dataset": dataset, "method": optics, "reference": reference}
-            row |= {"noise_level": level, "mse": mse, "stderr": stderr, "bound": least}
-            row |= {"tight": tight, "ratio": mse / least}
-            row |= {"ratio_stderr": clustered_mean(apart, pair.field.to_numpy())[1] / least}
+            row |= {"noise_level": level, "mse": mse, "stderr": stderr, "bound": limit}
+            row |= {"tight": tight, "ratio": mse / limit}
+            row |= {"ratio_stderr": clustered_mean(gap, pair.field.to_numpy())[1] / limit}
             row["flagged"] = int((pairs.explained == 0).sum())
             if reference == "realisation":
                 floor = floors[np.isclose(floors.noise_level, level)]
-                own = pairs.merge(floor[["star", "mse_floor"]], on="star")
-                row["median_over_floor"] = (own.mse / own.mse_floor).median()
-                lost, doubtful = missed[level]
-                row |= {"missed": len(lost), "missed_flagged": len(set(lost) & set(doubtful))}
-                row["others_flagged"] = len(set(doubtful) - set(lost))
+                floored = pairs.merge(floor[["star", "mse_floor"]], on="star")
+                row["median_over_floor"] = (floored.mse / floored.mse_floor).median()
+                missing, doubtful = missed[level]
+                row |= {"missed": len(missing), "missed_flagged": len(set(missing) & set(doubtful))}
+                row["others_flagged"] = len(set(doubtful) - set(missing))
             rows.append(row | {"n": len(pairs)})
             print(rows[-1], flush=True)
     commit = subprocess.run(
@@ -75,26 +77,26 @@ def main(results: Path, dataset: str, out: Path) -> None:
     table.to_csv(out, index=False, float_format="%.5g")
 
 
-def misses(config, product, drawn, optics) -> dict:
-    """By noise level: stars of which a better mode is missed, and those that are flagged."""
+def misses(config, product, bank, optics) -> dict:
+    """Return by noise level the stars whose better mode is missed, and those that are flagged."""
     kind = method(optics)
     data = training_set(config, kind, product, "random", "realisation")
-    fitted = kind.with_bank(drawn, config, data)
+    fitted = kind.with_bank(bank, config, data)
     stars = bounded_stars(config, product)
     position, count = field_positions(product)[stars.star], len(stars.star)
     truth = true_modes(fitted.model, product, stars)
-    found = {}
+    by_level = {}
     for level, noisy in stars.noisy.items():
         modes, doubtful = fitted.modes(noisy, level, position)
         likelihood = fitted.likelihood(level)
         counts = likelihood.counts(noisy)
         posteriors = sampling.StarPosteriors(counts, likelihood, fitted.model)
-        right = sampling.climb(truth, posteriors)
-        best = np.full(count, -np.inf)
-        np.maximum.at(best, modes.star, modes.evidence)
-        lost = right.star[right.evidence > best[right.star] + MISSED]
-        found[level] = lost.tolist(), doubtful.tolist()
-    return found
+        summits = sampling.climb(truth, posteriors)
+        highest = np.full(count, -np.inf)
+        np.maximum.at(highest, modes.star, modes.evidence)
+        missing = summits.star[summits.evidence > highest[summits.star] + MISSED]
+        by_level[level] = missing.tolist(), doubtful.tolist()
+    return by_level
 
 
 if __name__ == "__main__":

@@ -35,27 +35,27 @@ def errors(law, count, at, off, sigma, side):
     still, axes, moves = np.zeros(count), PART * np.eye(count), STEP * np.eye(2)
     moving = [(image(still, e) - image(still, -e)) / (2 * STEP) for e in moves]
     shapes = np.array([(image(e) - image(-e)) / (2 * PART) for e in axes])
-    known = np.stack([image(still), np.ones(side**2), *moving], axis=1)
+    base = np.stack([image(still), np.ones(side**2), *moving], axis=1)
     place = [0.0, 0.0, *[3.0 / (MOVE + 0.5) ** 2] * 2]  # 1/variance of a centre in the frame
     for s in sigma:
-        seen = np.column_stack([known, shapes.T])
+        design = np.column_stack([base, shapes.T])
         prior = np.diag([*place, *np.ones(count)])
-        spread = np.linalg.inv(seen.T @ seen / s**2 + prior)[2:, 2:]
-        fit = np.linalg.solve(known.T @ known / s**2 + np.diag(place), known.T / s**2)[2:]
-        apart = np.column_stack([known[:, 2:] / np.sqrt(place[2:]), shapes.T])
-        missed = known[:, 2:] @ (fit @ apart) - apart
-        of_field = s**2 * np.square(known[:, 2:] @ fit).sum() + np.square(missed).sum()
-        yield np.trace(seen[:, 2:] @ spread @ seen[:, 2:].T) / side**2, of_field / side**2
+        spread = np.linalg.inv(design.T @ design / s**2 + prior)[2:, 2:]
+        fit = np.linalg.solve(base.T @ base / s**2 + np.diag(place), base.T / s**2)[2:]
+        offsets = np.column_stack([base[:, 2:] / np.sqrt(place[2:]), shapes.T])
+        missed = base[:, 2:] @ (fit @ offsets) - offsets
+        of_field = s**2 * np.square(base[:, 2:] @ fit).sum() + np.square(missed).sum()
+        yield np.trace(design[:, 2:] @ spread @ design[:, 2:].T) / side**2, of_field / side**2
 
 
 def main(kind, faint):
-    found = np.load(faint)
-    law, side, rng = LAWS[kind], found["truth"].shape[-1], np.random.default_rng(1)
-    sigma = [float(found[f"sigma{snr}"]) / FLUX for snr in SNR]
-    places = found["at"][::EVERY]
+    faint_stars = np.load(faint)
+    law, side, rng = LAWS[kind], faint_stars["truth"].shape[-1], np.random.default_rng(1)
+    sigma = [float(faint_stars[f"sigma{snr}"]) / FLUX for snr in SNR]
+    places = faint_stars["at"][::EVERY]
     all_errors = [[*errors(*law, at, rng.uniform(-0.5, 0.5, 2), sigma, side)] for at in places]
-    for snr, (least, field) in zip(SNR, np.mean(all_errors, axis=0), strict=True):
-        print(f"{kind} S/N {snr}: least {least:.2e}, field {field:.2e}, {least / field:.2f}")
+    for snr, (bound, field) in zip(SNR, np.mean(all_errors, axis=0), strict=True):
+        print(f"{kind} S/N {snr}: least {bound:.2e}, field {field:.2e}, {bound / field:.2f}")
 
 
 if __name__ == "__main__":

@@ -27,39 +27,39 @@ SETTING = ["package", "sampling_px", "order", "centre"]
 DRAWS = 1000  # of the stars, for the error of a median
 
 
-def ours(known, bundle):
+def psfdae_results(faint_stars, bundle):
     """(setting, S/N, PSFs, fluxes) of psfdae, and what the record says of it."""
-    place, model = known["at"][known["star"]].astype(float), load_model(bundle)
+    place, model = faint_stars["at"][faint_stars["star"]].astype(float), load_model(bundle)
     for snr in SNR:
-        found = model.predict(known[f"noisy{snr}"], position=place)
-        psf = found.psf / found.psf.sum(axis=(1, 2), keepdims=True)
-        yield ("psfdae", "", "", "averaged"), snr, psf, found.flux, {"version": __version__}
+        predictions = model.predict(faint_stars[f"noisy{snr}"], position=place)
+        psf = predictions.psf / predictions.psf.sum(axis=(1, 2), keepdims=True)
+        yield ("psfdae", "", "", "averaged"), snr, psf, predictions.flux, {"version": __version__}
 
 
-def theirs(file):
+def peer_results(file):
     """The same of a file of peers.py, with each kind of centre."""
     package, sampling, order, _ = file.stem.split("-")
-    found = np.load(file)
-    about = {"version": str(found["version"]), "fit_cpu_s": float(found["fit_cpu_s"])}
+    results = np.load(file)
+    about = {"version": str(results["version"]), "fit_cpu_s": float(results["fit_cpu_s"])}
     for snr in SNR:
-        for centre in (one for one in CENTRES if f"{one}{snr}" in found):
+        for centre in (centre for centre in CENTRES if f"{centre}{snr}" in results):
             setting = (package, sampling, order if package != "epsf" else "", centre)
-            yield setting, snr, found[f"{centre}{snr}"], found[f"flux{snr}"], about
+            yield setting, snr, results[f"{centre}{snr}"], results[f"flux{snr}"], about
 
 
 def of_stars(folder, split):
     """A row for every star of a split, setting and S/N."""
-    known = np.load(folder / f"faint{split}.npz")
-    star = pd.Series(known["id"][known["star"]], name="id")
-    own = np.square(known["own"])
+    faint_stars = np.load(folder / f"faint{split}.npz")
+    star = pd.Series(faint_stars["id"][faint_stars["star"]], name="id")
+    own_noise2 = np.square(faint_stars["own"])
     (bundle,) = (folder / f"ours{split}").glob("*.psf.safetensors")
     peers = sorted(folder.glob(f"*-*-*-{split}.npz"))
-    for found in (ours(known, bundle), *map(theirs, peers)):
-        for setting, snr, psf, flux, about in found:
+    for results in (psfdae_results(faint_stars, bundle), *map(peer_results, peers)):
+        for setting, snr, psf, flux, about in results:
             # A copy without a PSF counts as an image of 0.
-            error = np.square(np.nan_to_num(psf) - known["truth"]).mean(axis=(1, 2))
+            error = np.square(np.nan_to_num(psf) - faint_stars["truth"]).mean(axis=(1, 2))
             off = flux / FLUX - 1.0
-            copies = {"copies": 1, "mse": error, "own_mse": own, "off": off, "off2": off**2}
+            copies = {"copies": 1, "mse": error, "own_mse": own_noise2, "off": off, "off2": off**2}
             table = pd.DataFrame(copies).groupby(star).mean().assign(copies=star.value_counts())
             yield table.assign(**dict(zip(SETTING, setting, strict=True)), snr=snr, **about)
 
@@ -67,18 +67,18 @@ def of_stars(folder, split):
 def row(cell, reference):
     """A row of the table, of the stars of a setting and those of psfdae."""
     ratio = reference.mse.mean() / cell.mse.mean()
-    found = {"version": cell.version.iloc[0], "fit_cpu_s": cell.fit_cpu_s.mean()}
-    found |= {"stars": len(cell), "copies": cell.copies.sum()}
-    found |= {"mse": cell.mse.mean(), "stderr": sem(cell.mse), "ratio": ratio}
-    found["ratio_stderr"] = sem(reference.mse - ratio * cell.mse) / cell.mse.mean()
+    values = {"version": cell.version.iloc[0], "fit_cpu_s": cell.fit_cpu_s.mean()}
+    values |= {"stars": len(cell), "copies": cell.copies.sum()}
+    values |= {"mse": cell.mse.mean(), "stderr": sem(cell.mse), "ratio": ratio}
+    values["ratio_stderr"] = sem(reference.mse - ratio * cell.mse) / cell.mse.mean()
     bias = cell.off.mean()
-    found |= {"flux_bias": bias, "bias_stderr": sem(cell.off)}
-    found |= {"flux_scatter": np.sqrt(cell.off2.mean() - bias**2)}
+    values |= {"flux_bias": bias, "bias_stderr": sem(cell.off)}
+    values |= {"flux_scatter": np.sqrt(cell.off2.mean() - bias**2)}
     of_each = (reference.mse / cell.mse).to_numpy()
-    drawn = np.random.default_rng(0).choice(of_each, (DRAWS, len(of_each)))
-    found |= {"median_ratio": np.median(of_each)}
-    found["median_stderr"] = np.median(drawn, axis=1).std()
-    return found | {"own_mse": cell.own_mse.mean()}
+    resampled = np.random.default_rng(0).choice(of_each, (DRAWS, len(of_each)))
+    values |= {"median_ratio": np.median(of_each)}
+    values["median_stderr"] = np.median(resampled, axis=1).std()
+    return values | {"own_mse": cell.own_mse.mean()}
 
 
 def of_image(folder):
@@ -100,13 +100,13 @@ def main(out, *folders):
     table.to_csv(out, index=False, float_format="%.6g")
     print(f"| image | S/N | {' | '.join(CENTRES)} | median star: {' | '.join(CENTRES)} |")
     print("|---|---" + 2 * len(CENTRES) * "|---" + "|")
-    others = table[table.package != "psfdae"]
-    for (image, snr), cell in others.groupby(["image", "snr"], sort=False):
-        best = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").loc[[*CENTRES]]
+    peers = table[table.package != "psfdae"]
+    for (image, snr), cell in peers.groupby(["image", "snr"], sort=False):
+        lowest = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").loc[[*CENTRES]]
         cells = [
-            f"{one[name]:.2f} ± {one[error]:.2f}"
+            f"{best_cell[name]:.2f} ± {best_cell[error]:.2f}"
             for name, error in (("ratio", "ratio_stderr"), ("median_ratio", "median_stderr"))
-            for _, one in best.iterrows()
+            for _, best_cell in lowest.iterrows()
         ]
         print(f"| {image} | {snr} | {' | '.join(cells)} |")
 

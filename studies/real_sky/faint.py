@@ -49,10 +49,10 @@ def brightest(data, x, y, reach):
     return x + column - 2, y + row - 2
 
 
-def noise_free(known, star, at, half):
+def noise_free(true_stars, star, at, half):
     """Stamp of a star of images.py about pixel (x, y) of its image."""
-    psf = np.pad(np.asarray(known["psf"][star], np.float64), half)
-    column, row = at - known["pixel"][star] + psf.shape[-1] // 2
+    psf = np.pad(np.asarray(true_stars["psf"][star], np.float64), half)
+    column, row = at - true_stars["pixel"][star] + psf.shape[-1] // 2
     return psf[row - half : row + half, column - half : column + half]
 
 
@@ -64,29 +64,29 @@ def main(image, selection, out, side=10, copies=10):
     at = np.array([brightest(data, s["x"], s["y"], reach) for s in stars])
     file = Path(image).with_suffix(".npz")
     if file.exists():
-        known, own = np.load(file), np.zeros(len(stars))
-        wide = [noise_free(known, s, xy, half) for s, xy in zip(stars["id"], at, strict=True)]
+        npz, own_noise = np.load(file), np.zeros(len(stars))
+        frames = [noise_free(npz, s, xy, half) for s, xy in zip(stars["id"], at, strict=True)]
     else:
-        wide, own = zip(*(around(data, x, y, half, reach) for x, y in at), strict=True)
+        frames, own_noise = zip(*(around(data, x, y, half, reach) for x, y in at), strict=True)
     rng = np.random.default_rng(int(stars["id"].sum()))
     star = np.repeat(np.arange(len(stars)), copies)
     move = rng.integers(0, 2 * MOVE + 1, (star.size, 2))[:, :, None] + np.arange(side)
-    truth = np.stack(wide)[star[:, None, None], move[:, 0, :, None], move[:, 1, None, :]]
+    truth = np.stack(frames)[star[:, None, None], move[:, 0, :, None], move[:, 1, None, :]]
     flux = truth.sum(axis=(1, 2))
     truth /= flux[:, None, None]
-    own = np.array(own)[star] / flux
+    own_noise = np.array(own_noise)[star] / flux
     # Noise-equivalent width of the mean star: the squares of its noise are no light.
-    square = np.square(truth).sum(axis=(1, 2)) - side**2 * own**2
+    square = np.square(truth).sum(axis=(1, 2)) - side**2 * own_noise**2
     width = np.sqrt(np.maximum(square, 0.0)).mean()
-    found = {"truth": truth, "star": star, "at": at, "own": own, "id": np.array(stars["id"])}
+    arrays = {"truth": truth, "star": star, "at": at, "own": own_noise, "id": np.array(stars["id"])}
     for snr in SNR:
-        more = np.sqrt(np.maximum((width / snr) ** 2 - own**2, 0.0))
-        noisy = truth + more[:, None, None] * rng.standard_normal(truth.shape)
-        found |= {
+        added_noise = np.sqrt(np.maximum((width / snr) ** 2 - own_noise**2, 0.0))
+        noisy = truth + added_noise[:, None, None] * rng.standard_normal(truth.shape)
+        arrays |= {
             f"noisy{snr}": (FLUX * noisy).astype(np.float32),
             f"sigma{snr}": FLUX * width / snr,
         }
-    np.savez(out, **found)
+    np.savez(out, **arrays)
 
 
 if __name__ == "__main__":

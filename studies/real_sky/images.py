@@ -34,16 +34,16 @@ SHAPE, WIDTH = 0.05, 0.08  # of the scatter: RMS of both shears, and of the FWHM
 WAVES = 0.06  # RMS of each aberration, waves; of those of third order half of it
 BETA, FWHM, UNDERSAMPLED = 3.0, 2.4, 1.3  # of Moffat profiles before the pixel, px
 SEEING, SCALE = 1.1, 0.6  # FWHM of Kolmogorov's profile in arcsec; arcsec per px
-APART = 3.0  # px: nearer stars are one in the list
-NEAR, WINDOW, ROUNDS = 7, 1.2, 20  # px about a star, σ in px, of the centroids that are listed
+BLEND_PX = 3.0  # px: nearer stars are one in the list
+WINDOW_PX, WINDOW, ROUNDS = 7, 1.2, 20  # px about a star, σ in px, of the centroids that are listed
 
 
 def moffat(u, v, fwhm, scatter):
     """Moffat profile at (u, v), from -1 to 1 over the field; `scatter` (3,) in RMS."""
     g1 = 0.02 + 0.05 * u + 0.04 * (u**2 - v**2) + SHAPE * scatter[0]
     g2 = -0.02 + 0.04 * v + 0.08 * u * v + SHAPE * scatter[1]
-    wide = (1 + 0.03 * u + 0.06 * (u**2 + v**2)) * np.exp(WIDTH * scatter[2])
-    return galsim.Moffat(beta=BETA, fwhm=fwhm * wide * SCALE).shear(g1=g1, g2=g2)
+    relative_fwhm = (1 + 0.03 * u + 0.06 * (u**2 + v**2)) * np.exp(WIDTH * scatter[2])
+    return galsim.Moffat(beta=BETA, fwhm=fwhm * relative_fwhm * SCALE).shear(g1=g1, g2=g2)
 
 
 def optics(u, v, scatter):
@@ -59,7 +59,7 @@ def optics(u, v, scatter):
 
 
 def profile(kind, u, v, rng):
-    """Of one star."""
+    """Return the profile of one star, at (u, v) from -1 to 1 over the field."""
     scatter = rng.standard_normal(8) * (kind in ("shapes", "aberrations"))
     if kind in ("optics", "aberrations"):
         return optics(u, v, scatter)
@@ -77,7 +77,7 @@ def places(kind, rng):
     return LATTICE * PITCH, position, np.exp(rng.uniform(*np.log(SNR), len(position)))
 
 
-def drawn(star, off):
+def drawn_image(star, off):
     """Image of a profile, its centre `off` px from the pixel [s/2, s/2]."""
     frame = galsim.Image(SIDE, SIDE, scale=SCALE)
     return star.drawImage(frame, offset=galsim.PositionD(*(off + 0.5))).array
@@ -86,13 +86,13 @@ def drawn(star, off):
 def centroid(counts, pixel):
     """(x, y) of a star near a pixel: centroids in a Gaussian window, as a star list has them."""
     x, y = pixel
-    light = counts[y - NEAR : y + NEAR + 1, x - NEAR : x + NEAR + 1] - SKY
-    axis, off = np.arange(-NEAR, NEAR + 1), np.zeros(2)
+    light = counts[y - WINDOW_PX : y + WINDOW_PX + 1, x - WINDOW_PX : x + WINDOW_PX + 1] - SKY
+    axis, off = np.arange(-WINDOW_PX, WINDOW_PX + 1), np.zeros(2)
     for _ in range(ROUNDS):
         rows, columns = (np.exp(-(((axis - at) / WINDOW) ** 2) / 2) for at in off[::-1])
         weight = light * rows[:, None] * columns
-        moved = np.array([(weight * axis).sum(), (weight * axis[:, None]).sum()]) / weight.sum()
-        off = np.clip(2 * moved - off, -2, 2)  # a window hides about half of the way
+        shift = np.array([(weight * axis).sum(), (weight * axis[:, None]).sum()]) / weight.sum()
+        off = np.clip(2 * shift - off, -2, 2)  # a window hides about half of the way
     return pixel + off
 
 
@@ -101,8 +101,8 @@ def main(kind, image):
     side, position, snr = places(kind, rng)
     pixel = np.rint(position).astype(int)
     psf = [
-        drawn(profile(kind, *(2 * at / side - 1), rng), at - near)
-        for at, near in zip(position, pixel, strict=True)
+        drawn_image(profile(kind, *(2 * at / side - 1), rng), at - middle)
+        for at, middle in zip(position, pixel, strict=True)
     ]
     psf = np.array(psf, np.float32)
     flux = snr * np.sqrt(SKY / np.square(psf).sum(axis=(1, 2)))
@@ -110,13 +110,13 @@ def main(kind, image):
     for (x, y), star in zip(pixel + SIDE // 2, flux[:, None, None] * psf, strict=True):
         light[y : y + SIDE, x : x + SIDE] += star
     counts = rng.poisson(light[SIDE:-SIDE, SIDE:-SIDE]).astype(np.float32)
-    inside = ((pixel >= NEAR) & (pixel < side - NEAR)).all(axis=1)
+    inside = ((pixel >= WINDOW_PX) & (pixel < side - WINDOW_PX)).all(axis=1)
     # Of two stars that look like one, a list has the brighter.
-    near = cKDTree(position).query_pairs(APART, output_type="ndarray").T
-    hidden = np.where(snr[near[0]] < snr[near[1]], *near)
+    blends = cKDTree(position).query_pairs(BLEND_PX, output_type="ndarray").T
+    hidden = np.where(snr[blends[0]] < snr[blends[1]], *blends)
     inside[hidden] = False
     listed = np.flatnonzero(inside & (snr >= SNR[0]))
-    at = np.array([centroid(counts, pixel[one]) for one in listed])
+    at = np.array([centroid(counts, pixel[star]) for star in listed])
     out = Path(image)
     header = fits.Header({"GAIN": 1.0, "SATURATE": 6e4, "PIXSCALE": SCALE})
     fits.PrimaryHDU(counts, header).writeto(out, overwrite=True)

@@ -72,13 +72,13 @@ def piff(image, selection, side, sampling, order):
 def normal_equations(polynomial, stars, logger):
     """Piff's own equations as one product of matrices: its sum over stars takes minutes."""
     basis = np.array([polynomial.basis(star) for star in stars])
-    left, right = (np.array([getattr(star.fit, a) for star in stars]) for a in ("alpha", "beta"))
-    size, terms = right.shape[1], basis.shape[1]
+    matrix, vector = (np.array([getattr(star.fit, a) for star in stars]) for a in ("alpha", "beta"))
+    size, terms = vector.shape[1], basis.shape[1]
     pairs = (basis[:, :, None] * basis[:, None]).reshape(len(stars), -1)
-    left = (left.reshape(len(stars), -1).T @ pairs).reshape(size, size, terms, terms)
-    left = left.transpose(0, 2, 1, 3).reshape(size * terms, -1)
-    found = solve(left, (right.T @ basis).ravel(), assume_a="pos", check_finite=False)
-    polynomial.q += found.reshape(polynomial.q.shape)
+    matrix = (matrix.reshape(len(stars), -1).T @ pairs).reshape(size, size, terms, terms)
+    matrix = matrix.transpose(0, 2, 1, 3).reshape(size * terms, -1)
+    solution = solve(matrix, (vector.T @ basis).ravel(), assume_a="pos", check_finite=False)
+    polynomial.q += solution.reshape(polynomial.q.shape)
 
 
 def psfex(image, selection, side, sampling, order):
@@ -87,7 +87,7 @@ def psfex(image, selection, side, sampling, order):
     from galsim.des import DES_PSFEx
     from scipy.spatial import cKDTree
 
-    wanted = np.array([place for place, *_ in training(image, selection)]) + 1.0
+    targets = np.array([place for place, *_ in training(image, selection)]) + 1.0
     samples = 25 if sampling == 1 else 51
     columns = "NUMBER X_IMAGE Y_IMAGE FLUX_RADIUS FLUX_APER(1) FLUXERR_APER(1) ELONGATION FLAGS"
     columns = f"{columns} SNR_WIN VIGNET(27,27)".replace(" ", "\n")
@@ -99,12 +99,12 @@ def psfex(image, selection, side, sampling, order):
         run = ["source-extractor", str(Path(image).resolve()), *words.split()]
         subprocess.run(run, cwd=folder, check=True, capture_output=True)
         with fits.open(f"{folder}/all.cat") as file:
-            found = file[2].data
-            tree = cKDTree(np.stack([found["X_IMAGE"], found["Y_IMAGE"]], axis=1))
-            distance, row = tree.query(wanted)
-            file[2].data = found[np.unique(row[distance < 2.0])]
+            sources = file[2].data
+            tree = cKDTree(np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1))
+            distance, row = tree.query(targets)
+            file[2].data = sources[np.unique(row[distance < 2.0])]
             file[2].data["FLAGS"][:] = 0
-            print(f"psfex: {len(file[2].data)} of {len(wanted)} training stars")
+            print(f"psfex: {len(file[2].data)} of {len(targets)} training stars")
             file.writeto(f"{folder}/train.cat")
         words = f"train.cat -c /dev/null -PSF_SIZE {samples},{samples} -PSF_SAMPLING {sampling}"
         # All stars of the list.
@@ -147,21 +147,21 @@ class Centres:
     """PSFs of sum 1 of a place at any centre, (dy, dx) from the middle: cubic splines."""
 
     def __init__(self, draw, x, y, side):
-        wide, parts, cache = side + 2 * REACH, round(1 / STEP), {}
+        drawn_px, parts, cache = side + 2 * REACH, round(1 / STEP), {}
         count = 2 * REACH * parts - parts + 1
         self.offsets = (np.arange(count) - count // 2) * STEP
         self.psfs = np.empty((count, count, side, side))
         for i, dy in enumerate(self.offsets):
             for j, dx in enumerate(self.offsets):
-                whole = np.floor([dy, dx]).astype(int)
-                part = (dy - whole[0], dx - whole[1])
+                whole_px = np.floor([dy, dx]).astype(int)
+                part = (dy - whole_px[0], dx - whole_px[1])
                 if part not in cache:
-                    cache[part] = np.array(draw(x, y, part[1], part[0], wide), np.float64)
-                row, column = REACH - whole
+                    cache[part] = np.array(draw(x, y, part[1], part[0], drawn_px), np.float64)
+                row, column = REACH - whole_px
                 self.psfs[i, j] = cache[part][row : row + side, column : column + side]
         self.psfs /= self.psfs.sum(axis=(2, 3), keepdims=True)
-        self.free = self.psfs - self.psfs.mean(axis=(2, 3), keepdims=True)  # of the sky
-        self.norm = np.square(self.free).sum(axis=(2, 3))
+        self.above_sky = self.psfs - self.psfs.mean(axis=(2, 3), keepdims=True)  # of the sky
+        self.norm = np.square(self.above_sky).sum(axis=(2, 3))
         self.spline = make_interp_spline(self.offsets, np.eye(count), k=3)
 
     def between(self, centres, *tables):
@@ -184,37 +184,37 @@ def lattice(centre, shape, count):
 
 def restored(centres, stamp, sigma):
     """PSFs of CENTRES, and the flux."""
-    product = np.tensordot(centres.free, stamp.astype(np.float64), 2)
+    product = np.tensordot(centres.above_sky, stamp.astype(np.float64), 2)
 
     def gain(points):
-        """By how much χ² falls with the star, and the norm of its PSF; flux and sky are free."""
+        """Return the fall of χ² by the star, the norm of the PSF, and the flux; the sky is free."""
         match, norm = centres.between(points, product, centres.norm)
         return np.maximum(match, 0.0) ** 2 / (norm * sigma**2), norm, match / norm
 
-    def best(start, most):
+    def best_centre(start, limit_px):
         """Best centre within `most`, searched for from a lattice within `start`."""
         points = lattice(np.zeros(2), np.eye(2) * start, 17)
         centre = points[gain(points)[0].argmax()]
         for step in (0.25, 0.0625, 0.0156, 0.0039):
-            near = np.clip(lattice(centre, np.eye(2) * step, 9), -most, most)
-            centre = near[gain(near)[0].argmax()]
+            trial_centres = np.clip(lattice(centre, np.eye(2) * step, 9), -limit_px, limit_px)
+            centre = trial_centres[gain(trial_centres)[0].argmax()]
         return centre
 
-    def averaged(centre, most):
+    def averaged(centre, limit_px):
         """Over four standard errors about it, of a parabola: then the posterior itself weighs."""
         around = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
-        peak, up, down, right, left, both, neither = gain(centre + 0.05 * around)[0]
-        mixed = (both + neither - up - down - right - left + 2 * peak) / 2
-        bend = np.array([[2 * peak - up - down, -mixed], [-mixed, 2 * peak - right - left]])
+        peak, up, down, east, west, corner, opposite = gain(centre + 0.05 * around)[0]
+        mixed = (corner + opposite - up - down - east - west + 2 * peak) / 2
+        bend = np.array([[2 * peak - up - down, -mixed], [-mixed, 2 * peak - east - west]])
         value, axes = np.linalg.eigh(bend / 0.05**2)  # of χ², twice the inverse variance
-        near = lattice(centre, axes * np.clip(4.0 / np.sqrt(value.clip(1e-9) / 2), 0.02, 2.0), 17)
-        near = near[np.abs(near).max(axis=1) <= most]
-        found, norm, _ = gain(near)
-        return centres.mean(near, np.exp((found - found.max()) / 2) / np.sqrt(norm))
+        nodes = lattice(centre, axes * np.clip(4.0 / np.sqrt(value.clip(1e-9) / 2), 0.02, 2.0), 17)
+        nodes = nodes[np.abs(nodes).max(axis=1) <= limit_px]
+        fall, norm, _ = gain(nodes)
+        return centres.mean(nodes, np.exp((fall - fall.max()) / 2) / np.sqrt(norm))
 
     farthest = centres.offsets[-1]
-    centre = best(2.0, farthest)
-    framed = centre if np.abs(centre).max() <= FRAMED else best(FRAMED, FRAMED)
+    centre = best_centre(2.0, farthest)
+    framed = centre if np.abs(centre).max() <= FRAMED else best_centre(FRAMED, FRAMED)
     psfs = centres.mean(centre[None], np.ones(1)), averaged(centre, farthest)
     return *psfs, averaged(framed, FRAMED), gain(centre[None])[2][0]
 
@@ -222,36 +222,36 @@ def restored(centres, stamp, sigma):
 def version(package):
     """Release of a package in use."""
     if package == "psfex":
-        said = subprocess.run(["psfex", "--version"], check=True, capture_output=True, text=True)
-        return said.stdout.split()[2]
+        printed = subprocess.run(["psfex", "--version"], check=True, capture_output=True, text=True)
+        return printed.stdout.split()[2]
     return metadata.version({"epsf": "photutils"}.get(package, package))
 
 
 def main(package, sampling, order, image, selection, faint, out):
-    known = np.load(faint)
-    side = known["truth"].shape[-1]
+    copies = np.load(faint)
+    side = copies["truth"].shape[-1]
     make = {"piff": piff, "psfex": psfex, "epsf": epsf}[package]
     draw = make(image, selection, side, float(sampling), int(order))
-    found = {"version": version(package), "fit_cpu_s": sum(os.times()[:4])} | {
-        f"{name}{snr}": np.empty(known["truth"].shape[: 1 if name == "flux" else 3])
+    results = {"version": version(package), "fit_cpu_s": sum(os.times()[:4])} | {
+        f"{name}{snr}": np.empty(copies["truth"].shape[: 1 if name == "flux" else 3])
         for snr in SNR
         for name in (*CENTRES, "flux")
     }
-    for star, (x, y) in enumerate(known["at"]):
+    for star, (x, y) in enumerate(copies["at"]):
         centres = Centres(draw, x, y, side)
         for snr in SNR:
-            for copy in np.flatnonzero(known["star"] == star):
-                stamp = known[f"noisy{snr}"][copy]
-                for name, one in zip(
+            for copy in np.flatnonzero(copies["star"] == star):
+                stamp = copies[f"noisy{snr}"][copy]
+                for name, values in zip(
                     (*CENTRES, "flux"),
-                    restored(centres, stamp, float(known[f"sigma{snr}"])),
+                    restored(centres, stamp, float(copies[f"sigma{snr}"])),
                     strict=True,
                 ):
-                    found[f"{name}{snr}"][copy] = one
-    np.savez_compressed(f"{out}.part.npz", **found)
+                    results[f"{name}{snr}"][copy] = values
+    np.savez_compressed(f"{out}.part.npz", **results)
     Path(f"{out}.part.npz").replace(out)
     for snr in SNR:
-        errors = [np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in CENTRES]
+        errors = [np.square(results[f"{n}{snr}"] - copies["truth"]).mean() for n in CENTRES]
         print(package, sampling, order, snr, *(f"{error:.3e}" for error in errors))
 
 

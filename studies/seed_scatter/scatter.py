@@ -37,17 +37,17 @@ COLUMNS += ["mse", "mse_of_mean", "flux_error2", "validation_mse", "alive", "cpu
 
 @dataclass
 class Trial:
-    """What a training does otherwise than the one in use."""
+    """Schedule of a training, where it differs from the one in use."""
 
     warm: float = 0.3  # part of the steps in which the rate rises
     course: str = "cos"  # of the rate: cos or linear
 
 
-class Tried(DaeTraining):
+class TrialTraining(DaeTraining):
     """A training with a trial's schedule, and moving averages of its weights."""
 
-    def __init__(self, trial: Trial, *given) -> None:
-        super().__init__(*given)
+    def __init__(self, trial: Trial, *arguments) -> None:
+        super().__init__(*arguments)
         self.trial = trial
         total = self.settings.epochs * self.steps
         if self.settings.schedule == "onecycle":
@@ -74,20 +74,20 @@ class Tried(DaeTraining):
 @torch.inference_mode()
 def alive(model, images: np.ndarray, factor: float) -> str:
     """Channels of each layer that are above zero in any pixel of some images."""
-    x, found = torch.from_numpy(images)[:, None] * factor, []
+    x, counts = torch.from_numpy(images)[:, None] * factor, []
     for layer in model.layers:
         x = torch.relu(layer(x))
-        found.append(int((x.amax(dim=(0, 2, 3)) > 0).sum()))
-    return " ".join(map(str, found))
+        counts.append(int((x.amax(dim=(0, 2, 3)) > 0).sum()))
+    return " ".join(map(str, counts))
 
 
-def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str) -> None:
+def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: str) -> None:
     """Train with every seed, measure, append."""
     torch.set_num_threads(1)
-    own = {f.name for f in fields(Trial)}
-    pairs = [text.split("=", 1) for text in given]
-    trial = Trial(**{k: type(getattr(Trial, k))(v) for k, v in pairs if k in own})
-    words = [f"train.{k}={v}" for k, v in pairs if k not in own]
+    trial_keys = {f.name for f in fields(Trial)}
+    pairs = [text.split("=", 1) for text in settings]
+    trial = Trial(**{k: type(getattr(Trial, k))(v) for k, v in pairs if k in trial_keys})
+    words = [f"train.{k}={v}" for k, v in pairs if k not in trial_keys]
     config = load([f"dataset={dataset}", *words])
     product = read_product(Path(stars), "stars", ("realisation", "field_index", "grid"))
     data = training_set(config, Dae, product, "random", "realisation")
@@ -96,7 +96,7 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str)
     noisy = [noisy_test_images(config, product, test, level) for level in levels]
     truth = product["realisation"][test]
     for seed in map(int, seeds.split(",")):
-        training = Tried(trial, data, config.dae, config.train, seed)
+        training = TrialTraining(trial, data, config.dae, config.train, seed)
         started = time.process_time()
         while not training.finished():
             row = training.run_epoch()
@@ -115,7 +115,7 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str)
         for decay, mean in training.averages.items():
             states[f"average {decay}"] = dict(zip(names, mean, strict=True))
         rows = []
-        for which, state in states.items():
+        for weights, state in states.items():
             model.load_state_dict(state)
             for level, images in zip(levels, noisy, strict=True):
                 error = predict(model, images, training.factor) - truth
@@ -126,8 +126,8 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str)
                         git_commit()[:7],
                         dataset,
                         name,
-                        " ".join(given),
-                        which,
+                        " ".join(settings),
+                        weights,
                         seed,
                         level,
                         f"{np.square(error).mean(dtype=np.float64):.5g}",

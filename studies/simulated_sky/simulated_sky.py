@@ -104,7 +104,7 @@ def places(
     truth: Annotated[File, "NPZ of `field`."],
     selection: Annotated[File, "selection.csv of from-stars on image and list."],
     bundle: Annotated[File, "Its model, of the method field."],
-    others: Annotated[
+    packages: Annotated[
         tuple[str, ...],
         {"flag": "--other"},
         "NAME=FILE of a package that learnt from the same stars: a .psf of PSFEx, or NPZ with psf "
@@ -122,34 +122,34 @@ def places(
 
     from psfdae.model.psf_model import load_model
 
-    model, table, known = load_model(bundle), read_table(selection), np.load(truth)
-    held, side = np.flatnonzero(table["part"] == "held out"), model.info.stamp_px
-    position = table[["x", "y"]].to_numpy()[held]
+    model, table, npz = load_model(bundle), read_table(selection), np.load(truth)
+    test, side = np.flatnonzero(table["part"] == "held out"), model.info.stamp_px
+    position = table[["x", "y"]].to_numpy()[test]
     data = np.pad(np.asarray(fits.getdata(image), float), SIDE, mode="reflect")
     frame = central_pixel(position) + SIDE
-    near = _cut(data, frame, 2 * NEAR_PX).reshape(len(held), -1)
-    frame += np.stack(np.divmod(near.argmax(axis=1), 2 * NEAR_PX)[::-1], axis=1) - NEAR_PX
+    cores = _cut(data, frame, 2 * NEAR_PX).reshape(len(test), -1)
+    frame += np.stack(np.divmod(cores.argmax(axis=1), 2 * NEAR_PX)[::-1], axis=1) - NEAR_PX
     stamps = _cut(data, frame, side)
-    right = np.pad(known["psf"][held].astype(float), ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
-    at = frame - known["pixel"][held] + SIDE // 2
-    right = np.concatenate(
-        [_cut(star, one[None], side) for star, one in zip(right, at, strict=True)]
+    psfs = np.pad(npz["psf"][test].astype(float), ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
+    at = frame - npz["pixel"][test] + SIDE // 2
+    psfs = np.concatenate(
+        [_cut(star, pixel[None], side) for star, pixel in zip(psfs, at, strict=True)]
     )
-    right /= right.sum(axis=(1, 2), keepdims=True)
-    ours = model.method.model
-    terms = ours.terms(position)
-    draws = {"psfdae": lambda centre: ours.images(terms, centre, side)}
-    for package, file in (other.split("=", 1) for other in others):
+    psfs /= psfs.sum(axis=(1, 2), keepdims=True)
+    field_model = model.method.model
+    terms = field_model.terms(position)
+    draws = {"psfdae": lambda centre: field_model.images(terms, centre, side)}
+    for package, file in (text.split("=", 1) for text in packages):
         draws[package] = _sampled(Path(file), position, side)
     errors = {
-        package: np.square(_fitted(draw, stamps) - right).mean(axis=(1, 2))
+        package: np.square(_fitted(draw, stamps) - psfs).mean(axis=(1, 2))
         for package, draw in draws.items()
     }
     rows = []
     for package, error in errors.items():
         over = errors["psfdae"].mean() / error.mean()
         paired = (errors["psfdae"] - over * error) / error.mean()
-        row = {"package": package, "stars": len(held), "learnt": sum(table["part"] == "training")}
+        row = {"package": package, "stars": len(test), "learnt": sum(table["part"] == "training")}
         row |= {"mse": error.mean(), "stderr": sem(error)}
         row |= {"over": over, "over_stderr": sem(paired)}
         rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
@@ -172,29 +172,32 @@ def errors(
     from psfdae.metrics import clustered_mean
     from psfdae.model.psf_model import load_model
 
-    model, known, rows = load_model(bundle), np.load(truth), []
-    given, place = read_table(selection)[["x", "y"]].to_numpy(), known["pixel"]
-    fresh = np.abs(place[:, None] - given).max(axis=2).min(axis=1) > PITCH / 2
+    model, npz, rows = load_model(bundle), np.load(truth), []
+    listed, place = read_table(selection)[["x", "y"]].to_numpy(), npz["pixel"]
+    fresh = np.abs(place[:, None] - listed).max(axis=2).min(axis=1) > PITCH / 2
     star, side = np.repeat(np.flatnonzero(fresh)[:TESTED], DRAWS), model.info.stamp_px
-    image = np.stack([_framed(psf, side) for psf in known["psf"][star].astype(float)])
-    everything = known["psf"][star].sum(axis=(1, 2))
+    image = np.stack([_framed(psf, side) for psf in npz["psf"][star].astype(float)])
+    everything = npz["psf"][star].sum(axis=(1, 2))
     area, rng = 1.0 / np.square(image).sum(axis=(1, 2)), stream(0, "simulated sky", "errors")
     for snr in FAINT_SNR:
         light = snr * np.sqrt(SKY * area)[:, None, None]
         stamps = rng.poisson(SKY + light * image).astype(float) - SKY
-        found = model.predict(stamps, position=place[star], gain=np.ones(len(star)))
-        inside, whole = (light * image).sum(axis=(1, 2)), light[:, 0, 0] * everything
+        result = model.predict(stamps, position=place[star], gain=np.ones(len(star)))
+        inside, total = (light * image).sum(axis=(1, 2)), light[:, 0, 0] * everything
         # A model calls flux what is above a ring around the star.
-        part = np.median(found.flux / inside)
-        off = np.abs(found.flux - part * inside) / found.flux_error
-        held = {
+        part = np.median(result.flux / inside)
+        off = np.abs(result.flux - part * inside) / result.flux_error
+        within_errors = {
             "flux": off < 1.0,
-            "psf": (np.abs(found.psf - light * image) < found.uncertainty).mean(axis=(1, 2)),
+            "psf": (np.abs(result.psf - light * image) < result.uncertainty).mean(axis=(1, 2)),
         }
         row = {"snr": snr, "stars": len(np.unique(star)), "images": len(star)}
-        row |= {"flux_over_stamp": part, "flux_total_over_all": np.median(found.flux_total / whole)}
+        row |= {
+            "flux_over_stamp": part,
+            "flux_total_over_all": np.median(result.flux_total / total),
+        }
         row["flux_pull"] = np.quantile(off, 0.6827)
-        for name, of in held.items():
+        for name, of in within_errors.items():
             row[name], row[f"{name}_stderr"] = clustered_mean(of.astype(float), star)
         rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
     pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
@@ -213,12 +216,12 @@ def _cut(image, pixel, side):
 
 
 def _sampled(path, position, side):
-    """What draws a package's PSFs (n, d, d) at their centres (n, 2) (row, column)."""
+    """Return a function that draws a package's PSFs (n, d, d) at centres (n, 2) (row, column)."""
     if path.suffix == ".psf":
         psf, step = _psfex(path, position + 1.0)
     else:
-        found = np.load(path)
-        psf, step = found["psf"], 1.0 / found["oversampling"]
+        samples = np.load(path)
+        psf, step = samples["psf"], 1.0 / samples["oversampling"]
     grid = step * (np.arange(psf.shape[-1]) - psf.shape[-1] // 2)
 
     def draw(centre):
@@ -251,27 +254,27 @@ def _lanczos(t):
 def _fitted(draw, stamps):
     """PSFs of sum 1 in the frames of stamps (n, d, d), by least squares."""
 
-    def solved(centre, *more):
-        parts = np.stack([draw(centre), np.ones_like(stamps), *more], axis=-1)
+    def solved(centre, *extra_columns):
+        parts = np.stack([draw(centre), np.ones_like(stamps), *extra_columns], axis=-1)
         parts = parts.reshape(len(stamps), -1, parts.shape[-1])
-        found = np.linalg.pinv(parts) @ flat
-        return found[..., 0], np.square(flat - parts @ found).sum(axis=(1, 2))
+        scales = np.linalg.pinv(parts) @ flat
+        return scales[..., 0], np.square(flat - parts @ scales).sum(axis=(1, 2))
 
     flat = stamps.reshape(len(stamps), -1, 1)
     axis = np.arange(-FARTHEST, FARTHEST + 1.0)
     starts = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     first = [solved(np.tile(start, (len(stamps), 1)))[1] for start in starts]
-    centre, least, part = starts[np.argmin(first, axis=0)], np.min(first, axis=0), 1.0
+    centre, min_chi2, part = starts[np.argmin(first, axis=0)], np.min(first, axis=0), 1.0
     for _ in range(ROUNDS):
         # Changes with the row and the column of the centre, from differences.
         slopes = [(draw(centre + e) - draw(centre - e)) / 0.04 for e in 0.02 * np.eye(2)]
-        found, _ = solved(centre, *slopes)
-        move = np.clip(found[:, 2:] / found[:, :1], -STEP, STEP) * part
+        scales, _ = solved(centre, *slopes)
+        move = np.clip(scales[:, 2:] / scales[:, :1], -STEP, STEP) * part
         chi2 = solved(centre + move)[1]
-        better = chi2 < least
-        centre = np.where(better[:, None], centre + move, centre)
-        least = np.minimum(chi2, least)
-        part = np.where(better, 1.0, np.asarray(part).ravel() / 2)[:, None]
+        is_improved = chi2 < min_chi2
+        centre = np.where(is_improved[:, None], centre + move, centre)
+        min_chi2 = np.minimum(chi2, min_chi2)
+        part = np.where(is_improved, 1.0, np.asarray(part).ravel() / 2)[:, None]
     psf = draw(centre)
     return psf / psf.sum(axis=(1, 2), keepdims=True)
 

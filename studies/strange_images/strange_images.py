@@ -114,14 +114,14 @@ def trail(side: int, x: float, y: float, u: float, v: float) -> np.ndarray:
 # Images.
 
 
-def places(rng: np.random.Generator, count: int, size: int, apart: float = 0.0) -> np.ndarray:
-    """Return positions (count, 2), x and y, no two nearer than `apart` px."""
-    chosen: list[np.ndarray] = []
-    while len(chosen) < count:
+def places(rng: np.random.Generator, count: int, size: int, distance_px: float = 0.0) -> np.ndarray:
+    """Return positions (count, 2), x and y, no two nearer than `distance_px`."""
+    accepted: list[np.ndarray] = []
+    while len(accepted) < count:
         new = rng.uniform(4, size - 5, 2)
-        if all(np.hypot(*(new - other)) >= apart for other in chosen):
-            chosen.append(new)
-    return np.array(chosen)
+        if all(np.hypot(*(new - place)) >= distance_px for place in accepted):
+            accepted.append(new)
+    return np.array(accepted)
 
 
 def fluxes(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
@@ -166,8 +166,8 @@ def table_of(place: np.ndarray, flux: np.ndarray) -> Table:
 
 def file_of(image: np.ndarray, **cards: object) -> fits.HDUList:
     """Return an image with the header of a camera; a card that is None is left out."""
-    known = {"GAIN": GAIN, "RDNOISE": READ_NOISE, "SATURATE": 60000.0, "PIXSCALE": 0.6, **cards}
-    header = fits.Header([(key, value) for key, value in known.items() if value is not None])
+    cards = {"GAIN": GAIN, "RDNOISE": READ_NOISE, "SATURATE": 60000.0, "PIXSCALE": 0.6, **cards}
+    header = fits.Header([(key, value) for key, value in cards.items() if value is not None])
     return fits.HDUList([fits.PrimaryHDU(image.astype(np.float32), header)])
 
 
@@ -175,14 +175,14 @@ def scene(
     seed: int,
     count: int = STARS,
     size: int = SIZE_PX,
-    apart: float = 0.0,
+    distance_px: float = 0.0,
     low: float = 500.0,
     high: float = 3e5,
     **drawing: object,
 ) -> tuple[np.random.Generator, np.ndarray, Table]:
     """Return random numbers, the light of stars without sky and noise, and the stars."""
     rng = np.random.default_rng(seed)
-    place = places(rng, count, size, apart)
+    place = places(rng, count, size, distance_px)
     flux = fluxes(rng, count, low, high)
     return rng, light_of(place, flux, size, **drawing), table_of(place, flux)
 
@@ -335,8 +335,8 @@ def quantised(seed: int) -> Case:
     rng, light, stars = scene(seed)
     image = exposed(rng, light + SKY).astype(np.float32)
     header = fits.Header([("GAIN", GAIN), ("RDNOISE", READ_NOISE), ("SATURATE", 60000.0)])
-    how = {"compression_type": "RICE_1", "quantize_level": 1.0, "quantize_method": -1}
-    packed = fits.CompImageHDU(image, header, **how)
+    compression = {"compression_type": "RICE_1", "quantize_level": 1.0, "quantize_method": -1}
+    packed = fits.CompImageHDU(image, header, **compression)
     return Case(fits.HDUList([fits.PrimaryHDU(), packed]), stars, suffix=".fits.fz")
 
 
@@ -472,7 +472,7 @@ SEEDS = {
 
 @dataclass
 class Run:
-    """What a command printed, and what it cost."""
+    """Output of a command, and its cost."""
 
     code: int
     text: str
@@ -482,18 +482,18 @@ class Run:
 
 def run(words: list[object]) -> Run:
     """Run psfdae with one thread."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    cpu_before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "psfdae", *map(str, words)],
         check=False, capture_output=True, text=True, env={**os.environ, **threads},
     )  # fmt: skip
-    cost = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
-    lines = done.stderr.strip().splitlines()
-    refusal = lines[-1] if done.returncode and lines else ""
-    if "Traceback" in done.stderr:
+    cost = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - cpu_before
+    lines = process.stderr.strip().splitlines()
+    refusal = lines[-1] if process.returncode and lines else ""
+    if "Traceback" in process.stderr:
         refusal = f"TRACEBACK {refusal}"
-    return Run(done.returncode, done.stdout + done.stderr, cost, refusal)
+    return Run(process.returncode, process.stdout + process.stderr, cost, refusal)
 
 
 def judged(kind: str, seed: int, case: Case, folder: Path) -> dict[str, object]:
@@ -528,21 +528,21 @@ def judged(kind: str, seed: int, case: Case, folder: Path) -> dict[str, object]:
     row |= {"learnt": len(learnt), "wrong": int((off > case.reach_px).sum())}
     (bundle,) = (place / "model").glob("*.psf.safetensors")
     out = ["--model", bundle, "--out", place / "photometry.csv", "--overwrite"]
-    done = run(["photometry", image, *stars, *out])
-    (place / "photometry.txt").write_text(done.text)
-    row |= {"photometry": done.code, "cpu_s": fit.cpu_s + done.cpu_s, "refusal": done.refusal[:200]}
-    if done.code:
+    job = run(["photometry", image, *stars, *out])
+    (place / "photometry.txt").write_text(job.text)
+    row |= {"photometry": job.code, "cpu_s": fit.cpu_s + job.cpu_s, "refusal": job.refusal[:200]}
+    if job.code:
         return row
     measured = Table.read(place / "photometry.csv", format="ascii.csv")
     measured = measured[np.isfinite(measured["x"]) & np.isfinite(measured["y"])]
-    where = np.stack([measured["x"], measured["y"]], axis=1)
-    distance, nearest = cKDTree(where).query(truth.data)
+    positions = np.stack([measured["x"], measured["y"]], axis=1)
+    distance, nearest = cKDTree(positions).query(truth.data)
     flux = np.array(case.stars["flux"])
     ratio = np.array(measured["flux"])[nearest] / flux - 1
     error = np.array(measured["flux_error"])[nearest] / flux
     clean = np.array(measured["flags"]) == 0
     bright = (distance < 1.5) & (flux > np.median(flux)) & np.isfinite(ratio)
-    wrong = clean[nearest] & bright & (np.abs(ratio) > 10 * error) & (np.abs(ratio) > 0.05)
+    is_off = clean[nearest] & bright & (np.abs(ratio) > 10 * error) & (np.abs(ratio) > 0.05)
     deviation = np.abs(ratio[bright] - np.median(ratio[bright]))
     return row | {
         "n": int(bright.sum()),
@@ -550,8 +550,8 @@ def judged(kind: str, seed: int, case: Case, folder: Path) -> dict[str, object]:
         "scatter_percent": 148.26 * np.median(deviation),
         "stated_percent": 100 * np.nanmedian(error[bright]),
         "within": np.mean(np.abs(ratio[bright]) < error[bright]),
-        "fakes": int((clean & (truth.query(where)[0] > max(2.0, case.reach_px))).sum()),
-        "far_off": int(wrong.sum()),
+        "fakes": int((clean & (truth.query(positions)[0] > max(2.0, case.reach_px))).sum()),
+        "far_off": int(is_off.sum()),
     }
 
 
@@ -572,9 +572,9 @@ def main(table: Path, folder: Path, *names: str) -> None:
         row |= {"date": date.today().isoformat(), "commit": git_commit()}
         rows = pd.DataFrame([row], columns=COLUMNS)
         if table.exists():
-            kept = pd.read_csv(table)
-            same = (kept["kind"] == name) & (kept["seed"] == seed)
-            rows = pd.concat([kept[~same], rows])
+            old_rows = pd.read_csv(table)
+            is_same = (old_rows["kind"] == name) & (old_rows["seed"] == seed)
+            rows = pd.concat([old_rows[~is_same], rows])
         place = rows["kind"].map({kind: place for place, kind in enumerate(kinds)})
         rows = rows.assign(place=place).sort_values(["place", "seed"]).drop(columns="place")
         rows[COUNTS] = rows[COUNTS].astype("Int64")

@@ -26,8 +26,8 @@ def draw(cube: str, truth: str, count: int) -> None:
     cluster = rng.choice(len(law.count), count, p=law.count / law.count.sum())
     coordinates = law.mean[cluster].astype(float)
     for star, k in enumerate(cluster):
-        own = law.deviation[ends[k] - law.rows[k] : ends[k]] / np.sqrt(law.count[k])
-        coordinates[star, : own.shape[1]] += rng.standard_normal(len(own)) @ own
+        deviation = law.deviation[ends[k] - law.rows[k] : ends[k]] / np.sqrt(law.count[k])
+        coordinates[star, : deviation.shape[1]] += rng.standard_normal(len(deviation)) @ deviation
     images = (coordinates @ law.axes.T).reshape(count, side, side)
     images /= images.sum(axis=(1, 2), keepdims=True)
     noise = np.exp(rng.uniform(np.log(info.noise_min), np.log(info.noise_max), count))
@@ -45,18 +45,18 @@ def errors(restored: str, truth: str) -> None:
         flux = np.asarray(stars["flux"], float)[:, None, None]
         noise = np.asarray(stars["noise"], float) / flux[:, 0, 0]
         off = np.abs(psf / flux - np.load(truth))
-        held = off < uncertainty / flux
-    known = np.isfinite(off).all(axis=(1, 2)) & (flux[:, 0, 0] > 0)
-    order = np.flatnonzero(known)[np.argsort(noise[known])]
-    print(f"{known.sum()} of {len(known)} stars have a flux")
+        is_within = off < uncertainty / flux
+    has_flux = np.isfinite(off).all(axis=(1, 2)) & (flux[:, 0, 0] > 0)
+    order = np.flatnonzero(has_flux)[np.argsort(noise[has_flux])]
+    print(f"{has_flux.sum()} of {len(has_flux)} stars have a flux")
     for part in np.array_split(order, PARTS):
-        mse, share = np.square(off[part]).mean(), held[part].mean()
+        mse, share = np.square(off[part]).mean(), is_within[part].mean()
         print(f"noise over flux to {noise[part[-1]]:.2g}: MSE {mse:.4g}, within UNCERT {share:.3f}")
 
 
 if __name__ == "__main__":
-    what, first, second, *count = sys.argv[1:]
-    if what == "draw":
+    action, first, second, *count = sys.argv[1:]
+    if action == "draw":
         draw(first, second, int(count[0]))
     else:
         errors(first, second)

@@ -37,11 +37,11 @@ def main(dataset: str, name: str, reference: str, stars: str, out: str) -> None:
     row = dict(dataset=dataset, method=name, reference=reference, clusters=len(fitted.count))
     row |= dict(shrinkage=fitted.shrinkage[0], fit_cpu_s=process_time() - start)
     test, errors, start = split_stars(product, "random", config).test, [], process_time()
-    where = field_positions(product)[test] if kind.needs.position else None
+    position = field_positions(product)[test] if kind.needs.position else None
     for level in config.noise.levels:
         noisy = noisy_test_images(config, product, test, level)
-        found = fitted.estimate(noisy, level, where)
-        errors.append(np.square(found.psf - product[reference][test]).mean(dtype=np.float64))
+        estimate = fitted.estimate(noisy, level, position)
+        errors.append(np.square(estimate.psf - product[reference][test]).mean(dtype=np.float64))
     row |= dict(estimate_cpu_s=process_time() - start, mse=np.exp(np.mean(np.log(errors))))
     table = pd.DataFrame([row | dict(date=date.today().isoformat(), commit=git_commit())])
     table.to_csv(out, mode="a", header=not Path(out).exists(), index=False, float_format="%.5g")

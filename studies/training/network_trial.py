@@ -31,11 +31,11 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
     """Train, measure, append."""
     root = Path(results)
     states, dae = root / "data/alignment", root / "alignment/dae"
-    given = [f"--dae={dae}"] * ALIGNERS[kind].denoised
+    dae_option = [f"--dae={dae}"] * ALIGNERS[kind].denoised
     config = load([*CHOICE, *overrides])
     test = read_product(states / "uniform.h5", "alignment_states", ("states", "stamps"))
     with tempfile.TemporaryDirectory() as folder:
-        words = ["alignment", "train-network", "--kind", kind, "--out", folder, *given]
+        words = ["alignment", "train-network", "--kind", kind, "--out", folder, *dae_option]
         words += ["--states", f"{states}/train.h5", "--checkpoint", f"{folder}/checkpoint.pt"]
         started = time.process_time()
         psfdae([*words, *overrides], standalone_mode=False)
@@ -43,8 +43,8 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
         predict, rows = network_predictor(Path(folder), test, config), []
         for level in config.noise.levels:
             noisy = noisy_test_states(config, test["stamps"], "uniform", level)
-            seen = denoise(dae, config, noisy) if ALIGNERS[kind].denoised else noisy
-            error = np.abs(predict(seen) - test["states"]).mean()
+            inputs = denoise(dae, config, noisy) if ALIGNERS[kind].denoised else noisy
+            error = np.abs(predict(inputs) - test["states"]).mean()
             row = dict(network=kind, trial=trial, settings=" ".join(overrides))
             row |= dict(noise_level=level, mean_abs_error=error, cpu_s=seconds)
             rows.append(row | dict(date=date.today().isoformat(), commit=git_commit()))

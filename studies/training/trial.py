@@ -31,33 +31,33 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 
 
-def with_schedule(**own):
+def with_schedule(**changes):
     """Let trainings take another one-cycle schedule."""
-    training.OneCycleLR = lambda *given, **usual: OneCycleLR(*given, **{**usual, **own})
+    training.OneCycleLR = lambda *words, **settings: OneCycleLR(*words, **{**settings, **changes})
 
 
 def with_sides(text):
     """Let each epoch see the middle of stamps of a side of its own; overrides that go with it."""
-    own, *templates = [[int(side) for side in part.split(",")] for part in text.split(":")]
-    sides = {"realisation": own, "template": templates[0] if templates else own}
+    sides_px, *templates = [[int(side) for side in part.split(",")] for part in text.split(":")]
+    sides = {"realisation": sides_px, "template": templates[0] if templates else sides_px}
     # All epochs but the last being cropped, their part that is over says which one it is.
     dae.middle_px = lambda _, part, reference: sides[reference][
         round(part * (len(sides[reference]) - 1))
     ]
-    continued = len(sides["template"]) / len(own)
+    continued = len(sides["template"]) / len(sides_px)
     return [
         "train.crop_epochs=0.999",
-        f"train.epochs={len(own)}",
+        f"train.epochs={len(sides_px)}",
         f"train.continued_epochs={continued}",
     ]
 
 
-def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str) -> None:
+def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: str) -> None:
     """Train with every seed, measure, append."""
-    words = dict(word.split("=", 1) for word in given)
-    own = {"course": ("anneal_strategy", str), "peak": ("pct_start", float)}
-    with_schedule(**{own[k][0]: own[k][1](v) for k, v in words.items() if k in own})
-    overrides = [f"{k}={v}" for k, v in words.items() if k not in {*own, "sides"}]
+    words = dict(word.split("=", 1) for word in settings)
+    keys = {"course": ("anneal_strategy", str), "peak": ("pct_start", float)}
+    with_schedule(**{keys[k][0]: keys[k][1](v) for k, v in words.items() if k in keys})
+    overrides = [f"{k}={v}" for k, v in words.items() if k not in {*keys, "sides"}]
     overrides += with_sides(words["sides"]) if "sides" in words else []
     config = load([f"dataset={dataset}", *overrides])
     references = config.dataset.references
@@ -72,15 +72,15 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str)
                 data = replace(data, seed=seed, checkpoint=Path(folder) / "checkpoint")
                 start = fitted = Dae.fit(data, config.dae, config.train)
             history = fitted.diagnosed[HISTORY]
-            best = np.nanmin([row["validation_mse"] for row in history])
+            lowest = np.nanmin([row["validation_mse"] for row in history])
             test = split_stars(product, "random", config).test
             rows = []
             for level in config.noise.levels:
                 noisy = noisy_test_images(config, product, test, level)
                 error = fitted.predict(noisy) - product[reference][test]
-                row = dict(dataset=dataset, trial=name, settings=" ".join(given), seed=seed)
+                row = dict(dataset=dataset, trial=name, settings=" ".join(settings), seed=seed)
                 row |= dict(split="random", reference=reference, noise_level=level)
-                row |= dict(mse=np.square(error).mean(dtype=np.float64), validation_mse=best)
+                row |= dict(mse=np.square(error).mean(dtype=np.float64), validation_mse=lowest)
                 row |= dict(attempt=fitted.attempt, cpu_s=history[-1]["cpu_seconds"])
                 rows.append(row | dict(date=date.today().isoformat(), commit=git_commit()))
             table, new = pd.DataFrame(rows), not Path(out).exists()

@@ -106,16 +106,16 @@ def stars(out, count=500):
     images = poppy_stamps(telescope, noll, truth, place)
     counts = noisy(images, snr, rng)
     started = time.process_time()
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5)
+    result = psfdae.wavefront(counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5)
     took = time.process_time() - started
     rows = []
     for probability in (0.6827, 0.9545):
-        low, high = np.moveaxis(found.interval(probability), -1, 0)
-        held = (truth >= low) & (truth <= high)
-        rows.append(("pooled", probability, held.mean()))
-        rows += [(n, probability, h) for n, h in zip(terms.names, held.mean(axis=0), strict=True)]
+        low, high = np.moveaxis(result.interval(probability), -1, 0)
+        inside = (truth >= low) & (truth <= high)
+        rows.append(("pooled", probability, inside.mean()))
+        rows += [(n, probability, h) for n, h in zip(terms.names, inside.mean(axis=0), strict=True)]
     table = pd.DataFrame(rows, columns=["coefficient", "interval", "held"])
-    table["stars"], table["explained"] = count, found.explained.mean()
+    table["stars"], table["explained"] = count, result.explained.mean()
     table["ms_per_star"] = 1000 * took / count
     stamped(table).to_csv(out, index=False, float_format="%.4g")
     print(table.to_string())
@@ -140,15 +140,15 @@ def joint(out, fits=50, count=100, snr=50.0):
         images = images.astype(float)
         counts = noisy(images, snr, rng)
         started = time.process_time()
-        found = psfdae.wavefront(
+        result = psfdae.wavefront(
             counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5, joint=True
         )
-        took, state = time.process_time() - started, found.joint
-        field = TelescopePosterior(found.search, model, state.star, found.search.optics)
+        took, state = time.process_time() - started, result.joint
+        field = TelescopePosterior(result.search, model, state.star, result.search.optics)
         flux = snr * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))[state.star]
-        own = np.column_stack([place[state.star], flux / found.search.flux[state.star]])
-        own = np.column_stack([own, np.zeros(len(own))])
-        _, _, information = field.evaluate(np.zeros(1), np.append(t, own.ravel())[None])
+        parameters = np.column_stack([place[state.star], flux / result.search.flux[state.star]])
+        parameters = np.column_stack([parameters, np.zeros(len(parameters))])
+        _, _, information = field.evaluate(np.zeros(1), np.append(t, parameters.ravel())[None])
         bound = model.sd * np.sqrt(np.diagonal(np.linalg.inv(information[0]))[: t.size])
         rows += [
             (fit, name, value, got, error, limit, state.probability, took)

@@ -23,7 +23,7 @@ from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.base import config_dir
 
-STATED, THERE, WIDTH = 1.5, 1.8, 0.15
+STATED, TRUE_FWHM, WIDTH = 1.5, 1.8, 0.15
 STARS, SNR, SKY, NIGHTS = 12, 100.0, 1000.0, 40
 
 
@@ -32,7 +32,7 @@ def main(out: Path) -> None:
     limit_threads(1)
     telescope = read_telescope(config_dir() / "telescope" / "example_zernike.yaml")
 
-    def seen(fwhm: float, prior: float):
+    def example(fwhm: float, prior: float):
         seeing = Seeing(kind="gaussian", fwhm_arcsec=fwhm)
         return telescope.model_copy(update={"seeing": seeing, "prior": Prior(seeing=prior)})
 
@@ -40,24 +40,24 @@ def main(out: Path) -> None:
     for seed in range(NIGHTS):
         rng = np.random.default_rng(seed)
         angle = rng.uniform(-1.0, 1.0, (STARS, 2)) * telescope.field_edge_deg
-        there = seen(THERE, 0.0)
-        model, terms = telescope_model(there, angle), terms_of(there, angle)
+        true_telescope = example(TRUE_FWHM, 0.0)
+        model, terms = telescope_model(true_telescope, angle), terms_of(true_telescope, angle)
         truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
         waves = np.einsum("mk,mkj->mj", model.coefficients(truth), terms.to_modes)
         place = rng.uniform(-0.5, 0.5, (STARS, 2))
-        operator = StarOptics(there, terms, 16).operator
+        operator = StarOptics(true_telescope, terms, 16).operator
         images = operator.stamps(np.concatenate([waves, place], axis=1)).astype(float)
         flux = SNR * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))
         counts = rng.poisson(flux[:, None, None] * images + SKY).astype(float)
         state = psfdae.wavefront(
-            counts, seen(STATED, WIDTH), field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
+            counts, example(STATED, WIDTH), field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
         ).joint
         strongest = np.abs(state.correlation[-1, :-1]).argmax()
         pull = (state.value[:-1] - truth) / state.error[:-1]
         row = {"night": seed, "found": state.value[-1], "error": state.error[-1]}
         row |= {"pull_of_others": np.sqrt(np.mean(pull**2)), "stars": len(state.star)}
         row |= {"with": state.model.names[strongest]}
-        rows.append(row | {"correlation": state.correlation[-1, strongest], "truth": THERE})
+        rows.append(row | {"correlation": state.correlation[-1, strongest], "truth": TRUE_FWHM})
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()

@@ -21,7 +21,7 @@ from psfdae.options import File
 from psfdae_paper.configuration.command import command
 
 TARGETS = (*(f"dataset{n}" for n in range(1, 9)), "scene3", "all")
-"""Of `make reproduce`, one after the other; each builds what those before it have not."""
+"""Targets of `make reproduce`, in order; each builds what those before it have not."""
 
 COSTS = {"wall_s": "wall time", "cpu_s": "CPU time", "job_s": "wall time of all jobs together"}
 EVERY_S = 0.2
@@ -55,10 +55,10 @@ def compare(
                 print(" ".join(f"{key} {value}" for key, value in rows[-1].items()), flush=True)
         table = pd.DataFrame(rows)
         write_csv(out, table, 6)
-        print(said(table, *(tree.name for tree in trees.values())))
+        print(summary(table, *(tree.name for tree in trees.values())))
 
 
-def said(table, old, new):
+def summary(table, old, new):
     """Ratios of the costs of two commits, in lines; `table` has a row per target and commit.
 
     Their scatter is that between targets, if there are several.
@@ -66,11 +66,11 @@ def said(table, old, new):
     first, second = (table[table.commit == c].set_index("target") for c in (old, new))
     lines = [f"{new} over {old}, targets: {', '.join(first.index)}"]
     for name, about in COSTS.items():
-        both = [second[name].to_numpy(float), first[name].reindex(second.index).to_numpy(float)]
-        ratio, stderr = clustered_ratio(*both, np.arange(len(second)))
+        seconds = [second[name].to_numpy(float), first[name].reindex(second.index).to_numpy(float)]
+        ratio, stderr = clustered_ratio(*seconds, np.arange(len(second)))
         scatter = f" ± {stderr:.3f}" if len(second) > 1 else ""
         lines.append(
-            f"  {about} {both[1].sum():.0f} -> {both[0].sum():.0f} s: {ratio:.3f}{scatter}"
+            f"  {about} {seconds[1].sum():.0f} -> {seconds[0].sum():.0f} s: {ratio:.3f}{scatter}"
         )
     peaks = [f"{side.peak_mb.max():.0f}" for side in (first, second)]
     return "\n".join([*lines, f"  largest job {peaks[0]} -> {peaks[1]} MB"])
@@ -86,23 +86,23 @@ def _tree(root, commit, folder):
 
 
 def _output(*words):
-    """What a command prints; a failure ends with what it says."""
-    done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise click.ClickException(f"{' '.join(map(str, words))}: {done.stderr.strip()}")
-    return done.stdout.strip()
+    """Return the output of a command; a failure ends with its message."""
+    process = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise click.ClickException(f"{' '.join(map(str, words))}: {process.stderr.strip()}")
+    return process.stdout.strip()
 
 
 def _built(tree, target, preset, cores):
     """Row with what a target costs: seconds, of Snakemake itself, too, and the largest job."""
-    started, clock, own = time(), perf_counter(), [0.0]
+    started, clock, cpu = time(), perf_counter(), [0.0]
     programs = f"{tree / '.venv/bin'}{os.pathsep}{os.environ['PATH']}"
     words = ["snakemake", "--cores", str(cores), "--quiet", "all"]
     words += ["--config", f"preset={preset}", "set=", "results=results", "--", target]
     child = subprocess.Popen(
         words, cwd=tree, env={**os.environ, "PATH": programs, "PSFDAE_RESULTS": "results"}
     )
-    watching = threading.Thread(target=_watch, args=(psutil.Process(child.pid), own))
+    watching = threading.Thread(target=_watch, args=(psutil.Process(child.pid), cpu))
     watching.start()
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
@@ -118,19 +118,19 @@ def _built(tree, target, preset, cores):
         "target": target,
         "wall_s": round(wall, 2),
         "cpu_s": round(used.ru_utime + used.ru_stime, 2),
-        "snakemake_cpu_s": round(own[0], 2),
+        "snakemake_cpu_s": round(cpu[0], 2),
         "jobs": len(jobs),
         "job_s": round(jobs.s.sum(), 2),
         "peak_mb": jobs.max_rss.max(),
     }
 
 
-def _watch(process, own):
+def _watch(process, cpu):
     """Keep the CPU time of a process without its children until it ends."""
     try:
         while process.status() != psutil.STATUS_ZOMBIE:
             times = process.cpu_times()
-            own[0] = times.user + times.system
+            cpu[0] = times.user + times.system
             sleep(EVERY_S)
     except psutil.Error:
         return

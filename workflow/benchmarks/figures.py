@@ -91,10 +91,10 @@ def propagation(table):
     table = table.assign(way=table["method"] + " " + table["backend"])
     for axes, name in zip(np.atleast_1d(panels), sorted({*table["aberration"]}), strict=True):
         rows = table[table["aberration"] == name]
-        for way, mine in rows.groupby("way"):
+        for way, part in rows.groupby("way"):
             _, color, marker = WAYS[way]
             dots = {"color": color, "marker": marker, "ls": "", "ms": 5, "alpha": 0.75, "mew": 0}
-            axes.plot(mine["time_ms"], mine["mse"], **dots)
+            axes.plot(part["time_ms"], part["mse"], **dots)
         front = rows[rows["pareto"] == "yes"].sort_values("time_ms")
         axes.plot(front["time_ms"], front["mse"], color="black", lw=1.0)
         used = rows[rows["used"] == "yes"]
@@ -146,17 +146,17 @@ def baseline(table):
     panels = figure.subplots(1, 2, sharex=True)
     used = table[table["used"] == "yes"].iloc[0]
     for axes, reference in zip(panels, ("realisation", "template"), strict=True):
-        column, rest = f"mse_{reference}", table.drop(index=used.name)
+        column, single = f"mse_{reference}", table.drop(index=used.name)
         for (size, label), color in zip(SIZES.items(), SERIES_COLORS, strict=False):
-            others = [name for name in SIZES if name != size]
-            line = table[(table[others] == used[others]).all(axis=1)].sort_values(size)
-            rest = rest.drop(index=line.index, errors="ignore")
+            other_sizes = [name for name in SIZES if name != size]
+            line = table[(table[other_sizes] == used[other_sizes]).all(axis=1)].sort_values(size)
+            single = single.drop(index=line.index, errors="ignore")
             style = {"marker": "o", "ms": 4, "lw": 1.2, "color": color}
             axes.plot(line["fit_s"], line[column], label=f"{label} varied", **style)
             for row in line.drop(index=used.name).to_dict("records"):
                 labelled(axes, row["fit_s"], row[column], str(row[size]), color=color)
-        axes.plot(rest["fit_s"], rest[column], ls="", marker="x", color="#4d4d4d")
-        for row in rest.to_dict("records"):
+        axes.plot(single["fit_s"], single[column], ls="", marker="x", color="#4d4d4d")
+        for row in single.to_dict("records"):
             text = f"K {row['components']}, {row['rows']}×{row['columns']}, {row['epochs']}"
             # The slow one stands at the right edge.
             side = {"shift": -4, "ha": "right"} if row["fit_s"] > used["fit_s"] else {}
@@ -223,9 +223,9 @@ def scaling(table):
     """Time, memory and disk against the stars, and time per star against the stamp's side."""
     figure = new_figure(6.0, layout="constrained")
     *panels, by_side = figure.subplots(2, 2).flat
-    for (what, against), part in table.groupby(["what", "against"], sort=False):
-        style = {"color": COLORS[what], "marker": "o", "lw": 1.4}
-        label = f"{what}: exponent {part['exponent'].iloc[0]:.2f}"
+    for (stage, against), part in table.groupby(["what", "against"], sort=False):
+        style = {"color": COLORS[stage], "marker": "o", "lw": 1.4}
+        label = f"{stage}: exponent {part['exponent'].iloc[0]:.2f}"
         if against == "stamp_px":
             per_star = 1e3 * part["time_s"] / part["stars"]
             by_side.plot(part["stamp_px"], per_star, label=label, **style)
@@ -233,7 +233,7 @@ def scaling(table):
         measured = part[part["measured"] == "yes"]
         for axes, cost in zip(panels, COSTS, strict=True):
             axes.plot(part["stars"], part[cost], **style | {"ls": ":", "mfc": "white"})
-            name = label if cost == "time_s" else what
+            name = label if cost == "time_s" else stage
             axes.plot(measured["stars"], measured[cost], label=name, **style)
             axes.set(xlabel="stars", ylabel=COSTS[cost])
     by_side.set(xlabel="side of the stamp (px)", ylabel="ms per star")
@@ -258,20 +258,20 @@ def graded(table):
     for number, axes in enumerate(figure.subplots(2, 2).flat):
         title, xlabel, ylabel, place = STRESS[number]
         axes.set(**LOGS, title=title, xlabel=xlabel, ylabel=ylabel)
-        refused, series = False, [rest for panel, *rest in SERIES if panel == number]
+        refused, series = False, [fields for panel, *fields in SERIES if panel == number]
         for (case, label, bounded), color in zip(series, SERIES_COLORS, strict=False):
             rows = table[table["case"] == case].sort_values("stress")
-            gone = rows["error"].isna()
-            measured, lost = rows[~gone], rows.loc[gone, "stress"]
+            is_refused = rows["error"].isna()
+            measured, stress = rows[~is_refused], rows.loc[is_refused, "stress"]
             style = {"lw": 1.3, "color": color, "label": label}
             axes.plot(measured["stress"], measured["error"], "o-", ms=4, **style)
             if bounded:
                 axes.plot(rows["stress"], rows["bound"], "--", lw=1.0, color=color)
             # Marks of what is refused are near the upper edge, in room made for them.
-            height = np.full(len(lost), 0.96 - 0.04 * SERIES_COLORS.index(color))
+            height = np.full(len(stress), 0.96 - 0.04 * SERIES_COLORS.index(color))
             transform = axes.get_xaxis_transform()
-            axes.plot(lost, height, "x", ms=6, mew=1.6, color=color, transform=transform)
-            refused |= gone.any()
+            axes.plot(stress, height, "x", ms=6, mew=1.6, color=color, transform=transform)
+            refused |= is_refused.any()
         axes.plot([], [], "--", lw=1.0, color="0.4", label="bound")
         if refused:
             axes.plot([], [], "x", ms=6, mew=1.6, color="0.4", label="refused")

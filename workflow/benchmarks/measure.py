@@ -39,7 +39,7 @@ def time_in_rounds(builders, repeats):
 
     A machine that others share is slower for seconds at a time; rounds spread the repeats of
     every callable over the whole run. Builders set up what is timed and warm it up, anew in
-    every round. Processes that run side by side (see `alone`) begin every timing together.
+    every round. Processes that run side by side (see `isolated`) begin every timing together.
     """
     return np.array([[_timed(build()) for build in builders] for _ in range(repeats)]).T
 
@@ -57,7 +57,7 @@ def _meet(barrier):
     _BARRIERS.append(barrier)
 
 
-def alone(threads, function, *arguments, processes=1):
+def isolated(threads, function, *arguments, processes=1):
     """Results of a module's function in interpreters of their own with so many threads.
 
     That of one process as it is, those of several that run side by side as a list.
@@ -71,36 +71,36 @@ def alone(threads, function, *arguments, processes=1):
     pool = ProcessPoolExecutor(processes, context, *meeting, max_tasks_per_child=1)
     with patch.dict(os.environ, dict.fromkeys(THREAD_VARIABLES, str(threads))), pool:
         running = [pool.submit(function, *arguments) for _ in range(processes)]
-        found = [task.result() for task in running]
-    return found if processes > 1 else found[0]
+        results = [task.result() for task in running]
+    return results if processes > 1 else results[0]
 
 
 def cost_of_command(words, out, tree=None):
-    """What a command of psfdae costs in this process, run as users run it.
+    """Return the cost of a command of psfdae in this process, run as users run it.
 
     `words` are its name and options but for `--out`, `tree` the configuration that its groups
     are from, if it reads any. Seconds are `time_s` and `cpu_s`, bytes those of the memory
     before and at most (`resting_b`, `peak_b`) and of new files in the folder (`disk_b`).
     """
-    (name, *given), before = [*map(str, words), "--out", str(out)], _files(out.parent)
+    (name, *options), files_before = [*map(str, words), "--out", str(out)], _files(out.parent)
     with TemporaryDirectory() as folder:
         if tree is not None:
             # A command that fits a method reads the groups of the method that it names.
-            reads = stage(name).stage.settings.names({"name": given[0]})
+            reads = stage(name).stage.settings.names({"name": options[0]})
             settings = write_settings(Path(folder), name, reads, tree)
-            given += ["--config", str(settings)]
+            options += ["--config", str(settings)]
         resting, start, start_cpu = _memory("VmRSS", forget=True), perf_counter(), process_time()
-        if code := main([*name.split(), *given], standalone_mode=False):
+        if code := main([*name.split(), *options], standalone_mode=False):
             raise RuntimeError(f"psfdae {name}: ends with {code}")
         cost = {"time_s": perf_counter() - start, "cpu_s": process_time() - start_cpu}
-    peak, new = _memory("VmHWM"), _files(out.parent) - before
+    peak, new = _memory("VmHWM"), _files(out.parent) - files_before
     return cost | {"resting_b": resting, "peak_b": peak, "disk_b": sum(size for *_, size in new)}
 
 
 def _files(folder):
     """Path, time and size of the files of a folder."""
-    found = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
-    return {(path, about.st_mtime_ns, about.st_size) for path, about in found}
+    paths = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
+    return {(path, about.st_mtime_ns, about.st_size) for path, about in paths}
 
 
 def _memory(entry, forget=False):
@@ -145,8 +145,8 @@ def machine():
 def pareto(time, error):
     """Points that no other one beats in both time and error: indices by ascending time."""
     order = np.lexsort((error, time))
-    best = np.minimum.accumulate(error[order])
-    return order[np.r_[True, error[order][1:] < best[:-1]]]
+    lowest = np.minimum.accumulate(error[order])
+    return order[np.r_[True, error[order][1:] < lowest[:-1]]]
 
 
 def yes(condition):

@@ -14,7 +14,7 @@ from typing import Annotated
 import click
 import numpy as np
 
-from measure import alone, cost_of_command, write, yes
+from measure import cost_of_command, isolated, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import program
 from psfdae.files import read_product
@@ -65,8 +65,8 @@ def throughput(
     work = (settings.star_counts[-1], settings.threads, min(settings.repeats, REPEATS))
     with TemporaryDirectory() as folder:
         cube = Path(folder, "stars.fits")
-        alone(1, make_cube, config.model_dump(), stars, work[0], cube)
-        rates, peak_mb = alone(settings.threads, time_prediction, cube, bundle, mixture, *work)
+        isolated(1, make_cube, config.model_dump(), stars, work[0], cube)
+        rates, peak_mb = isolated(settings.threads, time_prediction, cube, bundle, mixture, *work)
     bare = max(rates["bare_shared_per_s"], rates["bare_parallel_per_s"])
     share = rates["predict_per_s"] / bare
     row = {"stamps": work[0], "stamp_px": config.framing.stamp_px, "threads": work[1]}
@@ -136,14 +136,14 @@ def bare_rate(model, stamps, threads, way):
     size = model.restorer.block_size
     blocks = rounds * np.array_split(images, range(size, len(images), size))
 
-    def apply(some):
-        return predict(network, some, factor, size)
+    def apply(images):
+        return predict(network, images, factor, size)
 
     if way == "shared":
-        before = torch.get_num_threads()
+        threads_before = torch.get_num_threads()
         torch.set_num_threads(threads)
         seconds = Timer(partial(apply, images)).timeit(rounds)
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads_before)
     else:
         with one_thread_each():
             seconds = Timer(partial(side_by_side, apply, blocks, threads)).timeit(1)
@@ -181,11 +181,11 @@ def bundle_errors(bundle, truth, config):
         rng = stream(config.seed, "poppy", "noise", f"{level:.6g}")
         flux = float(noise.flux(level))
         stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
-        given = model.predict(stamps, flux=flux, background=noise.background, gain=1.0)
+        prediction = model.predict(stamps, flux=flux, background=noise.background, gain=1.0)
         estimated = model.predict(stamps, gain=1.0)
         row = {"bundle": model.info.name, "method": model.info.method, "noise_level": level}
         row |= {"snr": tested["snr"], "stars": len(truth), "mse_table": tested["mse"]}
-        row |= quality(given, truth, flux, tested["mse"], "given")
+        row |= quality(prediction, truth, flux, tested["mse"], "given")
         row |= quality(estimated, truth, flux, tested["mse"], "estimated")
         row["lost"] = np.isnan(estimated.psf).any(axis=(1, 2)).sum()
         row["allowed_ratio"] = ALLOWED_RATIO
@@ -201,23 +201,23 @@ def require_bundle(bundle, config):
         require(bundle, trained_on, STARS, config)
 
 
-def quality(found, truth, flux, expected, which):
+def quality(result, truth, flux, expected, case):
     """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty.
 
     `coverage95` is of `UNCERT` times `ratio95`.
     """
     from psfdae.model.error_model import brightest
 
-    kept = np.isfinite(found.psf).all(axis=(1, 2))
-    psf, width = found.psf[kept], found.uncertainty[kept]
-    ratio = found.ratio95[kept, None, None], found.ratio95_bright[kept, None, None]
-    wide = width * np.where(brightest(psf), *ratio[::-1])
-    squares = np.square(psf / found.flux[kept, None, None] - truth[kept]).mean(axis=(1, 2))
-    error, mse = np.abs(psf - flux * truth[kept]), squares.mean()
+    good = np.isfinite(result.psf).all(axis=(1, 2))
+    psf, width = result.psf[good], result.uncertainty[good]
+    ratio = result.ratio95[good, None, None], result.ratio95_bright[good, None, None]
+    width95 = width * np.where(brightest(psf), *ratio[::-1])
+    squares = np.square(psf / result.flux[good, None, None] - truth[good]).mean(axis=(1, 2))
+    error, mse = np.abs(psf - flux * truth[good]), squares.mean()
     row = {"mse": mse, "stderr": squares.std(ddof=1) / squares.size**0.5, "ratio": mse / expected}
     row |= {"coverage": (error <= width).mean()}
-    row |= {"coverage95": (error <= wide).mean()}
-    return {f"{name}_{which}": value for name, value in row.items()}
+    row |= {"coverage95": (error <= width95).mean()}
+    return {f"{name}_{case}": value for name, value in row.items()}
 
 
 @command("coverage", reads=TESTED)
@@ -237,8 +237,8 @@ def coverage(
     rows = []
     for path in bundles:
         bundle = read_bundle(path)
-        own = (p for p in products if p.config == bundle.info.config["stars"])
-        product = next(own, None) or refuse(path, stars)
+        matching = (p for p in products if p.config == bundle.info.config["stars"])
+        product = next(matching, None) or refuse(path, stars)
         rows += covered(bundle, product, config.seed)
     write(out, rows)
 
@@ -256,32 +256,32 @@ def covered(bundle, product, seed):
     from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
-    said = part(("seed", "noise", "parts"), trained)
-    noise, rng = star_sets.noise_model(said), stream(seed, "coverage", bundle.info.name)
+    settings = part(("seed", "noise", "parts"), trained)
+    noise, rng = star_sets.noise_model(settings), stream(seed, "coverage", bundle.info.name)
     reference = bundle.info.reference
-    test = star_sets.split_stars(product, trained["split"], said).test
+    test = star_sets.split_stars(product, trained["split"], settings).test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
-    odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    halves = [HeldOutStars.of(product, reference, noise, test[half]) for half in (odd, ~odd)]
-    found = {}
+    is_odd = np.unique(star, return_inverse=True)[1] % 2 == 1
+    halves = [HeldOutStars.of(product, reference, noise, test[half]) for half in (is_odd, ~is_odd)]
+    cells = {}
     for judges, judged in (halves, halves[::-1]):
         model = calibrated(bundle, fitted, judges, seed)[0]
         for tested in bundle.info.metrics:
             level = tested["noise_level"]
             flux = float(noise.flux(level))
             stamps = rng.poisson(flux * judged.images + noise.background).astype(np.float32)
-            told = PsfModel(model).predict(stamps, gain=1.0, position=judged.position)
-            kept = np.isfinite(told.psf).all(axis=(1, 2))
+            result = PsfModel(model).predict(stamps, gain=1.0, position=judged.position)
+            good = np.isfinite(result.psf).all(axis=(1, 2))
             # As the calibration has it: the own noise of stars of an image is no error.
-            error = flux * judged.errors(told.psf / flux)[kept] / told.uncertainty[kept]
-            bright = brightest(told.psf[kept])
-            ratios = told.ratio95_bright, told.ratio95
+            error = flux * judged.errors(result.psf / flux)[good] / result.uncertainty[good]
+            bright = brightest(result.psf[good])
+            ratios = result.ratio95_bright, result.ratio95
             for name, pixels, ratio in zip(BRIGHTNESS, (bright, ~bright), ratios, strict=True):
-                inside = (error <= 1), (error <= ratio[kept, None, None])
+                inside = (error <= 1), (error <= ratio[good, None, None])
                 key = level, tested["snr"], name
-                found.setdefault(key, []).append([kept.sum(), *(i[pixels].mean() for i in inside)])
-    for (level, snr, name), parts in found.items():
+                cells.setdefault(key, []).append([good.sum(), *(i[pixels].mean() for i in inside)])
+    for (level, snr, name), parts in cells.items():
         of_half = np.array(parts)
         row = {"bundle": bundle.info.name, "method": bundle.info.method, "noise_level": level}
         row |= {"snr": snr, "pixels": name, "stars": int(of_half[:, 0].sum())}
@@ -290,7 +290,7 @@ def covered(bundle, product, seed):
 
 
 @command("strange", reads=TESTED)
-def strange(
+def outliers(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
     bundle: Annotated[File, "Model bundle of a method with a law of stars."],
@@ -316,13 +316,13 @@ def strange(
     rows = []
     for level in config.noise.levels:
         limits = {}
-        for kind, changed in unlike(images, stream(config.seed, "strange", "draws")).items():
+        for kind, changed in changed_stars(images, stream(config.seed, "strange", "draws")).items():
             rng = stream(config.seed, "strange", "noise", f"{level:.6g}", kind)
             flux = noise.flux(level)
             stamps = rng.poisson(flux * changed + noise.background).astype(np.float32)
-            found = model.predict(stamps, gain=1.0)
+            prediction = model.predict(stamps, gain=1.0)
             # Tables of the record name the outlier score so.
-            scores = {"distance": found.distance, "strangeness": found.outlier_score}
+            scores = {"distance": prediction.distance, "strangeness": prediction.outlier_score}
             for measure, score in scores.items():
                 values = score[np.isfinite(score)]
                 limits.setdefault(measure, np.quantile(values, 1.0 - FALSE_ALARMS))
@@ -332,21 +332,21 @@ def strange(
     write(out, rows)
 
 
-def unlike(images, rng):
+def changed_stars(images, rng):
     """Stars as they are, then others by kind, each of flux 1; shape (n, d, d)."""
     count, side = len(images), images.shape[-1]
     place = np.arange(side) - side // 2
-    angle, where = rng.uniform(0, 2 * np.pi, count), rng.integers(3, side - 3, (count, 2))
+    angle, pixel = rng.uniform(0, 2 * np.pi, count), rng.integers(3, side - 3, (count, 2))
     shift = np.rint(COMPANION_PX * np.stack([np.sin(angle), np.cos(angle)], axis=1)).astype(int)
-    moved = [np.roll(star, by, axis=(0, 1)) for star, by in zip(images[::-1], shift, strict=True)]
+    shifted = [np.roll(star, by, axis=(0, 1)) for star, by in zip(images[::-1], shift, strict=True)]
     hit = images.copy()
     for along in range(RAY_PX):  # a straight one, along a row
-        hit[np.arange(count), where[:, 0], np.minimum(where[:, 1] + along, side - 1)] += RAY_FLUX
+        hit[np.arange(count), pixel[:, 0], np.minimum(pixel[:, 1] + along, side - 1)] += RAY_FLUX
     radius2 = np.square(place[:, None]) + np.square(place)
     width2 = np.mean((images * radius2).sum(axis=(1, 2))) / 2.0
     kinds = {
         "usual": images,
-        "companion": images + COMPANION_FLUX * np.stack(moved),
+        "companion": images + COMPANION_FLUX * np.stack(shifted),
         "cosmic ray": hit,
         "turned": np.rot90(images, axes=(1, 2)),
         "Gaussian": np.broadcast_to(np.exp(-0.5 * radius2 / width2), images.shape),
@@ -439,4 +439,4 @@ def poppy_telescope(telescope, side_px):
 
 
 if __name__ == "__main__":
-    program(throughput, poppy, coverage, strange)
+    program(throughput, poppy, coverage, outliers)

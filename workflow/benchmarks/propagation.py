@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Annotated, Any
 
-from measure import alone, machine, write
+from measure import isolated, machine, write
 from propagators import (
     compare,
     configured_setting,
@@ -69,14 +69,14 @@ def time_everything(config, cases):
             for setting in kernel_settings(optics, benchmark, case.samples, backend)
         ]
         for threads in sorted({setting.threads for _, setting in pairs}):
-            chosen = [pair for pair in pairs if pair[1].threads == threads]
+            timed = [pair for pair in pairs if pair[1].threads == threads]
             if (backend, threads) == ("numpy", benchmark.threads):
-                chosen += peers
-                beside = [(case, replace(setting, threads=1)) for case, setting in chosen]
-            work = (time_settings, chosen, benchmark.repeats, benchmark.stamps)
-            rows += alone(threads, *work)
+                timed += peers
+                parallel = [(case, replace(setting, threads=1)) for case, setting in timed]
+            work = (time_settings, timed, benchmark.repeats, benchmark.stamps)
+            rows += isolated(threads, *work)
     if benchmark.threads > 1:
-        rows += in_processes(beside, benchmark.repeats, benchmark.stamps, benchmark.threads)
+        rows += in_processes(parallel, benchmark.repeats, benchmark.stamps, benchmark.threads)
     used = {case.aberration: configured_setting(optics, benchmark, case.samples) for case in cases}
     return finish(rows, used)
 

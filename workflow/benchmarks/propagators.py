@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from measure import alone, pareto, time_in_rounds, use_threads, yes
+from measure import isolated, pareto, time_in_rounds, use_threads, yes
 from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
 from psfdae.optics.pupil import SamplingError
 from psfdae.threads import side_by_side
@@ -62,9 +62,9 @@ class Setting:
 
 def candidate_samples(optics, thorough):
     """Grid sizes N to try: the configured grid_sizes, coarser ones and those between, ascending."""
-    least, *_, most = optics.pupil_samples
-    others = GRIDS if thorough else [n for n in GRIDS if n < least][-1:]
-    return sorted({*(n for n in others if n < most), *optics.pupil_samples})
+    first, *_, last = optics.pupil_samples
+    coarser = GRIDS if thorough else [n for n in GRIDS if n < first][-1:]
+    return sorted({*(n for n in coarser if n < last), *optics.pupil_samples})
 
 
 def configured_setting(optics, benchmark, samples):
@@ -73,8 +73,8 @@ def configured_setting(optics, benchmark, samples):
     Its batch is the configured one, but no more than are timed.
     """
     batch = min(optics.batch, benchmark.stamps)
-    rest = (EXTRA_POINTS, optics.precision, optics.backend, optics.threads, batch)
-    return Setting("kernel", samples, *rest)
+    options = (EXTRA_POINTS, optics.precision, optics.backend, optics.threads, batch)
+    return Setting("kernel", samples, *options)
 
 
 def kernel_settings(optics, benchmark, samples, backend):
@@ -87,32 +87,32 @@ def kernel_settings(optics, benchmark, samples, backend):
     grids = candidate_samples(optics, benchmark.peers)
     points = POINTS if benchmark.peers else POINTS[-2:]
     threads, batches = sorted({1, benchmark.threads}), BATCHES if benchmark.peers else (1,)
-    rest = (backend, benchmark.threads, used.batch)
-    chosen = [Setting("kernel", *point, *rest) for point in product(grids, points, PRECISIONS)]
+    options = (backend, benchmark.threads, used.batch)
+    settings = [Setting("kernel", *point, *options) for point in product(grids, points, PRECISIONS)]
     for precision, t, batch in product(PRECISIONS, threads, batches):
-        chosen.append(replace(used, precision=precision, threads=t, batch=batch))
-    return list(dict.fromkeys([*chosen, used]))
+        settings.append(replace(used, precision=precision, threads=t, batch=batch))
+    return list(dict.fromkeys([*settings, used]))
 
 
 def peers_of(case, benchmark, coarse=126):
-    """What is set beside the kernel: FFTs and, if wanted, POPPY and HCIPy on two grids."""
+    """Return settings of other codes: FFTs and, if wanted, POPPY and HCIPy on two grids."""
     fine, single = case.samples, {"precision": "complex64"}
     if not benchmark.peers:
-        chosen = [Setting("fft", fine, 2), Setting("fft_pruned", fine, 2)]
+        peers = [Setting("fft", fine, 2), Setting("fft_pruned", fine, 2)]
     else:
-        chosen = [Setting("fft", fine, q, p) for q in (2, 4, 8) for p in PRECISIONS]
-        chosen += [Setting("fft_pruned", fine, q, **single) for q in (2, 4, 8, 16)]
+        peers = [Setting("fft", fine, q, p) for q in (2, 4, 8) for p in PRECISIONS]
+        peers += [Setting("fft_pruned", fine, q, **single) for q in (2, 4, 8, 16)]
         for method in ("poppy_mft", "hcipy"):
-            chosen += [Setting(method, coarse, q) for q in (2, 4, 8)]
-            chosen += [Setting(method, fine, q) for q in (2, 4, 8, 16)]
-            chosen += [Setting(method, fine, q, **single) for q in (4, 8)]
+            peers += [Setting(method, coarse, q) for q in (2, 4, 8)]
+            peers += [Setting(method, fine, q) for q in (2, 4, 8, 16)]
+            peers += [Setting(method, fine, q, **single) for q in (4, 8)]
         sizes = ((coarse, 4), (fine, 2), (fine, 4), (fine, 8))
         # Fresnel propagation samples the image by the padding; below 2 it aliases its phases.
-        chosen += [Setting("poppy_fresnel", n, q) for n, q in sizes if q / case.pixel >= 2.0]
-    return [replace(peer, threads=benchmark.threads) for peer in dict.fromkeys(chosen)]
+        peers += [Setting("poppy_fresnel", n, q) for n, q in sizes if q / case.pixel >= 2.0]
+    return [replace(peer, threads=benchmark.threads) for peer in dict.fromkeys(peers)]
 
 
-def time_settings(chosen, repeats, stamps):
+def time_settings(pairs, repeats, stamps):
     """Rows of pairs of a case and a setting, timed in turn in this process.
 
     Times are those of one stamp, whatever ran beside it. The kernel does more per timing than
@@ -120,7 +120,7 @@ def time_settings(chosen, repeats, stamps):
     stars. Settings that a wavefront refuses (its grid would alias) are left out.
     """
     trials, builders = [], []
-    for case, setting in chosen:
+    for case, setting in pairs:
         try:
             samples, propagate = build(case, replace(setting, batch=1))
         except SamplingError:
@@ -144,16 +144,16 @@ def time_settings(chosen, repeats, stamps):
     return rows
 
 
-def in_processes(chosen, repeats, stamps, processes):
+def in_processes(pairs, repeats, stamps, processes):
     """Rows of `time_settings` where so many processes of one thread run side by side.
 
     The time of a stamp is that of one process over their number.
     """
-    found = alone(1, time_settings, chosen, repeats, stamps, processes=processes)
+    results = isolated(1, time_settings, pairs, repeats, stamps, processes=processes)
     rows = []
-    for same in zip(*found, strict=True):
-        times = {key: np.mean([r[key] for r in same]) / processes for key in TIMES}
-        rows.append({**same[0], **times, "processes": processes})
+    for copies in zip(*results, strict=True):
+        times = {key: np.mean([r[key] for r in copies]) / processes for key in TIMES}
+        rows.append({**copies[0], **times, "processes": processes})
     return rows
 
 
@@ -249,18 +249,18 @@ def padded_fft(case, peer):
     opd = case.batch(pupil, 1, np.zeros(0, precision).real.dtype)[0]
     ramp = np.exp(2j * np.pi * _towards_stamp(case, pupil, samples / padded))
     amplitude = (pupil.amplitude * ramp).astype(precision)
-    seen, size = _subsamples(case, peer.points) % padded, pupil.axis.size
+    points, size = _subsamples(case, peer.points) % padded, pupil.axis.size
 
-    def whole():
+    def unpruned():
         grid = np.zeros((padded, padded), precision)
         grid[:size, :size] = amplitude * np.exp(2j * np.pi * opd)
-        return fft.fft2(grid, workers=peer.threads, overwrite_x=True)[np.ix_(seen, seen)]
+        return fft.fft2(grid, workers=peer.threads, overwrite_x=True)[np.ix_(points, points)]
 
     def pruned():
         rows = fft.fft(amplitude * np.exp(2j * np.pi * opd), n=padded, workers=peer.threads)
-        return fft.fft(rows[:, seen], n=padded, axis=0, workers=peer.threads)[seen]
+        return fft.fft(rows[:, points], n=padded, axis=0, workers=peer.threads)[points]
 
-    field_of = whole if peer.method == "fft" else pruned
+    field_of = unpruned if peer.method == "fft" else pruned
     return samples, lambda: np.abs(field_of()) ** 2
 
 
@@ -296,8 +296,8 @@ def poppy_fresnel(case, peer):
     system.add_optic(poppy.QuadraticLens(focal_length))
     focus = poppy.ScalarTransmission(planetype=poppy.poppy_core.PlaneType.image, name="focus")
     system.add_optic(focus, distance=focal_length)
-    seen = np.ix_(*[padded // 2 - _subsamples(case, peer.points)] * 2)
-    return samples, lambda: image()[seen]
+    points = np.ix_(*[padded // 2 - _subsamples(case, peer.points)] * 2)
+    return samples, lambda: image()[points]
 
 
 def fresnel_grid(case, peer):
@@ -369,14 +369,14 @@ def compare(table):
     Both were timed in the same way (backend numpy), in one process with the same threads or
     in as many processes. Peers that err less than every setting of ours are left out.
     """
-    ours = table[(table["method"] == "kernel") & (table["backend"] == "numpy")]
-    ours = ours[[*EQUAL, *KERNEL_COLUMNS]]
-    ours = ours.rename(columns={name: f"kernel_{name}" for name in KERNEL_COLUMNS})
+    kernel = table[(table["method"] == "kernel") & (table["backend"] == "numpy")]
+    kernel = kernel[[*EQUAL, *KERNEL_COLUMNS]]
+    kernel = kernel.rename(columns={name: f"kernel_{name}" for name in KERNEL_COLUMNS})
     peers = table.loc[table["method"] != "kernel", PEER_COLUMNS].reset_index()
-    pairs = peers.merge(ours, on=EQUAL).query("kernel_mse <= mse").reset_index(drop=True)
-    best = pairs.groupby("index")["kernel_time_ms"].idxmin()
-    found = pairs.loc[best].drop(columns="index").reset_index(drop=True)
-    found["speedup"] = found["time_ms"] / found["kernel_time_ms"]
-    found["required"] = found["method"].map(REQUIRED_SPEEDUP)
-    met = (found["speedup"] >= found["required"]).map(yes)
-    return found.assign(met=met.where(found["required"].notna(), ""))
+    pairs = peers.merge(kernel, on=EQUAL).query("kernel_mse <= mse").reset_index(drop=True)
+    fastest = pairs.groupby("index")["kernel_time_ms"].idxmin()
+    rows = pairs.loc[fastest].drop(columns="index").reset_index(drop=True)
+    rows["speedup"] = rows["time_ms"] / rows["kernel_time_ms"]
+    rows["required"] = rows["method"].map(REQUIRED_SPEEDUP)
+    is_met = (rows["speedup"] >= rows["required"]).map(yes)
+    return rows.assign(met=is_met.where(rows["required"].notna(), ""))

@@ -135,7 +135,7 @@ def relative_to_peak(stamps, reference):
 
 
 def spread_evenly(total, count):
-    """At most `count` indices from 0 to total − 1."""
+    """Return at most `count` indices from 0 to total − 1."""
     return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(int))
 
 
@@ -150,15 +150,15 @@ def build_cases(scene):
         ("strong", scene.stars, np.argmax, scene.search_px),
     ):
         slopes = source.slopes()
-        one = Selection(source, np.array([pick(np.abs(slopes).max(axis=(1, 2)))]), slopes)
+        selection = Selection(source, np.array([pick(np.abs(slopes).max(axis=(1, 2)))]), slopes)
         # A copy: sources keep images of every grid, and the case is sent to other processes.
-        work = deepcopy(one)
+        work = deepcopy(selection)
         propagation = scene.propagation(work, search_px)
         offset = propagation.brightest()
         stamps = [stamps_at(scene, work, offset, *reference) for reference in REFERENCES]
         geometry = (scene.framing.stamp_px, scene.telescope.pixel, scene.telescope.obscuration)
         samples, truth = int(propagation.samples[0]), stamps[-1][0]
-        place = (one, offset, samples, *geometry, scene.budget, truth)
+        place = (selection, offset, samples, *geometry, scene.budget, truth)
         cases.append(Case(scene.name, aberration, *place))
         for (samples, points), stamp in zip(REFERENCES[:-1], stamps, strict=False):
             row = {"scene": scene.name, "aberration": aberration}

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from measure import alone, cost_of_command, write
+from measure import cost_of_command, isolated, write
 from prediction import make_cube
 from psfdae.cli import program
 from psfdae.fits import rule_of
@@ -28,7 +28,7 @@ BATCHES = (1, 16, 64, 256, 1024)
 LARGEST_BATCH_PER_STAMP = 16  # larger ones than this times `benchmark.stamps` are left out
 LEAST_S = 0.03  # a timing calls as often as it takes to last this long
 PREDICTED_STARS = 1_000_000  # for which time, memory and disk are extrapolated
-FEW = 16  # stars of a first run, whose imports cost time and memory
+FIRST_RUN_STARS = 16  # stars of a first run, whose imports cost time and memory
 COSTS = ("time_s", "peak_mb", "disk_mb")
 PLANNED_STARS = 1_000_000_000
 TRAINED_EPOCHS = 1  # the cost of more is that of their stars times epochs
@@ -44,11 +44,11 @@ def inference(config: Config, out: Annotated[File, "CSV with stars per second."]
     """
     settings, width = config.benchmark, max(config.dae.widths)
     sizes = list(product((width // 2, width, 2 * width), settings.stamp_sizes[:2]))
-    most = LARGEST_BATCH_PER_STAMP * settings.stamps
-    batches = [batch for batch in BATCHES if batch <= most]
+    largest_batch = LARGEST_BATCH_PER_STAMP * settings.stamps
+    batches = [batch for batch in BATCHES if batch <= largest_batch]
     dae, rows = config.dae.model_dump(), []
     for threads in sorted({1, settings.threads}):
-        rows += alone(threads, time_networks, dae, sizes, batches, threads, settings.repeats)
+        rows += isolated(threads, time_networks, dae, sizes, batches, threads, settings.repeats)
     write(out, rows)
 
 
@@ -113,24 +113,24 @@ def chain(config, count, side, folder):
     """Simulate stars, then predict their PSFs, one row each."""
     threads, tree = config.benchmark.threads, config.model_dump()
     tree["framing"]["stamp_px"], tree["optics"]["threads"] = side, threads
-    trees = [{**tree, "stars": {**tree["stars"], "count": n}} for n in (FEW, count)]
+    trees = [{**tree, "stars": {**tree["stars"], "count": n}} for n in (FIRST_RUN_STARS, count)]
     names = ("templates.h5", "stars.h5", "model.psf.safetensors", "stars.fits", "psf.fits")
     templates, stars, bundle, cube, psf = (folder / name for name in names)
-    alone(threads, cost_of_command, ["templates"], templates, tree)
+    isolated(threads, cost_of_command, ["templates"], templates, tree)
     simulate = ["stars", "--templates", templates]
-    costs = {"simulation": alone(threads, last_cost, [(simulate, stars, t) for t in trees])}
-    alone(1, untrained_bundle, tree, stars, bundle)
-    few = cube.with_name("few.fits")
-    for number, path in ((FEW, few), (count, cube)):
-        alone(1, make_cube, tree, stars, number, path)
+    costs = {"simulation": isolated(threads, last_cost, [(simulate, stars, t) for t in trees])}
+    isolated(1, untrained_bundle, tree, stars, bundle)
+    first_cube = cube.with_name("few.fits")
+    for number, path in ((FIRST_RUN_STARS, first_cube), (count, cube)):
+        isolated(1, make_cube, tree, stars, number, path)
     options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
-    predict = [(["predict", path, *options], psf) for path in (few, cube)]
-    costs["inference"] = alone(threads, last_cost, predict)
+    predict = [(["predict", path, *options], psf) for path in (first_cube, cube)]
+    costs["inference"] = isolated(threads, last_cost, predict)
     rows = []
-    for what, cost in costs.items():
+    for stage, cost in costs.items():
         # Where the peak cannot be started anew, that of the imports may be the larger one.
         peak_mb = max((cost["peak_b"] - cost["resting_b"]) / 2**20, 0.1)
-        row = {"what": what, "stars": count, "stamp_px": side, "time_s": cost["time_s"]}
+        row = {"what": stage, "stars": count, "stamp_px": side, "time_s": cost["time_s"]}
         rows.append(row | {"peak_mb": peak_mb, "disk_mb": cost["disk_b"] / 2**20})
     return rows
 
@@ -183,7 +183,7 @@ def with_exponents(part, against):
     table = part.assign(measured="yes")
     if against == "stars":
         row = part.iloc[-1].to_dict() | {"stars": PREDICTED_STARS, "measured": "extrapolated"}
-        row |= beyond(part.to_dict("records"), COSTS, PREDICTED_STARS)
+        row |= extrapolated(part.to_dict("records"), COSTS, PREDICTED_STARS)
         table = pd.concat([table, pd.DataFrame([row])])
     table.insert(1, "against", against)
     # Two points leave the error of the exponent open.
@@ -193,7 +193,7 @@ def with_exponents(part, against):
     return table.assign(**exponents)
 
 
-def beyond(rows, names, stars):
+def extrapolated(rows, names, stars):
     """Costs of more stars than measured: a fixed part and a part per star, neither negative.
 
     Least squares of relative deviations, so that small and large sizes count alike.
@@ -203,8 +203,8 @@ def beyond(rows, names, stars):
     costs = {}
     for name in names:
         relative = [(1.0 / row[name], row["stars"] / row[name]) for row in rows]
-        fixed, each = nnls(np.array(relative), np.ones(len(rows)))[0]
-        costs[name] = fixed + each * stars
+        fixed, per_star = nnls(np.array(relative), np.ones(len(rows)))[0]
+        costs[name] = fixed + per_star * stars
     return costs
 
 
@@ -228,32 +228,32 @@ def measured(config, folder):
     templates, simulated, stars, cube = (folder / name for name in names)
     places = {kind: folder / kind.name for kind in map(method, config.methods) if kind.storage}
     bundle = folder / "model.psf.safetensors"
-    alone(threads, cost_of_command, ["templates"], templates, tree)
+    isolated(threads, cost_of_command, ["templates"], templates, tree)
 
     def cost(stage, words, out, reads=tree):
-        found = alone(threads if stage == "simulate" else 1, cost_of_command, words, out, reads)
+        costs = isolated(threads if stage == "simulate" else 1, cost_of_command, words, out, reads)
         row = {"stage": stage, "stars": count, "epochs": TRAINED_EPOCHS * (stage == "train")}
-        row |= {name: found[name] for name in ("time_s", "cpu_s")}
-        row |= {f"{name}_mb": found[f"{name}_b"] / 1e6 for name in ("peak", "disk")}
+        row |= {name: costs[name] for name in ("time_s", "cpu_s")}
+        row |= {f"{name}_mb": costs[f"{name}_b"] / 1e6 for name in ("peak", "disk")}
         rows.append(row | {"measured": "yes"})
 
     for count in config.benchmark.star_counts[:SIMULATED]:
         tree["stars"]["count"] = count
         cost("simulate", ["stars", "--templates", templates], simulated)
-    given = ["--stars", stars]
+    stars_option = ["--stars", stars]
     for i, count in enumerate(config.benchmark.star_counts):
         tree["parts"] |= {"train_stars": 4 * count // 5, "test_stars": count - 4 * count // 5}
-        alone(1, repeat_stars, simulated, count, stars)
+        isolated(1, repeat_stars, simulated, count, stars)
         models = ["--dataset", "measured"]
         for kind, place in places.items():
-            own = ["--checkpoint", folder / "fit.pt"]
-            cost(rule_of(kind), ["fit", kind.name, *given, *own], place)
+            checkpoint_option = ["--checkpoint", folder / "fit.pt"]
+            cost(rule_of(kind), ["fit", kind.name, *stars_option, *checkpoint_option], place)
             models += [f"--{kind.name.replace('_', '-')}", place]
         per_star = ["--per-star", folder / "per_star.parquet"]
-        cost("evaluate", ["evaluate", *given, *models, *per_star], folder / "summary.csv")
+        cost("evaluate", ["evaluate", *stars_option, *models, *per_star], folder / "summary.csv")
         if i < SIMULATED:
-            alone(1, untrained_bundle, tree, stars, bundle)
-            alone(1, make_cube, tree, stars, count, cube)
+            isolated(1, untrained_bundle, tree, stars, bundle)
+            isolated(1, make_cube, tree, stars, count, cube)
             options = ["--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
             cost("predict", ["predict", cube, *options], folder / "psf.fits", None)
     return rows
@@ -280,12 +280,12 @@ def one_cpu():
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
+    cpus = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cpus)})
     try:
         yield
     finally:
-        os.sched_setaffinity(0, allowed)
+        os.sched_setaffinity(0, cpus)
 
 
 def planned(rows):
@@ -295,7 +295,7 @@ def planned(rows):
         stages.setdefault(row["stage"], []).append(row)
     return [
         {**part[0], "stars": PLANNED_STARS, "measured": "extrapolated"}
-        | beyond(part, ("cpu_s", *COSTS), PLANNED_STARS)
+        | extrapolated(part, ("cpu_s", *COSTS), PLANNED_STARS)
         for part in stages.values()
     ]
 

@@ -98,28 +98,28 @@ def knee_table(
             idle.append(idle_steps(name, history.dropna(subset=["validation_mse"])))
     table = pd.DataFrame(rows)
     # Other stars cost simulation time that is not in the column: shown, but not a candidate.
-    same = np.flatnonzero(table["stars"] == "same")
-    time, error = (table[name].to_numpy()[same] for name in ("cpu_s", "validation_mse"))
-    for name, found in (("pareto", pareto(time, error)), ("knee", [knee(time, error)])):
-        table[name] = np.where(np.isin(table.index, same[found]), "yes", "no")
+    same_stars = np.flatnonzero(table["stars"] == "same")
+    time, error = (table[name].to_numpy()[same_stars] for name in ("cpu_s", "validation_mse"))
+    for name, front in (("pareto", pareto(time, error)), ("knee", [knee(time, error)])):
+        table[name] = np.where(np.isin(table.index, same_stars[front]), "yes", "no")
     write(out, table)
     write(stopping, idle)
 
 
 def settings_of(folder, configured):
-    """What a training was, and whether it is the one that the configuration uses."""
+    """Return the settings of a training, and whether the configuration uses them."""
     from psfdae.method import CONFIG
 
     tree = decisive_settings(read_yaml(folder / CONFIG))
-    same = tree["parts"]["test_stars"] > 1
+    has_same_stars = tree["parts"]["test_stars"] > 1
     row = {"width": max(tree["dae"]["widths"])}
     row |= {key: tree["train"][key] for key in ("epochs", "batch", "lr", "schedule", "noise")}
-    used = same and all(tree[key] == configured[key] for key in configured)
-    return row | {"stars": "same" if same else "fresh", "used": yes(used)}
+    used = has_same_stars and all(tree[key] == configured[key] for key in configured)
+    return row | {"stars": "same" if has_same_stars else "fresh", "used": yes(used)}
 
 
 def idle_steps(name, validations):
-    """What stopping early would save in a training of constant rate, and cost in error."""
+    """Return the saving of an early stop in a training of constant rate, and its cost in error."""
     scores = validations["validation_mse"].to_numpy()
     stop = stopping_point(scores, PATIENCE)
     with_s, without_s = validations["cpu_seconds"].iloc[[-1, stop]]
@@ -137,12 +137,12 @@ def knee(time, error, worthwhile=WORTHWHILE):
     `worthwhile` or less per doubling of the time.
     """
     front = pareto(time, error)
-    chosen = front[0]
+    point = front[0]
     for candidate in front[1:]:
-        doublings = np.log2(time[candidate] / time[chosen])
-        if error[candidate] / error[chosen] <= worthwhile**doublings:
-            chosen = candidate
-    return int(chosen)
+        doublings = np.log2(time[candidate] / time[point])
+        if error[candidate] / error[point] <= worthwhile**doublings:
+            point = candidate
+    return int(point)
 
 
 def stopping_point(scores, patience):
@@ -150,8 +150,8 @@ def stopping_point(scores, patience):
 
     A training is deterministic, so a full history tells what `train.patience` would have done.
     """
-    best = np.minimum.accumulate(scores)
-    since = np.arange(scores.size) - np.searchsorted(-best, -best, side="left")
+    lowest = np.minimum.accumulate(scores)
+    since = np.arange(scores.size) - np.searchsorted(-lowest, -lowest, side="left")
     stale = np.flatnonzero(since >= patience)
     return int(stale[0]) if stale.size else scores.size - 1
 
@@ -211,14 +211,14 @@ def time_point(data, settings, tests, truths, repeats):
     """Fit a training set and restore the test images of each λ: median times and mean errors."""
     from psfdae_paper.methods.pca_som import PcaSom
 
-    model, fit_s, done = median_time(lambda: PcaSom.fit(data, settings), repeats)
+    model, fit_s, repeats_made = median_time(lambda: PcaSom.fit(data, settings), repeats)
     estimates, predict_s, _ = median_time(
         lambda: [model.predict(images, level) for level, images in tests.items()], repeats
     )
     row = {"fit_s": fit_s, "predict_stars_per_s": sum(map(len, estimates)) / predict_s}
-    row["repeats"] = done
+    row["repeats"] = repeats_made
     for name, truth in truths.items():
-        row[f"mse_{name}"] = np.mean([((found - truth) ** 2).mean() for found in estimates])
+        row[f"mse_{name}"] = np.mean([((estimate - truth) ** 2).mean() for estimate in estimates])
     return row
 
 
@@ -256,8 +256,8 @@ def time_methods(tree, stars):
     rows = []
     for kind in (kind for kind in map(method, config.methods) if kind.look.restores):
         with TemporaryDirectory() as folder:
-            given = config, kind, product, "random", "realisation"
-            data = star_sets.training_set(*given, checkpoint=Path(folder, "checkpoint"))
+            source = config, kind, product, "random", "realisation"
+            data = star_sets.training_set(*source, checkpoint=Path(folder, "checkpoint"))
             start = process_time()
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
@@ -266,10 +266,10 @@ def time_methods(tree, stars):
             # What is made once for a level, such as factorisations, is not of the stars.
             fitted.restore(noisy[:1], level, position[:1])
             start = process_time()
-            found = fitted.restore(noisy, level, position)
+            estimate = fitted.restore(noisy, level, position)
             rate = len(noisy) / (process_time() - start)
             row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
-            mean, stderr = clustered_mean(mse(found, clean), field)
+            mean, stderr = clustered_mean(mse(estimate, clean), field)
             rows.append(row | {"stars_per_s": rate, "mse": mean, "stderr": stderr})
     return rows
 
@@ -292,50 +292,50 @@ def seeds(
     test = star_sets.split_stars(product, "random", config).test
     position = star_sets.field_positions(product)[test]
     noisy = {x: star_sets.noisy_test_images(config, product, test, x) for x in config.noise.levels}
-    own = own_fits(config, kind, dataset, reference, product, results)
+    base = own_fits(config, kind, dataset, reference, product, results)
     rows = []
     for seed in range(config.seed, config.seed + SEEDS):
-        fits = own if seed == config.seed else other_fits(config, kind, own, product, seed)
+        fits = base if seed == config.seed else other_fits(config, kind, base, product, seed)
         for target, fitted in fits.items():
             row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
             for level, images in noisy.items():
-                found = fitted.restore(images, level, position)
-                error = mse(found, product[target][test]).mean()
+                estimate = fitted.restore(images, level, position)
+                error = mse(estimate, product[target][test]).mean()
                 rows.append({**row, "noise_level": level, "mse": error})
     write(out, rows)
 
 
 def own_fits(config, kind, dataset, references, product, results):
     """The fits of the workflow by reference; where they leave no file, the same again."""
-    found = {}
+    by_reference = {}
     for reference in references:
         if kind.storage:
             place = results / fits.place_of(kind, dataset, "random", reference)
             fits.require(kind, place, product, config, "random", reference)
-            found[reference] = kind.load(place, reference, config.evaluation)
+            by_reference[reference] = kind.load(place, reference, config.evaluation)
         else:
             data = star_sets.training_set(config, kind, product, "random", reference)
-            found[reference] = kind.fit(data, **kind.settings(config))
-    return found
+            by_reference[reference] = kind.fit(data, **kind.settings(config))
+    return by_reference
 
 
 def other_fits(config, kind, references, product, seed):
     """Fits that differ from the given ones by nothing but their seed."""
-    found = {}
+    by_reference = {}
     goes_on = issubclass(kind, GoesOn) and kind.continues(config)
     for reference in references:
-        if found and kind.storage and not kind.storage.per_reference:
-            found[reference] = next(iter(found.values()))  # one serves all
+        if by_reference and kind.storage and not kind.storage.per_reference:
+            by_reference[reference] = next(iter(by_reference.values()))  # one serves all
             continue
         with TemporaryDirectory() as folder:
             data = star_sets.training_set(
                 *(config, kind, product, "random", reference),
                 checkpoint=Path(folder, "checkpoint"),
-                start=found.get("realisation") if goes_on else None,
+                start=by_reference.get("realisation") if goes_on else None,
             )
             data = replace(data, seed=seed)
-            found[reference] = kind.fit(data, **kind.settings(config))
-    return found
+            by_reference[reference] = kind.fit(data, **kind.settings(config))
+    return by_reference
 
 
 @command("scatter")

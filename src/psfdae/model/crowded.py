@@ -20,7 +20,7 @@ from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.joint_fit import JointFit, chains, fit_stars
 from psfdae.model.photometry import FAINT_SNR
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_light
+from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_shares
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -115,7 +115,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
-        outer_parts = outer_light(model.on_pixels, place)
+        outer_parts = outer_shares(model.on_pixels, place)
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, place, flux, outer_parts, side, wings
         )
@@ -134,7 +134,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             if real.all() or turn == ROUNDS - 1:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
-    wings_used = wings if wings is not None and wings.seen else model.wings
+    wings_used = wings if wings is not None and wings.is_measured else model.wings
     result = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + wing_light, wings_used)
     stars = result.stars
     # The error of the PSF is no noise, and is as large a part of each flux.
@@ -274,7 +274,7 @@ def _described(
     stars["x_error"], stars["y_error"] = excess * fit.place_error.T
     total: np.ndarray | float = 1.0
     if wings is not None:
-        total, _ = wings.total(outer_light(model.on_pixels, fit.place))
+        total, _ = wings.total(outer_shares(model.on_pixels, fit.place))
     stars["flux"], stars["flux_error"] = total * fit.flux, total * excess * fit.flux_error
     stars["flux_model"] = fit.flux
     group = chains(fit.place, group_px)

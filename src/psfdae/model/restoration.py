@@ -41,7 +41,7 @@ from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
 from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.model.prediction import Prediction
-from psfdae.model.wings import Wings, outer_light
+from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
@@ -332,7 +332,7 @@ class Restorer:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
-        outer_part = outer_light(self.method.psf_at, place)
+        outer_part = outer_shares(self.method.psf_at, place)
         factor, factor_error = self.wings.total(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)

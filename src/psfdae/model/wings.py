@@ -30,15 +30,11 @@ if TYPE_CHECKING:
     from psfdae.model.field_psfs import FieldPsfs
     from psfdae.model.psf_model import PsfModel
 
-FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
-ROUND = 0.3  # the same of wings, which are round here, and are not there
-OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
-REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
-WINGED, BAND_PX = 1000, 128  # brightest stars, whose wings are drawn; rows at a time
-CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
-MOST_LIGHT, MOST_RADIUS_PX = 10.0, 1e5  # of wings over the flux in the stamp; no nonsense
-ROUNDS, SAME = 8, 0.1  # of wings and sky, at most; change of the light in σ with which they end
-PSFS_AT_ONCE = 2048
+PSF_ERROR = 0.03  # part of a star's light in a pixel by which its PSF may be off
+OUTER_RADIUS = 0.7  # inner radius of the outer part of a stamp, over half its side
+STEEPNESS = 3.0  # of the power of 1/r in the tents: light that mirrors and air scatter
+TENTS = 6
+CLIPPED_SIGMA = 4.0  # deviation of a pixel beyond which it is left out
 
 
 @dataclass(frozen=True)
@@ -54,14 +50,14 @@ class Wings:
         p_k, per pixel.
     covariance : ndarray, shape (K, K)
         Of p_k.
-    outer : float
-        Mean light of the model's PSFs in the outer part of their stamps.
+    outer_share : float
+        Mean of the stars' `outer_shares`, for which s = 1.
     """
 
     radius_px: np.ndarray
     profile: np.ndarray
     covariance: np.ndarray
-    outer: float
+    outer_share: float
 
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> Self:
@@ -75,18 +71,19 @@ class Wings:
         names = ("radius_px", "profile", "covariance")
         try:
             arrays = {name: np.array(plain[name], dtype=np.float64) for name in names}
-            wings = cls(**arrays, outer=float(plain["outer"]))
+            wings = cls(**arrays, outer_share=float(plain["outer_share"]))
         except (TypeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"wings without {error}") from None
         radius, count = wings.radius_px, wings.profile.size
         shapes = [a.shape for a in (wings.profile, radius, wings.covariance)]
         if count < 2 or shapes != [(count,), (count,), (count, count)]:
             raise ValueError("wings whose numbers do not fit together")
-        rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < MOST_RADIUS_PX
+        # No wings reach beyond 100 000 px, or have ten times the light of the star.
+        is_rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < 1e5
         with np.errstate(all="ignore"):
-            light, doubt = wings.light() if rising else (np.nan, np.nan)
-        scale = 0.0 < wings.outer < np.inf
-        if not (scale and abs(light) < MOST_LIGHT and np.isfinite(doubt)):
+            light, light_sigma = wings.light() if is_rising else (np.nan, np.nan)
+        is_scaled = 0.0 < wings.outer_share < np.inf
+        if not (is_scaled and abs(light) < 10.0 and np.isfinite(light_sigma)):
             raise ValueError("wings whose light is no part of that of a star")
         return wings
 
@@ -94,22 +91,24 @@ class Wings:
         """Lists and numbers, for a bundle."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
-    def scale(self, outer: np.ndarray) -> np.ndarray:
-        """s of stars by their `outer_light` (n,), 1 where that is NaN, of an unknown place."""
-        ratio = np.where(np.isfinite(outer), outer / self.outer, 1.0)
-        return np.asarray(np.clip(ratio, *OUTER_RANGE))
+    def scale(self, outer_share: np.ndarray) -> np.ndarray:
+        """Return s of stars with these `outer_shares` (n,), 1 where they are not known (NaN)."""
+        ratio = np.where(np.isfinite(outer_share), outer_share / self.outer_share, 1.0)
+        # A factor of three in either direction is no PSF of the same telescope.
+        return np.asarray(np.clip(ratio, 0.3, 3.0))
 
-    def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both.
+    def total(self, outer_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the whole flux of stars over that of their model, and its error, (n,) both.
 
         How the wings change with the PSF is known to half of the change.
         """
-        scale = self.scale(outer)
+        scale = self.scale(outer_share)
         light, error = self.light()
         return 1.0 + scale * light, np.hypot(scale * error, 0.5 * (scale - 1.0) * light)
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Part of the flux within a radius, where s = 1, and its standard error."""
+        # ∫ 2π r (h_0 p_0 + Σ h_k p_k) dr.
         half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
         # Part of a circle outside of the square of side 2 half, the stamp: 4/π arccos(half/r) ≤ 1.
@@ -140,19 +139,20 @@ class Wings:
 
     @classmethod
     def joined(cls, several: Sequence[Wings]) -> Wings:
-        """Those of several images with one model, each by the inverse of its light's variance."""
+        """Average the wings of several images with one model, by the variance of their light."""
         weight = np.array([wings.light()[1] ** -2.0 for wings in several])
         weight /= weight.sum()
-        outer = float(weight @ [wings.outer for wings in several])
-        share = weight * [outer / wings.outer for wings in several]
-        profile = np.tensordot(share, [wings.profile for wings in several], 1)
-        covariance = np.tensordot(share**2, [wings.covariance for wings in several], 1)
-        return cls(several[0].radius_px, profile, covariance, outer)
+        # Profiles of one outer share, that of the average.
+        outer_share = float(weight @ [wings.outer_share for wings in several])
+        weight *= [outer_share / wings.outer_share for wings in several]
+        profile = np.tensordot(weight, [wings.profile for wings in several], 1)
+        covariance = np.tensordot(weight**2, [wings.covariance for wings in several], 1)
+        return cls(several[0].radius_px, profile, covariance, outer_share)
 
     @property
-    def seen(self) -> bool:
-        """The pixels of the image say something of the light: its error is less than expected."""
-        sigma = expected_profile(self.radius_px, self.outer)[1]
+    def is_measured(self) -> bool:
+        """True if the pixels of the image say something of the light, more than is expected."""
+        sigma = expected_profile(self.radius_px, self.outer_share)[1]
         return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
 
@@ -178,30 +178,36 @@ def aperture_correction(
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
-    scale = float(wings.scale(outer_light(model.on_pixels, np.array([[x, y]])))[0])
+    scale = float(wings.scale(outer_shares(model.on_pixels, np.array([[x, y]])))[0])
     all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
     return (1.0 + all_wings) / (inside + inner_wings)
 
 
-def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
-    """Light of PSFs at places (n, 2), x and y, in the outer part of their stamps, shape (n,).
+def outer_shares(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
+    """Return the part of a star's flux in the outer part of its stamp, at places (n, 2), (n,).
 
-    `draw` makes PSFs (m, d, d) at m places, which are finite. NaN where a place is not known.
+    Pixels between 0.7 times half the side of the stamp and half the side count. `draw` makes PSFs
+    (m, d, d) at m places, which are finite. NaN where a place, x and y, is not known.
     """
-    outer_parts = np.full(len(place), np.nan)
+    shares = np.full(len(place), np.nan)
     located = np.flatnonzero(np.isfinite(place).all(axis=1))
-    for part in (located[a : a + PSFS_AT_ONCE] for a in range(0, len(located), PSFS_AT_ONCE)):
+    # Some at a time, so that their PSFs take little memory.
+    for first in range(0, len(located), 2048):
+        part = located[first : first + 2048]
         psf = draw(np.rint(place[part]))
         side = psf.shape[-1]
         axis = np.arange(side) - side // 2
-        ring = np.hypot(axis[:, None], axis)
-        outer_parts[part] = psf[:, (ring >= OUTER * side / 2) & (ring < side / 2)].sum(axis=1)
-    return outer_parts
+        radius = np.hypot(axis[:, None], axis)
+        ring = (radius >= OUTER_RADIUS * side / 2) & (radius < side / 2)
+        shares[part] = psf[:, ring].sum(axis=1)
+    return shares
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
-    """h_1 … at distances r, shape (K − 1, …), as they are outside of the stamp."""
-    # ln of r over the first top; tops are equidistant in it.
+    """Return h_1 … at distances r in pixels, shape (K − 1, …), as they are outside of the stamp.
+
+    h_k = max(1 − |ln(r/r_1)/ln(r_2/r_1) − (k − 1)|, 0) (r/r_1)^-3: tops are equidistant in ln r.
+    """
     radius = radius_px.astype(r.dtype)
     log_radius = np.log(np.maximum(r / radius[0], 1.0))
     top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
@@ -210,48 +216,57 @@ def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
 
 
 def star_tents(
-    rows: slice, width: int, place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
+    rows: slice,
+    width: int,
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer_share: np.ndarray,
+    wings: Wings,
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
+    """Yield windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
-    shining = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
-    brightest = shining[np.argsort(-light[shining])[:WINGED]]
-    # The pixels within reach, as far as they are in these rows.
+    light = np.where(np.isfinite(outer_share), flux * wings.scale(outer_share), np.nan)
+    has_light = np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1)
+    # The wings of more than the thousand brightest stars are below the noise.
+    lit_stars = np.flatnonzero(has_light)
+    brightest = lit_stars[np.argsort(-light[lit_stars])[:1000]]
+    # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
     middle = np.rint(place[brightest]).astype(int)
-    low = np.maximum(middle - reach, [0, rows.start])
-    high = np.minimum(middle + reach + 1, [width, rows.stop])
-    for inside in np.flatnonzero((low < high).all(axis=1)):
-        star, (first_column, first_row), (last_column, last_row) = (
-            brightest[inside],
-            low[inside],
-            high[inside],
-        )
+    first = np.maximum(middle - reach, [0, rows.start])
+    end = np.minimum(middle + reach + 1, [width, rows.stop])
+    for index in np.flatnonzero((first < end).all(axis=1)):
+        star = brightest[index]
+        # Distances of the pixels from the star along either axis, and from its centre.
         across, down = (
-            (np.arange(*ends) - at).astype(np.float32)
-            for ends, at in zip(
-                ((first_column, last_column), (first_row, last_row)), place[star], strict=True
-            )
+            (np.arange(first[index, axis], end[index, axis]) - place[star, axis]).astype(np.float32)
+            for axis in (0, 1)
         )
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
-        stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
-        shape = np.concatenate([stamp[None], np.where(stamp, 0.0, tents(distance, radius))])
+        # h_0 is 1 in the stamp, and the tents are 0 there.
+        in_stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
+        tents_outside = np.where(in_stamp, 0.0, tents(distance, radius))
+        (first_column, first_row), (end_column, end_row) = first[index], end[index]
         window = (
-            slice(first_row - rows.start, last_row - rows.start),
-            slice(first_column, last_column),
+            slice(first_row - rows.start, end_row - rows.start),
+            slice(first_column, end_column),
         )
-        yield window, float(light[star]) * shape
+        yield window, float(light[star]) * np.concatenate([in_stamp[None], tents_outside])
 
 
 def tented_light(
-    shape: tuple[int, ...], place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
+    shape: tuple[int, ...],
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer_share: np.ndarray,
+    wings: Wings,
 ) -> Iterator[tuple[slice, np.ndarray]]:
-    """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
+    """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
     height, width = shape
-    for top in range(0, height, BAND_PX):
-        rows = slice(top, min(top + BAND_PX, height))
+    # The tents of a whole image would take K times its memory.
+    for top in range(0, height, 128):
+        rows = slice(top, min(top + 128, height))
         tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
-        for window, light in star_tents(rows, width, place, flux, outer, wings):
+        for window, light in star_tents(rows, width, place, flux, outer_share, wings):
             tented[:, *window] += light
         yield rows, tented
 
@@ -260,28 +275,29 @@ def wing_light(
     shape: tuple[int, ...],
     place: np.ndarray,
     flux: np.ndarray,
-    outer: np.ndarray,
+    outer_share: np.ndarray,
     wings: Wings | None,
 ) -> np.ndarray:
-    """Light of the wings of stars in an image (h, w)."""
-    image = np.zeros(shape, np.float32)
+    """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
+    image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
-        for window, light in star_tents(slice(0, shape[0]), shape[1], place, flux, outer, wings):
+        for window, light in star_tents(rows, shape[1], place, flux, outer_share, wings):
             image[window] += np.tensordot(wings.profile, light, 1)
     return image
 
 
-def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, np.ndarray]:
+def expected_profile(radius_px: np.ndarray, outer_share: float) -> tuple[np.ndarray, np.ndarray]:
     """Return what is expected of p before any pixel outside of stamps is seen, and its σ, (K,).
 
     Outside of a stamp of the half side h, the light falls on as a (r/h)^-5, the mean slope of
-    Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the light `outer` between
-    0.7 h and h. It may be more by half of what falls as r^-3, as light that mirrors and air scatter
-    does (King 1971, PASP 83, 199), or less, and has an error of 0.1 % of the star at least.
+    Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the `outer_share` of the
+    light, between 0.7 h and h. It may be more by half of what falls as r^-3, as light that mirrors
+    and air scatter does (King 1971, PASP 83, 199), or less, and has an error of 0.1 % of the star
+    at least.
     """
     half = radius_px[0]
     # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
-    edge = max(outer, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER**-3.0 - 1.0))
+    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER_RADIUS**-3.0 - 1.0))
     # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
     expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (STEEPNESS - 5.0))
     sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
@@ -292,41 +308,64 @@ def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, n
 
 def wings_of(
     residual: np.ndarray,
-    error: np.ndarray,
+    sigma: np.ndarray,
     bad: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
-    outer: np.ndarray,
+    outer_share: np.ndarray,
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> Wings | None:
-    """Wings of stars in what is left of an image (h, w) without sky and models; None without stars.
+    """Fit the wings of stars to what is left of an image without sky and models of its stars.
 
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
     are far from the wings of an `earlier` turn.
+
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (h, w)
+        What is left of the image, and σ of its pixels, in its unit.
+    bad : ndarray of bool, shape (h, w)
+    place : ndarray, shape (n, 2)
+        x and y of the stars.
+    flux, outer_share : ndarray, shape (n,)
+        Of the stars; those that are NaN or not above 0 take no part.
+    stamp_px : int
+        Side of the models' stamps.
+    earlier : Wings, optional
+
+    Returns
+    -------
+    Wings or None
+        None without a star that has light, or without a good pixel.
     """
     from scipy.ndimage import uniform_filter
 
-    radius = np.geomspace(stamp_px / 2, REACH * stamp_px, TENTS + 1)
-    lit = np.isfinite(flux) & (flux > 0)
-    lit &= np.isfinite(outer)
-    if not lit.any() or not (mean := float(np.average(outer[lit], weights=flux[lit]))) > 0:
+    # Wings reach 2.5 stamps far.
+    radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, TENTS + 1)
+    has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
+    if not has_light.any():
+        return None
+    mean_share = float(np.average(outer_share[has_light], weights=flux[has_light]))
+    if not mean_share > 0:
         return None
     count = len(radius)
-    blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
-    normal, projection, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
-    blocks = []
+    unfitted = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
-    unit_sigma = float(error.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
-    even_error = uniform_filter(np.square(error / unit_sigma), stamp_px, mode="nearest")
-    even_error = unit_sigma * np.sqrt(even_error)
-    for band, tented in tented_light(residual.shape, place, flux, outer, blank):
-        used = ~bad[band]
+    unit_sigma = float(sigma.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
+    even_variance = uniform_filter(np.square(sigma / unit_sigma), stamp_px, mode="nearest")
+    even_sigma = unit_sigma * np.sqrt(even_variance)
+    # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
+    # of A is (F s h_k, 1)/σ of a pixel and d its residual over σ; the same in blocks of a stamp.
+    normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
+    square, pixels, blocks = 0.0, 0, []
+    for band, tented in tented_light(residual.shape, place, flux, outer_share, unfitted):
+        is_used = ~bad[band]
         if earlier is not None:
-            off = residual[band] - np.tensordot(earlier.profile, tented, 1)
-            used &= np.abs(off) < CLIPPED_SIGMA * error[band]
-        weight = np.where(used, 1.0 / even_error[band].astype(np.float64), 0.0)
+            deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
+            is_used &= np.abs(deviation) < CLIPPED_SIGMA * sigma[band]
+        weight = np.where(is_used, 1.0 / even_sigma[band].astype(np.float64), 0.0)
         design = np.concatenate([tented, np.full((1, *weight.shape), unit_sigma)]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
         normal, projection = normal + flat @ flat.T, projection + flat @ data
@@ -340,21 +379,22 @@ def wings_of(
     # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² at least 1 and that of the pixels, or
     # of sums over blocks of a stamp: a sky that is not even, and stars and galaxies that nobody
     # sees, are residuals that neighbouring pixels share, and wings are as wide as these.
-    expected, sigma = expected_profile(radius, mean)
-    unit = np.append(sigma, normal[-1, -1] ** -0.5)
+    expected, prior_sigma = expected_profile(radius, mean_share)
+    unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
     normal, projection = normal * unit * unit[:, None], projection * unit
-    prior, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
+    prior = np.diag(np.append(np.ones(count), 0.0))
+    prior_projection = np.append(expected / prior_sigma, 0.0)
     chi2 = 1.0
     for _ in range(3):
         inverse = np.linalg.inv(normal / chi2 + prior)
-        parameters = inverse @ (projection / chi2 + start)
-        of_pixels = (
-            square - 2.0 * parameters @ projection + parameters @ normal @ parameters
-        ) / max(pixels, 1)
-        shared = block_light - (parameters * unit) @ np.array(block_design)
-        chi2 = max(of_pixels, float(shared @ shared) / max(block_pixels.sum(), 1.0), 1.0)
+        parameters = inverse @ (projection / chi2 + prior_projection)
+        residual_square = square - 2.0 * parameters @ projection + parameters @ normal @ parameters
+        chi2_of_pixels = residual_square / max(pixels, 1)
+        block_residual = block_light - (parameters * unit) @ np.array(block_design)
+        chi2_of_blocks = float(block_residual @ block_residual) / max(block_pixels.sum(), 1.0)
+        chi2 = max(chi2_of_pixels, chi2_of_blocks, 1.0)
     parameters, inverse = parameters * unit, inverse * unit * unit[:, None]
-    return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean)
+    return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
 
 
 def block_sums(values: np.ndarray, side: int) -> np.ndarray:
@@ -383,7 +423,7 @@ def around_stars(
     star_light: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
-    outer: np.ndarray,
+    outer_share: np.ndarray,
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> StarSurroundings:
@@ -397,22 +437,22 @@ def around_stars(
         Sky included, σ of its pixels, and light of the stars.
     sky : Sky
         As it is known so far; its `bad` pixels do not count.
-    place, flux, outer : ndarray, shape (n, 2) and (n,)
-        Of the stars, and their `outer_light`.
+    place, flux, outer_share : ndarray, shape (n, 2) and (n,)
+        Of the stars, see `outer_shares`.
     stamp_px : int
     earlier : Wings, optional
     """
-    sigma = np.hypot(error, FOLLOWED * star_light)
-    without_stars, stars = image - star_light, (place, flux, outer)
+    sigma = np.hypot(error, PSF_ERROR * star_light)
+    without_stars, stars = image - star_light, (place, flux, outer_share)
     wings = _wings_beside(without_stars, sky, sigma, *stars, stamp_px, earlier)
     light_of_wings = wing_light(image.shape, *stars, wings)
-    mapped = np.isfinite(sky.noise_scale)
-    sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if mapped else None)
+    has_noise_map = np.isfinite(sky.noise_scale)
+    sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if has_noise_map else None)
     # The map has the most frequent value of the pixels, which is below the mean where noise is that
     # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
     clipped = sky.bad | (np.abs(deviation) > CLIPPED_SIGMA)
-    # Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
+    # Mean deviation Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
     unit_sigma = float(sigma.mean(dtype=np.float64))
     weight = np.where(clipped, 0.0, unit_sigma / sigma)
     deviation *= weight
@@ -420,59 +460,56 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = unit_sigma * float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
-    return StarSurroundings(sky, light_of_wings, wings, np.hypot(sigma, ROUND * light_of_wings))
+    # Wings are round here; those of a telescope may differ from that by 30 % in a pixel.
+    return StarSurroundings(sky, light_of_wings, wings, np.hypot(sigma, 0.3 * light_of_wings))
 
 
 def _wings_beside(
     without_stars: np.ndarray,
     sky: Sky,
-    doubt: np.ndarray,
+    sigma: np.ndarray,
     place: np.ndarray,
     flux: np.ndarray,
-    outer: np.ndarray,
+    outer_share: np.ndarray,
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> Wings | None:
-    """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
-    wings, level, bad = earlier, sky.level, sky.bad
-    shown = np.where(_like_stars(without_stars - level, doubt, bad, place), flux, np.nan)
-    for turn in range(ROUNDS):
+    """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
+    wings = earlier
+    # Galaxies, blends and saturated stars say nothing of the wings of stars: in 5 × 5 px about a
+    # star, most pixels are good, and their residuals are within twice σ, which has what the PSF may
+    # be off by.
+    from scipy.ndimage import uniform_filter
+
+    residual, bad = without_stars - sky.level, sky.bad
+    squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
+    mean_square = uniform_filter(squares, 5, mode="constant")
+    good_part = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
+    height, width = bad.shape
+    column, row = np.rint(np.nan_to_num(place, nan=-9.0)).astype(int).T
+    is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
+    is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
+    star_flux = np.where(is_star, flux, np.nan)
+    for turn in range(8):
         latest = wings
         if turn:
-            without_light = without_stars - wing_light(bad.shape, place, flux, outer, latest)
+            without_light = without_stars - wing_light(bad.shape, place, flux, outer_share, latest)
             without_light[bad] = 0.0
-            level = sky_level(without_light, bad, sky.steps).level
-        wings = wings_of(without_stars - level, doubt, bad, place, shown, outer, stamp_px, latest)
+            residual = without_stars - sky_level(without_light, bad, sky.steps).level
+        stars = place, star_flux, outer_share
+        wings = wings_of(residual, sigma, bad, *stars, stamp_px, latest)
         if wings is None:
             break
-        light, sigma = wings.light()
-        if latest is not None and abs(light - latest.light()[0]) < SAME * sigma:
+        # Until their light changes by less than a tenth of its error.
+        light, light_sigma = wings.light()
+        if latest is not None and abs(light - latest.light()[0]) < 0.1 * light_sigma:
             break
     return wings
 
 
-def _like_stars(
-    residual: np.ndarray, sigma: np.ndarray, bad: np.ndarray, place: np.ndarray
-) -> np.ndarray:
-    """Return True for the sources (n,) whose light about them may say what wings of stars are.
-
-    The residuals (h, w) in 5 × 5 px about them are within twice their σ, which has what the PSF may
-    be off by, and most of these pixels are good. Galaxies, blends and saturated stars are not.
-    """
-    from scipy.ndimage import uniform_filter
-
-    deviation = np.where(bad, 0.0, residual / sigma).astype(np.float32)
-    squares = uniform_filter(np.square(deviation), 5, mode="constant")
-    part_good = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
-    height, width = bad.shape
-    column, row = np.rint(np.nan_to_num(place, nan=-9.0)).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    at = np.where(inside, row, 0), np.where(inside, column, 0)
-    return np.asarray(inside & (part_good[at] > 0.5) & (squares[at] < 4.0 * part_good[at]))
-
-
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
-    """Wings of the stars of an image, restored one by one; None if there is no light at all.
+    """Return the wings of stars that are restored one by one; None if there is no light at all.
 
     In a crowded image, where stars restored alone lack light, they come out too large.
 
@@ -482,7 +519,7 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         If there is no sky to measure.
     """
     sky, side = observation.sky(), model.stamp_px
-    middles, fluxes, outers = [], [], []
+    middles, fluxes, shares = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
     star_light = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
     for stamps, prediction in model.stream(observation, threads=1):
@@ -494,15 +531,15 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
             stamp = np.s_[y : y + side, x : x + side]
             if min(x, y) >= 0 and star_light[stamp].shape == psf.shape:
                 star_light[stamp] += psf
-        outers.append(outer_light(model.on_pixels, place))
+        shares.append(outer_shares(model.on_pixels, place))
         # Wings begin where the stamps end: they are those about the middles of the stamps.
         middles.append(np.where(is_restored[:, None], corner - side + 0.5 * (side - 1), np.nan))
         fluxes.append(np.where(is_restored, prediction.flux, np.nan))
     core = np.s_[side:-side, side:-side]
     light, gain = star_light[core], observation.gain
-    middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
+    middle, flux, outer_share = (np.concatenate(parts) for parts in (middles, fluxes, shares))
     # σ² = sky noise² + photons of the stars + (3 % of their light)².
     photon_sigma = np.sqrt(np.maximum(light, 0.0) / gain) if gain else 0.0
-    sigma = np.hypot(np.hypot(sky.noise, photon_sigma), FOLLOWED * light)
+    sigma = np.hypot(np.hypot(sky.noise, photon_sigma), PSF_ERROR * light)
     without_stars = sky.flat + sky.level - light
-    return _wings_beside(without_stars, sky, sigma, middle, flux, outer, side)
+    return _wings_beside(without_stars, sky, sigma, middle, flux, outer_share, side)
