@@ -20,6 +20,7 @@ import ast
 import json
 import re
 import sys
+from dataclasses import fields
 from functools import cache
 from math import fsum
 from pathlib import Path
@@ -29,6 +30,9 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from psfdae.cli import as_click, stage
+from psfdae.image.camera import HEADER_KEYS
+from psfdae.image.image_input import ImageStatements
 from psfdae.methods import known, method
 from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import CHOICE
@@ -193,6 +197,24 @@ def command_line():
     path = ROOT / "workflow/schemas/command_line.schema.yaml"
     schema = yaml.safe_load(path.read_text(encoding="utf-8"))
     return pd.DataFrame([{"key": key, **about} for key, about in schema["properties"].items()])
+
+
+def image_statements():
+    """What may be stated about an image: option of `predict`, keyword in Python, and meaning."""
+    options = {option.name: option for option in as_click(stage("predict")).params}
+    return pd.DataFrame(
+        {
+            "name": field.name,
+            "option": options[field.name].opts[0],
+            "meaning": options[field.name].help,
+        }
+        for field in fields(ImageStatements)
+    )
+
+
+def header_keys(name):
+    """Keys of headers with a value of the camera, in the order in which they are looked for."""
+    return {"keys": ", ".join(f"`{key}`" for key in HEADER_KEYS[name.replace("_", " ")])}
 
 
 def datasets():

@@ -15,7 +15,7 @@ from psfdae import PsfModel, StarFlag
 from psfdae.bright_stars import BrightStars, magnitude
 from psfdae.field_law import FieldSettings
 from psfdae.field_psf import FieldModel
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
 from psfdae.noise import NoiseModel
@@ -207,6 +207,6 @@ def test_colours_are_those_of_the_list_and_of_another_column_are_named(
     stars = psfdae.Stars.from_image(training.image, listed, **words, **SIZES)
     bright = stars.candidates.bright
     assert bright.colour == pytest.approx(np.asarray(listed[column])[bright.row])
-    observation = Source(training.image, listed, **words).open(16)
+    observation = ImageInput(training.image, catalogue=listed, **words).open(16)
     other = colourful.other_instrument(observation.instrument, observation.colour_column)
     assert (column in other) == unlike == bool(other)

@@ -28,7 +28,7 @@ from image_training import WORDS, few_draws
 from psfdae import Error, Stars, fit
 from psfdae.commands import from_stars
 from psfdae.image.fits_file import science_images
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from small_field import CAMERA, GAIN, READ, SIZE, SKY, TANGENT, field, header, table, write
 
 
@@ -212,7 +212,7 @@ def test_uncertainty_unit_meta_and_wcs_of_nddata_are_used(image, place, kind):
     # One σ for all, as the map has it, not those of stamps, which differ.
     assert np.ptp(chunk.noise) < 1e-6 * chunk.noise[0]
     assert chunk.noise[0] == pytest.approx(sigma[0, 0], rel=0.02)
-    assert "uses ERR as σ" in observation.said()
+    assert "uses ERR as σ" in observation.summary()
 
 
 def test_what_is_no_image_is_refused(place):
@@ -233,7 +233,7 @@ def test_quantities_are_converted_and_other_units_refused(tmp_path, image, place
     values = [camera[name][0] for name in ("gain", "read noise", "saturation", "pixel scale")]
     np.testing.assert_allclose(values, [1.6, 4.0, 5e4, 0.6])
     for name, wrong in (("gain", u.m), ("read_noise", u.adu), ("saturate", u.s)):
-        with pytest.raises(Error, match=name):
+        with pytest.raises(Error, match=f"2.0 {wrong}, expected a number of"):
             Stars.from_image(path, catalogue=place, **{name: 2.0 * wrong})
 
 
@@ -324,7 +324,7 @@ def test_versions_of_several_science_images_belong_together(tmp_path, image, bad
         hdus.append(fits.ImageHDU(mask.astype(np.uint8), name="DQ", ver=version))
     fits.HDUList(hdus).writeto(tmp_path / "two.fits")
     for version, mask in ((1, bad), (2, ~bad)):
-        source = Source(tmp_path / "two.fits", detect=5.0, extension=f"SCI,{version}")
+        source = ImageInput(tmp_path / "two.fits", detect=5.0, extension=f"SCI,{version}")
         assert (source.open(16).sky().bad == mask).all()
 
 
@@ -345,7 +345,7 @@ def test_a_gain_that_the_pixels_contradict_is_left_out(
     path = write(tmp_path / "a.fits", (image * factor + offset).astype(np.float32), **cards)
     stars = Stars.from_image(path, catalogue=place)
     assert stars.observation.gain is None and stars.observation.least_noise == 0.0
-    assert key in stars.observation.said()
+    assert key in stars.observation.summary()
     without = Stars.from_image((image * factor + offset).astype(np.float32), catalogue=place)
     np.testing.assert_allclose(stars.candidates.snr, without.candidates.snr, rtol=1e-6)
     stated = Stars.from_image(path, catalogue=place, gain=GAIN / factor)
@@ -357,14 +357,14 @@ def test_a_gain_that_fits_stays_and_a_given_one_is_used_with_a_word(tmp_path, im
     observation = Stars.from_image(path, catalogue=place).observation
     assert observation.gain == GAIN and observation.remarks == ()
     stated = Stars.from_image(path, catalogue=place, gain=0.1).observation
-    assert stated.gain == 0.1 and "given = 0.1" in stated.said() and "used" in stated.said()
+    assert stated.gain == 0.1 and "given = 0.1" in stated.summary() and "used" in stated.summary()
 
 
 def test_a_saturation_below_the_sky_is_said_or_refused(tmp_path, image, place):
     path = write(tmp_path / "a.fits", image, SATURATE=10.0)
     stars = Stars.from_image(path, catalogue=place)
     assert stars.observation.saturate is None
-    assert "10 counts (SATURATE) is below the sky of 300" in stars.observation.said()
+    assert "10 counts (SATURATE) is below the sky of 300" in stars.observation.summary()
     with pytest.raises(Error, match="--saturate"):
         Stars.from_image(path, catalogue=place, saturate=10.0)
 

@@ -19,7 +19,8 @@ from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
 from psfdae.files import read_product
-from psfdae.image.observation import Source, cut_image
+from psfdae.image.image_input import ImageInput
+from psfdae.image.stamps import cut_image
 from psfdae.model import crowded
 from psfdae.model.bundle import BundleError
 from psfdae.model.neighbours import light_of_others
@@ -83,7 +84,7 @@ def sky(tmp_path_factory):
 def found(sky):
     """The photometry of all stars, which are looked for."""
     folder, path, _ = sky
-    observation = Source(folder / "i.fits", detect=5.0).open(STAMP)
+    observation = ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
     return crowded.photometry(load_model(path), observation, 5.0)
 
 
@@ -157,7 +158,7 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
     assert model.info.config["stars"] == stars.config
     light, error = model.wings.light()
     assert light == pytest.approx(found.wings.light()[0], abs=4 * error + 0.004)
-    observation = Source(folder / "i.fits", folder / "i.csv").open(STAMP, 2)
+    observation = ImageInput(folder / "i.fits", catalogue=folder / "i.csv").open(STAMP, 2)
     ((_, measured),) = model.stream(observation)
     alone = ~true["pair"] & (true["flux"] > 1e4)
     ratio = measured.flux_total[alone] / true["flux"][alone]
@@ -238,7 +239,7 @@ def test_the_light_of_wings_is_the_sum_over_pixels():
 def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     """Variance grows with the light of a star by 1/gain; not in an image without photon noise."""
     folder, path, true = sky
-    model, observation = load_model(path), Source(folder / "i.fits", detect=5.0).open(STAMP)
+    model, observation = load_model(path), ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
     unknown = replace(observation, camera=observation.camera | {"gain": (None, "not known")})
     assert with_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
     assert with_measured_gain(model, observation) is observation

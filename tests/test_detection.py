@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 
 from command_line import psfdae, refused
 from image_training import few_draws
+from psfdae.image.camera import camera_values
 from psfdae.image.detection import Sky
-from psfdae.image.fits_file import READ_NOISE_KEYS, SATURATION_KEYS, find_image
-from psfdae.image.observation import SEEN, Source
+from psfdae.image.fits_file import find_image
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
@@ -50,7 +51,7 @@ def pixels(field):
 
 
 def opened(path, **stated):
-    return Source(path, **stated).open(16, 8)
+    return ImageInput(path, **stated).open(16, 8)
 
 
 # Finding
@@ -67,10 +68,10 @@ def test_stars_are_found_where_they_are(field):
     # Nothing but stars and their companions: noise alone has none.
     spurious, _ = cKDTree(made.centroid).query(stars.positions)
     assert (spurious > 8).sum() <= 1
-    assert stars.found.numbers("BACKGROUND") == pytest.approx(300 / 1.6, rel=0.08)
+    assert stars.detections.numbers("BACKGROUND") == pytest.approx(300 / 1.6, rel=0.08)
     # What a list is judged by.
     column, row = np.rint(made.centroid.T).astype(int)
-    assert stars.sky().covered(column, row, SEEN).mean() > 0.9
+    assert stars.sky().covered(column, row, 2.0).mean() > 0.9
 
 
 def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
@@ -142,10 +143,7 @@ def test_commands_need_no_list_and_no_card(field, tmp_path):
 )
 def test_what_headers_say_and_who_says_it(tmp_path, cards, name, expected):
     image = find_image(write(tmp_path / "image.fits", np.ones((20, 20)), **cards))
-    camera = {"gain": image.gain(), "pixel scale": image.scale()}
-    camera |= {"read noise": image.positive(READ_NOISE_KEYS)}
-    camera |= {"saturation": image.positive(SATURATION_KEYS)}
-    value, origin = camera[name]
+    value, origin = camera_values(image, {})[name]
     assert origin == expected[1]
     assert value == (expected[0] and pytest.approx(expected[0], rel=1e-3))
 
@@ -194,7 +192,7 @@ def test_pixels_without_weight_are_bad_and_counted_in_silence(field, tmp_path, c
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         observation = opened(path, detect=5.0, weight=str(beside))
-    assert f"{beside}: weight 0, bad pixels: 100" in observation.said()
+    assert f"{beside}: weight 0, bad pixels: 100" in observation.summary()
     assert observation.sky().bad.sum() == 100
     assert capfd.readouterr() == ("", "")
 
@@ -214,7 +212,7 @@ def test_bits_of_a_mask(field, tmp_path):
         assert observation.sky().bad[[10, 20, 30], [10, 20, 30]].tolist() == expected
     words = ["predict", path, "--detect", "--mask", "DQ", "--out", tmp_path / "x.fits"]
     done = psfdae(*words, "--bad-bits", 2**63)
-    assert done.exit_code == 2 and "is not in the range" in done.output
+    assert done.exit_code == 2 and "bad bits 9223372036854775808, expected" in done.output
 
 
 # What cannot be used: one line and code 2

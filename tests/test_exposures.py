@@ -13,7 +13,7 @@ from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import PredictionError, Stars, load_model
 from psfdae.field_psf import _deformations, fit_field
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.model.exposures import exposure, for_exposures
 from psfdae.model.settings import from_words
 from psfdae.model.validation import validate
@@ -55,7 +55,7 @@ def simulated(folder, name, seed, count, width, **cards):
     pixels = rng.poisson(pixels) + rng.normal(0, 3, pixels.shape)
     cards = {"GAIN": 1.0} | cards
     write_field(folder / f"{name}.fits", folder / f"{name}.csv", pixels, *place.T, **cards)
-    return Source(folder / f"{name}.fits", folder / f"{name}.csv")
+    return ImageInput(folder / f"{name}.fits", catalogue=folder / f"{name}.csv")
 
 
 def trained(*words):
@@ -223,7 +223,7 @@ def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night, shipped):
 def test_the_sky_of_a_training_is_that_of_the_typical_star(night):
     """The sky counts in photons: an exposure with another gain counts by its stars."""
     folder, _ = night
-    sources = [Source(folder / f"{name}.fits", detect=5.0) for name in ("rich", "poor")]
+    sources = [ImageInput(folder / f"{name}.fits", detect=5.0) for name in ("rich", "poor")]
     sources[1] = replace(sources[1], gain=3.0)
     stars = Stars.of(sources, from_words(["framing.stamp_px=10"]))
     sky = [part.settings.noise.background_photons for part in stars.exposures]

@@ -5,7 +5,7 @@ import pytest
 
 import psfdae
 from psfdae.errors import Error
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag
 from psfdae.model.calibration import StarErrors
@@ -18,7 +18,7 @@ CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
 
 def opened(model, image, place):
     """The stars of an image, for a model."""
-    return Source(image, place, **CAMERA).open(model.stamp_px, model.margin_px)
+    return ImageInput(image, catalogue=place, **CAMERA).open(model.stamp_px, model.margin_px)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_stated_size_is_taken_as_it_is():
 @pytest.mark.parametrize("kind", ["wide", "rings"])
 def test_large_stars_are_found_as_one_source_each(kind, request):
     image, place = request.getfixturevalue(kind)
-    found = Source(image, detect=5.0).open(16).positions
+    found = ImageInput(image, detect=5.0).open(16).positions
     assert len(found) == len(place)
     off = np.hypot(*(found[:, None] - place).T).min(axis=1)
     assert off.max() < 1.5

@@ -102,11 +102,11 @@ def test_the_manifest_of_a_run_shows_which_files_have_changed(tmp_path):
     for _ in range(2):  # the second time there is a manifest, which is no product
         assert psfdae("manifest", tmp_path).exit_code == 0
     line = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == ["data/a.h5: OK", "tables/b.csv: OK"]
+    check = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert check.stdout.splitlines() == ["data/a.h5: OK", "tables/b.csv: OK"]
     (tmp_path / "data/a.h5").write_text("content of data/a.h4\n")
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and "data/a.h5: FAILED" in done.stdout
+    check = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert check.returncode == 1 and "data/a.h5: FAILED" in check.stdout
 
 
 LIGHT = """

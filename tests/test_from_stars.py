@@ -23,7 +23,7 @@ from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import _locked
 from psfdae.files import read_product, write_product
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
@@ -56,7 +56,7 @@ def made(training):
 
 @pytest.fixture(scope="module")
 def candidates(training, config):
-    observation = Source(training.image, training.catalogue).open(16, 8)
+    observation = ImageInput(training.image, catalogue=training.catalogue).open(16, 8)
     return collect(observation, config.calibration_stars, config.framing)
 
 
@@ -117,14 +117,14 @@ def test_what_the_list_says_against_a_star_counts(training, candidates, config, 
     listed.loc[good[:4], "FLAGS"] = [1, 2, 7, 8]
     listed.loc[good[4], "X_IMAGE"] = np.nan
     listed.drop(columns=["ra", "dec"]).to_csv(tmp_path / "stars.csv", index=False)
-    observation = Source(training.image, tmp_path / "stars.csv").open(16, 8)
+    observation = ImageInput(training.image, catalogue=tmp_path / "stars.csv").open(16, 8)
     verdict = collect(observation, config.calibration_stars, config.framing).verdict
     assert verdict[good].tolist() == [
         *("good", "blended", "saturated", "incomplete", "no position"),
     ]
     others = np.setdiff1d(candidates.bright.row, good)
     assert (verdict[others] == "good").mean() > 0.95
-    assert f"no position in row {good[4] + 1}: flagged" in observation.said()
+    assert f"no position in row {good[4] + 1}: flagged" in observation.summary()
 
 
 def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
@@ -247,7 +247,7 @@ def test_a_model_is_replaced_on_request_only(training, tmp_path):
     assert set(out.rglob("*")) == before.keys()
 
 
-def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypatch):
+def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp_path, monkeypatch):
     """The bundle comes last, after the page, and says that all is there."""
     out, page = tmp_path / "model", tmp_path / "page.html"
     shutil.copytree(training.out, out)
@@ -270,10 +270,10 @@ def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypat
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert not made.exists() and page.exists()
-    done = run(*words)
+    assert f"{page}: exists already" in refused(*words)
+    done = run(*words, "--overwrite")
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == training.bundle.read_bytes()
-    assert not list(out.glob(".*"))
 
 
 @pytest.mark.parametrize("gain", [1e-9, 1e300])
@@ -301,7 +301,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         process.kill()
     assert str(out) in message
     with _locked(out):
-        assert [path.name for path in out.iterdir()] == [".from_stars.lock"]
+        assert list(out.iterdir()) == []
     assert not out.exists()
 
 

@@ -12,10 +12,9 @@ from astropy.table import Table
 
 from command_line import psfdae, refused
 from psfdae.commands import mosaic
-from psfdae.commands.predict import ImageOptions
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.model.bundle import read_bundle
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars import example
@@ -72,18 +71,16 @@ def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path
 
 def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
     image, catalogue = ccds
-    stated = mosaic.options_by_image(
-        image, ImageOptions(catalogue=catalogue, all_extensions=True, gain=2.0)
-    )
+    stated = mosaic.options_by_image(image, ImageStatements(catalogue=catalogue, gain=2.0))
     assert {name: of.extension for name, of in stated.items()} == NUMBERS
     for k in (1, 2):
         of = stated[f"CCD{k}"]
-        assert (of.all_extensions, of.gain) == (False, 2.0)
-        found = of.source(image).open(4)
+        assert of.gain == 2.0
+        found = ImageInput(image, **vars(of)).open(4)
         assert found.count == 5
         assert next(found.chunks(9)).id.tolist() == [10 * k + n for n in range(5)]
     # The list reaches beyond an image, which alone keeps and flags all of them.
-    assert Source(image, catalogue, extension=1).open(4).count == 10
+    assert ImageInput(image, catalogue=catalogue, extension=1).open(4).count == 10
 
 
 def twice(word):

@@ -144,7 +144,7 @@ def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, con
     observation = open_observation(image, D, catalogue=path)
     lost = [False, True, True, True, False]
     assert observation.without_position().tolist() == lost
-    assert f"{path}: no position in row 2, 3, 4: flagged" in observation.said()
+    assert f"{path}: no position in row 2, 3, 4: flagged" in observation.summary()
     stamps = next(observation.chunks(5))
     assert (
         (stamps.flags & StarFlag.TRUNCATED) > 0

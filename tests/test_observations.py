@@ -156,7 +156,7 @@ def test_the_scale_of_the_wcs_goes_before_a_nominal_one(tmp_path):
     fits.setval(path, "CTYPE1", value="RA---TNX")
     damaged = open_observation(path, D, catalogue=stars)
     assert damaged.pixel_scale_arcsec == 1.0
-    assert "its WCS (CTYPE1 = RA---TNX) is damaged and not used" in damaged.said()
+    assert "its WCS (CTYPE1 = RA---TNX) is damaged and not used" in damaged.summary()
 
 
 # Extensions and masks
@@ -294,6 +294,6 @@ def test_distortion_is_inverted_and_far_stars_do_not_fold_into_the_image(ramp, t
     np.testing.assert_allclose(observation.positions[:2], [[5, 7], [30, 20]], atol=1e-4)
     columns = read(observation)
     np.testing.assert_array_equal(columns["truncated"], [0, 0, 1, 1])
-    assert columns["bad"][2:].all() and "-SIP" not in observation.said()
+    assert columns["bad"][2:].all() and "-SIP" not in observation.summary()
     fits.setval(ramp, "CTYPE1", value="RA---TAN")
-    assert "RA---TAN has no -SIP" in open_observation(ramp, D, catalogue=stars).said()
+    assert "RA---TAN has no -SIP" in open_observation(ramp, D, catalogue=stars).summary()

@@ -16,7 +16,7 @@ from command_line import psfdae as run
 from command_line import refused
 from image_training import few_draws
 from psfdae import StarFlag, load_model
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.selection_advice import saturation_advice
 from psfdae.image.stamps import cut
@@ -161,7 +161,7 @@ def collected(pixels, sky, folder):
     fits.PrimaryHDU(pixels.astype(np.float32)).writeto(path)
     config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
-    return path, collect(Source(path, sky.list).open(22, 8), stars, config.framing)
+    return path, collect(ImageInput(path, catalogue=sky.list).open(22, 8), stars, config.framing)
 
 
 def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
@@ -177,7 +177,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     advice = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(candidates))
     count, saturation = int(advice[1]), float(advice[2])
     assert (candidates.verdict == "saturated").sum() <= count
-    observation = Source(path, sky.list, saturate=saturation).open(22, 0)
+    observation = ImageInput(path, catalogue=sky.list, saturate=saturation).open(22, 0)
     flagged = np.concatenate([s.saturated.any(axis=(1, 2)) for s in observation.chunks(64)])
     assert flagged.sum() == count > (candidates.brightest >= saturation).sum()
 

@@ -13,7 +13,7 @@ from psfdae.bright_stars import BrightStars
 from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import Verdict, completed
 from psfdae.image.sky_level import noise_correlation, sky_level, sky_steps
 from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
@@ -101,7 +101,7 @@ def test_a_listed_cosmic_ray_is_flagged_sharp(clean):
     dirty[150, 165] += 5000.0
     assert np.hypot(*(place - [165, 150]).T).min() > 8
     listed = np.concatenate([place, [[165, 150]]])
-    (stamps,) = Source(dirty, listed, origin=0, **CAMERA).open(16, 2).chunks(500)
+    (stamps,) = ImageInput(dirty, catalogue=listed, origin=0, **CAMERA).open(16, 2).chunks(500)
     sharp = (stamps.flags & psfdae.StarFlag.SHARP) > 0
     assert sharp.tolist() == [False] * len(place) + [True]
 
@@ -129,10 +129,12 @@ def test_an_image_that_was_cut_off_says_its_saturation(clean):
     unsaid = {key: value for key, value in CAMERA.items() if key != "saturate"}
     image = clean[0].copy()
     image[::40, ::40] = 1e5  # a value for bad pixels is no saturation
-    assert Source(image, clean[1], origin=0, **unsaid).open(16).saturate is None
-    observation = Source(np.minimum(clean[0], 3000.0), clean[1], origin=0, **unsaid).open(16)
+    assert ImageInput(image, catalogue=clean[1], origin=0, **unsaid).open(16).saturate is None
+    observation = ImageInput(
+        np.minimum(clean[0], 3000.0), catalogue=clean[1], origin=0, **unsaid
+    ).open(16)
     assert observation.saturate == 3000.0
-    assert "exactly the largest value, 3000 counts: taken as saturated" in observation.said()
+    assert "exactly the largest value, 3000 counts: taken as saturated" in observation.summary()
 
 
 # Skies with steps, structure, trails, and shared noise.

@@ -15,7 +15,7 @@ from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
 from psfdae.commands import predict as stage
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
 from psfdae.model import prediction as writer
 from psfdae.model import psf_model
@@ -90,7 +90,7 @@ def test_image_and_catalogue(folder, field_psfs, shipped):
     cubes, table, header = read(out)
     truth = Table.read(folder / "stars.csv")
     assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
-    source = Source(folder / "image.fits", folder / "stars.csv")
+    source = ImageInput(folder / "image.fits", catalogue=folder / "stars.csv")
     ((_, found),) = shipped.stream(source.open(shipped.stamp_px, shipped.margin_px))
     rows = found.to_table()
     assert rows.colnames == table.colnames and {"ra", "dec"} < {*rows.colnames}
@@ -146,7 +146,7 @@ def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     for rows, threads in ((1024, 1), (256, 3)):
         monkeypatch.setattr(psf_model, "MAX_STARS_READ", rows)
         out = folder / f"rows{rows}_{threads}.fits"
-        stage.predict(folder / "cube.fits", stage.ImageOptions(), threads=threads, out=out)
+        stage.predict(folder / "cube.fits", stage.ImageStatements(), threads=threads, out=out)
         files.append(out.read_bytes())
     assert files[0] == files[1]
 

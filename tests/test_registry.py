@@ -1,15 +1,13 @@
-"""Registered models restore stamps as `psfdae predict` does."""
+"""Registered models restore stamps as bundles of the same fits do."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from astropy.io import fits as fits_files
 
-from command_line import psfdae
 from image_training import few_draws
-from psfdae import fits
+from psfdae import fits, load_model
 from psfdae.files import Column, write_product
 from psfdae.methods import groups_of, method
 from psfdae_paper.configuration.compose import load_stage
@@ -55,17 +53,10 @@ def test_a_registered_model_restores_as_its_bundle_does(
     before = mlflow.get_tracking_uri()
     mlflow.set_tracking_uri(f"sqlite:///{database}")
     try:
-        model = mlflow.pyfunc.load_model("models:/mine-dae@best")
+        folder = mlflow.artifacts.download_artifacts("models:/mine-dae@best")
     finally:
         mlflow.set_tracking_uri(before)
-    (tensor,) = model.metadata.signature.inputs.inputs
-    assert (tensor.shape, tensor.type) == ((-1, 16, 16), np.float32)
 
-    photons = np.random.default_rng(5).poisson(2e4 * gaussian_stars[:20] + 1e4)
-    stamps = np.concatenate([photons, model.input_example]).astype(np.float32)
-    cube, restored = tmp_path / "stamps.fits", tmp_path / "psfs.fits"
-    fits_files.PrimaryHDU(stamps, fits_files.Header({"PIXSCALE": 0.1})).writeto(cube)
-    words = ("predict", cube, "--model", packed, "--out", restored, "--quiet")
-    result = psfdae(*words, "--pixel-scale", 0.1)
-    assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(model.predict(stamps), fits_files.getdata(restored, "PSF"))
+    stamps = np.random.default_rng(5).poisson(2e4 * gaussian_stars[:20] + 1e4).astype(np.float32)
+    registered, model = load_model(f"{folder}/mine-dae.psf.safetensors"), load_model(packed)
+    np.testing.assert_array_equal(registered.predict(stamps).psf, model.predict(stamps).psf)

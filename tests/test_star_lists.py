@@ -13,7 +13,7 @@ from command_line import psfdae
 from image_training import few_draws
 from psfdae import Error, StarFlag, Stars, fit
 from psfdae.image.catalogue import as_catalogue, read_catalogue
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from small_field import CAMERA, TANGENT, field, header, stetson, table, write
 
 
@@ -35,7 +35,7 @@ def path(tmp_path_factory, image):
 
 
 def positions(image, catalogue, **stated):
-    return Source(image, catalogue, **stated).open(16).positions
+    return ImageInput(image, catalogue=catalogue, **stated).open(16).positions
 
 
 # Lists in Python.
@@ -102,7 +102,7 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
     listed = table(place, 1, ("XWIN_IMAGE", "YWIN_IMAGE"))
     listed["NUMBER"] = np.arange(len(place)) + 100
     listed.write(tmp_path / "s.vot", format="votable")
-    observation = Source(image, tmp_path / "s.vot").open(16)
+    observation = ImageInput(image, catalogue=tmp_path / "s.vot").open(16)
     np.testing.assert_allclose(observation.positions, place)
     assert next(observation.chunks(100)).id[0] == 100
 
@@ -111,7 +111,7 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
 def test_lists_that_count_from_1(tmp_path, image, place, form):
     listed = [(k + 5, x + 1, y + 1) for k, (x, y) in enumerate(place)]
     form(listed, tmp_path / "s.als")
-    observation = Source(image, tmp_path / "s.als").open(16)
+    observation = ImageInput(image, catalogue=tmp_path / "s.als").open(16)
     np.testing.assert_allclose(observation.positions, place, atol=1e-3)
     assert [int(k) for k in next(observation.chunks(100)).id] == [k for k, _, _ in listed]
 
@@ -141,9 +141,9 @@ def test_vizier(tmp_path, path, place):
 
 def test_the_stars_say_the_origin_of_plain_columns(tmp_path, image, place):
     for origin in (0, 1):
-        observation = Source(image, table(place, origin)).open(16)
+        observation = ImageInput(image, catalogue=table(place, origin)).open(16)
         np.testing.assert_allclose(observation.positions, place)
-        assert f"count from {origin}" in observation.said()
+        assert f"count from {origin}" in observation.summary()
 
 
 def test_where_they_do_not_the_origin_is_asked_for(image, place):

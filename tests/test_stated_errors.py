@@ -10,7 +10,7 @@ from astropy.table import Table
 import psfdae
 from command_line import psfdae as command
 from psfdae.field_psf import excess_scatter
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.model.calibration import with_model_errors
 from psfdae.model.crowded import star_flags
@@ -134,7 +134,9 @@ def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp
     assert rows["id"].tolist() == names
     assert (rows["flags"] == 0).mean() > 0.9
     # As one star after the other is measured by `predict`, within the errors of both.
-    found = next(models[0].stream(Source(tmp_path / "i.fits", place).open(16, 2), threads=1))[1]
+    found = next(
+        models[0].stream(ImageInput(tmp_path / "i.fits", catalogue=place).open(16, 2), threads=1)
+    )[1]
     off = np.array(rows["flux"]) - found.flux_total
     one, two = within(off, np.hypot(rows["flux_error"], found.flux_total_error))
     assert one > 0.6 and two > 0.9

@@ -101,9 +101,10 @@ class Site:
 
         return MlflowClient(f"sqlite:///{self.database}")
 
-    def runs(self, kind="dae"):
-        experiment = self.client.get_experiment_by_name("scene1").experiment_id
-        return self.client.search_runs([experiment], f"tags.kind = '{kind}'")
+    def runs(self, kind="dae", experiment="scene1"):
+        number = self.client.get_experiment_by_name(experiment).experiment_id
+        query = f"tags.kind = '{kind}'" if experiment == "scene1" else ""
+        return self.client.search_runs([number], query)
 
     def history(self, run, metric):
         return self.client.get_metric_history(run.info.run_id, metric)
@@ -122,7 +123,8 @@ def site(tmp_path, empty_database, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(registry, "_with_bundle", lambda files, *given: files)
+    monkeypatch.setattr(registry, "bundle_of", lambda *given: None)
+    monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
     return Site(tmp_path, empty_database)
 
 

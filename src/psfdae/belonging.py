@@ -3,6 +3,9 @@
 A product carries the configuration that made it. A network or a fitted baseline has the
 configuration of its training stars in a file beside it. Settings that only one side states are
 not compared, nor are those that change no result (names, threads, batches).
+
+Two configurations and the keys to compare go in; nothing comes out, or a `ProductError` with the
+first key that differs.
 """
 
 from __future__ import annotations
@@ -66,6 +69,7 @@ def require(
         For the first key that differs, with both values.
     """
     tree = expected if isinstance(expected, Mapping) else expected.model_dump()
+    # The first difference is the message: the others often follow from it.
     for key in keys:
         difference = _difference(key, _at(config, key), _at(tree, key), is_partial=True)
         if difference is not None:
@@ -87,13 +91,21 @@ def _difference(
 ) -> tuple[str, Any, Any] | None:
     """Return the first key in which two values differ, with its two values; None if they agree.
 
-    Groups are compared key by key; a side without the group has none of its keys. If `is_partial`,
-    a side need not state the group, nor all of its keys.
+    Parameters
+    ----------
+    name : str
+        Dotted key of the values.
+    first, second : object
+        Groups, which are compared key by key, or values of other types.
+    is_partial : bool
+        Whether a side may leave out the value, or some of the keys of a group.
     """
+    # What a side does not state is not compared.
     if is_partial and (first is None or second is None):
         return None
     if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
         return None if first == second else (name, first, second)
+    # Two groups: a key that a side lacks is "nothing" there.
     keys, stated_parts = [*{**first, **second}], set()
     if is_partial:
         # If both sides state one part of a group by itself, such as aberrations, they state all of
@@ -136,6 +148,7 @@ def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[s
     ProductError
         For the first of `keys` that differs, or if the file of the origin is damaged.
     """
+    # A model that was copied alone has no note: then nothing is compared.
     path = origin_path(model)
     origin = read_yaml(path) if path.is_file() else {}
     require(path, origin, keys, product.config, product.path)
@@ -173,9 +186,11 @@ def require_training(
     ProductError
         For the first key that differs, with both values.
     """
+    # Stars of the same kind, and the same split and reference.
     origin = require_origin(model, STARS, stars)
     path = model if model.is_file() else model / "config.yaml"
     require(path, fit_config, tuple(options), options, "the command")
+    # Stars of the same draw: the test stars must not have been among those of the training.
     identities = [(_at(origin, key), _at(stars.config, key)) for key in SAME_STARS]
     same_stars = all(first == second and first is not None for first, second in identities)
     if options["split"] == "random" and same_stars:

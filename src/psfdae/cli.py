@@ -3,11 +3,13 @@
 `@command("name")` on a function makes it one: parameters become options,
 the docstring the help. Which module has which command is read from the text of the modules,
 so that `psfdae --help` imports none of them.
+
+Words of a command line go in, and a call of the function comes out, or one line that says what is
+wrong and exit code 2.
 """
 
 from __future__ import annotations
 
-import ast
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +19,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
+from textwrap import shorten
 from typing import (
     Annotated,
     Any,
@@ -56,11 +59,23 @@ class Stage:
 def command(name: str, settings: Reader | None = None) -> Callable[[Function], Function]:
     """Make a function the command `psfdae NAME`.
 
-    A parameter `config` receives what `settings` reads from trailing words or a file. Other
-    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a flag as
-    bool, all fields of a dataclass. `Annotated` adds help (a text), a click type, or a dict of
-    what click's option takes, where "flag" names it and "argument" makes it positional. Help is
-    the docstring. Of the words of a repeatable argument beside `config`, those with = are settings.
+    Parameters of the function are options: required without a default, repeatable as
+    `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a
+    click type, or a dict of what click's option takes, where "flag" names it and "argument" makes
+    it positional. Help is the docstring.
+
+    Parameters
+    ----------
+    name : str
+        Words of the command, such as "alignment states".
+    settings : Reader, optional
+        Makes what a parameter `config` receives, from trailing words or a file. Of the words of a
+        repeatable argument beside `config`, those with = are settings.
+
+    Returns
+    -------
+    callable
+        Decorator that returns the function itself, with the attribute `stage`.
     """
 
     def mark(function: Function) -> Function:
@@ -68,10 +83,6 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
         return function
 
     return mark
-
-
-REFUSABLE = (OSError, MemoryError, RuntimeError, ValueError, ImportError)
-"""Errors of which some are no bugs; `refusal` tells which."""
 
 
 class Careful(click.Group):
@@ -85,7 +96,7 @@ class Careful(click.Group):
         """
         try:
             return super().invoke(ctx)
-        except REFUSABLE as error:
+        except Exception as error:
             message = refusal(error)
             if message is None:
                 raise
@@ -95,6 +106,7 @@ class Careful(click.Group):
 
 def refusal(error: Exception) -> str | None:
     """Return the line for an error that is no bug; None if it is one."""
+    # Errors of Python that say what the machine lacks, then the package's own.
     if isinstance(error, MemoryError):
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):
@@ -118,6 +130,7 @@ class Commands(Careful):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the words that may follow those of the group."""
+        # Commands have one, two or three words; the first ones are those of the group.
         prefix = self.prefix.split()
         size = len(prefix)
         names = [name.split() for name in command_modules()]
@@ -138,8 +151,14 @@ class Commands(Careful):
         width = formatter.width - 6 - max(map(len, words))
         for heading, commands in listed.items():
             with formatter.section(heading):
-                names = [f"{self.prefix} {word}".strip() for word in commands]
-                formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
+                rows = []
+                for word in commands:
+                    name = f"{self.prefix} {word}".strip()
+                    text = groups()[name] if name in groups() else command_modules()[name][1]
+                    sentence = text.partition(". ")[0].removesuffix(".")
+                    sentence += "." if len(sentence) < width else ""
+                    rows.append((word, shorten(sentence, width, placeholder="...")))
+                formatter.write_dl(rows)
         if absent := len(words) - sum(map(len, listed.values())):
             formatter.write_paragraph()
             formatter.write_text(f'{absent} more with the extra "paper": {install_line("paper")}')
@@ -156,19 +175,22 @@ def main() -> None:
 
 
 @cache
-def command_modules() -> dict[str, tuple[str, Path]]:
-    """Return the name of the module, and the path of its file, of each command.
+def command_modules() -> dict[str, tuple[str, str]]:
+    """Return the module of each command, and the first paragraph of its help, by its name.
 
     They are found in the text of the modules, none of which is imported.
     """
-    # Lines such as @command("from-stars", …), perhaps with the name on the next line.
-    pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
+    # Lines such as @command("from-stars", …), perhaps with the name on the next line; then the
+    # docstring of the function.
+    pattern = re.compile(
+        r'^@command\(\s*"([^"]+)".*?"""(.*?)(?:\n\n|""")', re.MULTILINE | re.DOTALL
+    )
     commands = {}
     for package in _packages():
         for folder in find_spec(package).submodule_search_locations:  # type: ignore[union-attr]
             for path in sorted(Path(folder).glob("*.py")):
-                for name in pattern.findall(path.read_text(encoding="utf-8")):
-                    commands[name] = f"{package}.{path.stem}", path
+                for name, text in pattern.findall(path.read_text(encoding="utf-8")):
+                    commands[name] = f"{package}.{path.stem}", " ".join(text.split())
     return commands
 
 
@@ -182,6 +204,16 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
 
     The packages' `SECTIONS` have the commands of each heading, and their `REQUIRED` the module
     that a command needs; a command in no section is a stage of the paper.
+
+    Parameters
+    ----------
+    words : sequence of str
+        First words of all commands.
+
+    Returns
+    -------
+    dict of str to list of str
+        Words by their heading, without headings of none.
     """
     # Headings of all packages, in their order; packages may share a heading.
     headings: dict[str, list[str]] = {}
@@ -190,16 +222,17 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
         for heading, commands in getattr(package, "SECTIONS", {}).items():
             headings.setdefault(heading, []).extend(commands)
         required |= getattr(package, "REQUIRED", {})
-    in_sections = {word for commands in headings.values() for word in commands}
-    headings["The paper's stages"] = [word for word in words if word not in in_sections]
-
-    # The module "*" is that of all commands that are in no section.
-    def can_run(word: str) -> bool:
-        module = required.get(word, "" if word in in_sections else required.get("*", ""))
-        return word in words and (not module or find_spec(module) is not None)
-
-    available = {heading: list(filter(can_run, names)) for heading, names in headings.items()}
-    return {heading: commands for heading, commands in available.items() if commands}
+    rest = {*words}.difference(*headings.values())
+    headings["The paper's stages"] = [word for word in words if word in rest]
+    # What is in no section belongs to the paper; the module "*" is that of all these commands.
+    required |= dict.fromkeys(rest, required.get("*", ""))
+    available: dict[str, list[str]] = {}
+    for heading, commands in headings.items():
+        for word in commands:
+            module = required.get(word)
+            if word in words and (not module or find_spec(module) is not None):
+                available.setdefault(heading, []).append(word)
+    return available
 
 
 @cache
@@ -212,30 +245,11 @@ def groups() -> dict[str, str]:
 
 
 def stage(name: str) -> Callable[..., Any]:
-    """Import the module of a command, and return its function."""
+    """Return the function of a command, whose module is imported."""
     module = import_module(command_modules()[name][0])
     stages = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
     function: Callable[..., Any] = next(f for f in stages if f.stage.name == name)
     return function
-
-
-def _shortened(text: str, width: int) -> str:
-    """Return the first sentence of a text, cut after the last word that fits into the width."""
-    from textwrap import shorten
-
-    first = " ".join(text.split()).partition(". ")[0].removesuffix(".")
-    return first + "." if len(first) < width else shorten(first, width, placeholder="...")
-
-
-def _about(name: str) -> str:
-    """Return the first paragraph of a command's help from the text of its module."""
-    if name in groups():
-        return groups()[name]
-    for node in ast.parse(command_modules()[name][1].read_text(encoding="utf-8")).body:
-        for call in getattr(node, "decorator_list", []):
-            if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
-                return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
-    return ""
 
 
 def as_click(function: Callable[..., Any]) -> click.Command:
@@ -262,12 +276,14 @@ def as_click(function: Callable[..., Any]) -> click.Command:
             parameters.append(click.Argument(["overrides"], nargs=-1))
 
     def run(**values: Any) -> None:
+        # Settings come first, because what they are may depend on the other options.
         config = {}
         if read_settings is not None:
             file, overrides = values.pop("settings"), _settings(parameters, values)
             if file is not None and overrides:
                 raise click.UsageError("--config and overrides exclude each other")
             config["config"] = read_settings(values, file, overrides)
+        # Options of a dataclass become one value again.
         for name, dataclass_type in dataclasses.items():
             names = [field_name for field_name, *_ in _parameters(dataclass_type)]
             values[name] = dataclass_type(**{key: values.pop(key) for key in names})
@@ -282,6 +298,18 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
 
     They stand among the files of an argument with several values: a word with = before any / is a
     setting, so that a file a=b.fits is to be named ./a=b.fits.
+
+    Parameters
+    ----------
+    parameters : sequence of click.Parameter
+        All parameters of the command.
+    values : dict
+        Their values by name, which lose the words.
+
+    Raises
+    ------
+    click.MissingParameter
+        If no files are left.
     """
     if "overrides" in values:
         overrides: Sequence[str] = values.pop("overrides")
@@ -293,6 +321,16 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     if not values[name]:
         raise click.MissingParameter(param=argument)
     return settings
+
+
+def typed_words(options: Any) -> list[str]:
+    """Return the fields of a dataclass that differ from their defaults, as options are typed."""
+    words = []
+    for name, hint, default in _parameters(type(options)):
+        if (value := getattr(options, name)) != default:
+            flag = _option(name, hint, default).opts[0]
+            words += [flag] if value is True else [flag, str(value)]
+    return words
 
 
 def program(*functions: Callable[..., Any]) -> None:
@@ -309,6 +347,7 @@ def _parameters(function: Any) -> list[tuple[str, Any, Any]]:
 
 def _option(name: str, hint: Any, default: Any) -> click.Parameter:
     """Return click's option or argument for a parameter of a function; see `command`."""
+    # What the annotation says overrules what follows from the type.
     value_type, attributes = _click_type(hint)
     attributes = {"type": value_type, **attributes}
     if value_type is bool:
@@ -326,7 +365,12 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
 
 
 def _click_type(hint: Any) -> tuple[Any, dict[str, Any]]:
-    """Return click's type for an annotation, and further attributes of the option."""
+    """Return click's type for an annotation, and further attributes of the option.
+
+    Examples
+    --------
+    `Annotated[tuple[int, ...], "Sizes."]` gives int, and {"multiple": True, "help": "Sizes."}.
+    """
     if get_origin(hint) is Annotated:
         # A text is the help; a dict has attributes; anything else is a type of click's.
         value_type, attributes = _click_type(get_args(hint)[0])

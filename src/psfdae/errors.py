@@ -1,4 +1,7 @@
-"""The class of all refusals; where a package of an extra is missing, a line says which extra."""
+"""The class of all refusals; where a package of an extra is missing, a line says which extra.
+
+Everything that psfdae refuses is an `Error` with one line; a bug is any other exception.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,6 @@ class Error(Exception):
     """
 
 
-REQUIRED_BY_EXTRA = re.compile(r"([A-Za-z0-9._-]+).*extra == [\"']([^\"']+)[\"']")
-"""A line of the package's metadata: name of a package, and of the extra that requires it."""
-
-
 class MissingExtraError(Error, ImportError):
     """A package of an extra is not installed; one line says which, and how to install it."""
 
@@ -51,12 +50,28 @@ def needed_by(what: str) -> Iterator[None]:
 
 
 def missing(error: ModuleNotFoundError, what: str) -> str | None:
-    """Return the line that says what to install for `what`; None if no extra brings the module."""
-    requirement = _source(error.name or "")
-    if requirement is None:
+    """Return the line that says what to install for `what`; None if no extra brings the module.
+
+    Parameters
+    ----------
+    error : ModuleNotFoundError
+    what : str
+        Beginning of the line, such as "this command".
+    """
+    try:
+        lines = requires("psfdae") or []
+    except PackageNotFoundError:
         return None
-    package, extra = requirement
-    return f"{what} needs {package}: {install_line(extra)}"
+    # Packages and extras of lines of the metadata such as: hydra-core>=1.3; extra == "paper".
+    matches = (re.match(r"([A-Za-z0-9._-]+).*extra == [\"']([^\"']+)", line) for line in lines)
+    extras = {match[1]: match[2] for match in reversed([*matches]) if match}
+    # A package that is not installed does not say how its module is called: either as itself, or
+    # as the first word of its name, as hydra of hydra-core.
+    module = error.name or ""
+    names = [name for name in extras if name == module or name.startswith(f"{module}-")]
+    if not names:
+        return None
+    return f"{what} needs {min(names)}: {install_line(extras[min(names)])}"
 
 
 def install_line(extra: str) -> str:
@@ -65,6 +80,7 @@ def install_line(extra: str) -> str:
     psfdae is on no package index: pip needs the folder or wheel that it was installed from, which
     it has noted in direct_url.json (PEP 610).
     """
+    # pip leaves no note for a package from an index, or from a folder on the path of Python.
     try:
         note = json.loads(distribution("psfdae").read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
@@ -73,19 +89,3 @@ def install_line(extra: str) -> str:
     if place.scheme == "file" and (path := Path(unquote(place.path))).exists():
         return f'pip install "{path}[{extra}]"'
     return f'pip install ".[{extra}]" in the folder of psfdae\'s source'
-
-
-def _source(module: str) -> tuple[str, str] | None:
-    """The package of a top-level module and the extra that requires it, by psfdae's metadata.
-
-    A package that is not installed does not say how its module is called: either as itself,
-    or as the first word of its name, as hydra of hydra-core.
-    """
-    try:
-        lines = requires("psfdae") or []
-    except PackageNotFoundError:
-        return None
-    required = [(line[1], line[2]) for line in map(REQUIRED_BY_EXTRA.match, lines) if line]
-    alike = [pair for pair in required if pair[0] == module]
-    alike += [pair for pair in required if pair[0].startswith(f"{module}-")]
-    return alike[0] if alike else None

@@ -1,4 +1,9 @@
-"""Files that are either whole or absent, and data products that describe themselves."""
+"""Files that are either whole or absent, and data products that describe themselves.
+
+Tables, texts and images go in, and files come out: `write_text`, `write_csv`, `write_fits` and
+others. A product is an HDF5 file with arrays, their units and the configuration that made them:
+`write_product` and `stream_product` write it, `read_product` reads it.
+"""
 
 from __future__ import annotations
 
@@ -84,20 +89,30 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def write_csv(path: str | Path, table: DataFrame, digits: int = 8) -> None:
-    """Write a DataFrame as CSV, numbers with so many digits, atomically."""
+    """Write a DataFrame as CSV with so many significant digits of a number, atomically."""
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
 
 
 def write_columns(
     path: str | Path, columns: Mapping[str, Iterable[object]], digits: int = 8
 ) -> None:
-    """Write columns of equal length as CSV, numbers with so many digits, NaN as nothing."""
+    """Write columns of equal length as CSV, atomically.
+
+    Parameters
+    ----------
+    path : path-like
+    columns : mapping of str to iterable
+        Values by the name of the column.
+    digits : int
+        Significant digits of numbers; NaN is an empty cell.
+    """
 
     def cell(value: object) -> object:
         if not isinstance(value, float | np.floating):
             return value
         return "" if np.isnan(value) else f"{value:.{digits}g}"
 
+    # One row after the other, below the row of the names.
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -114,7 +129,7 @@ def write_parquet(path: str | Path, table: DataFrame) -> None:
 def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
     """Return rows with equal keys as CSV, the numbers with all digits."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, fieldnames=list(rows[0] if rows else ()), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -209,11 +224,13 @@ def stream_product(
     import h5py
 
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        # What the file is: no time of writing, so that equal products are equal bytes.
         file.attrs["kind"] = kind
         file.attrs["psfdae_version"] = __version__
         file.attrs["config"] = json.dumps(config, sort_keys=True)
         names = _create_datasets(file, columns)
         yield {name: file[name] for name in columns}
+        # An error of the disk is raised here, before the file gets its name.
         file.flush()
         # HDF5 creates the chunks of an array when they are written.
         for name in names:
@@ -224,7 +241,13 @@ def stream_product(
 
 
 def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[str]:
-    """Create a dataset for each array of a product; return the columns that are no links."""
+    """Create a dataset for each array of a product.
+
+    Returns
+    -------
+    list of str
+        Names of the columns that are no links to others.
+    """
     import h5py
 
     # The first name of each array; further names of the same array are links to that.
@@ -236,6 +259,7 @@ def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[
             file[name] = h5py.SoftLink(f"/{first}")
             continue
         if isinstance(column, Column):
+            # h5py chooses chunks; checksums need them.
             storage = {"data": column.values, "chunks": True}
         else:
             # Chunks of whole rows, 256 KiB, because rows are written in their order.
@@ -254,8 +278,16 @@ def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[
 class Product:
     """Data product: its configuration, and its arrays, each read when it is first used.
 
-    `kind` is that of `read_product`; "" for a product that is in memory as a whole, of which
-    `path` is only a name.
+    Attributes
+    ----------
+    path : Path
+        The file, or only a name for messages if the product is in memory as a whole.
+    config : dict
+        Resolved configuration of the stage that wrote it.
+    arrays : dict of str to ndarray
+        Arrays that have been read.
+    kind : str
+        Product type, as for `read_product`; "" for a product that is in memory as a whole.
     """
 
     path: Path
@@ -272,6 +304,14 @@ class Product:
 def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = None) -> Product:
     """Read a data product, or only some of its arrays.
 
+    Parameters
+    ----------
+    path : path-like
+    kind : str
+        Product type that the file must have.
+    names : tuple of str, optional
+        Arrays to read now; all by default. Others are read when they are used.
+
     Raises
     ------
     ProductError
@@ -283,6 +323,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
     path = Path(path)
     try:
         with h5py.File(path, "r") as file:
+            # A file of another stage is refused by its kind, before anything of it is used.
             file_kind = file.attrs.get("kind")
             if file_kind != kind:
                 raise ProductError(f"{path}: a product of kind {file_kind!r}, expected {kind!r}")
@@ -305,13 +346,19 @@ class OutputError(Error, ValueError):
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
     """Refuse outputs that are inputs, too.
 
-    Inputs that are no paths, such as arrays, and outputs that are None are passed over.
+    Parameters
+    ----------
+    outputs : iterable of Path or None
+        Files to write; None is passed over.
+    inputs : iterable
+        Files to read; inputs that are no paths, such as arrays, are passed over.
 
     Raises
     ------
     OutputError
         For the first output that is an input.
     """
+    # Links and relative names are followed, because they may be the same file.
     input_paths = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
     for out in outputs:
         if out is not None and out.resolve() in input_paths:

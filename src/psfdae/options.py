@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import click
 
@@ -25,3 +25,6 @@ class NameOrNumber(click.ParamType):  # type: ignore[type-arg]  # click below 8.
     ) -> str | int:
         """Return a number for up to six digits, and any other text as it is."""
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
+
+
+Extension: TypeAlias = Annotated[str | int, NameOrNumber()]

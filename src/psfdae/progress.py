@@ -39,6 +39,7 @@ def show_with(display: Display | None) -> None:
 @contextmanager
 def silence() -> Iterator[None]:
     """Show no tasks meanwhile."""
+    # The value is that of this thread: others go on showing their tasks.
     token = _display.set(None)
     try:
         yield
@@ -65,6 +66,7 @@ def task(name: str, count: int) -> Iterator[Advance]:
     if display is None:
         yield lambda steps: None
         return
+    # Of tasks within this one nothing is shown: their bars would mix.
     with silence(), display(name, count) as advance:
         yield advance
 

@@ -1,12 +1,15 @@
-"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong."""
+"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong.
+
+The path of a file goes in, and plain values or a table come out. What is wrong is a `ProductError`
+that names the file and, if it is known, line and column.
+"""
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsFloat
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -31,13 +34,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(path: Path) -> Any:
-    """Return the content of a YAML file, which is of any type.
+    """Return the content of a YAML file, which is of any type: no code of a file is run.
 
     Raises
     ------
     ProductError
         If the file is missing or wrong, or has a key twice; names file, line and column.
     """
+    # Errors of PyYAML take several lines; the place and the problem are in them.
     try:
         return yaml.load(_text(path), UniqueKeyLoader)
     except yaml.MarkedYAMLError as error:
@@ -114,7 +118,13 @@ def from_tree(
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file with an object; raise ProductError, which names the file, for another."""
+    """Read a JSON file with an object.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing or damaged, or has something else.
+    """
     try:
         tree = json.loads(_text(path))
     except (ValueError, RecursionError) as error:
@@ -124,22 +134,25 @@ def read_json(path: Path) -> dict[str, Any]:
     return tree
 
 
-def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; raise ProductError if it lacks a column or is damaged."""
-    try:
-        reader = csv.DictReader(_text(path).splitlines(keepends=True))
-        missing = [name for name in columns if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ProductError(f"{path}: column {missing[0]!r} is missing")
-        return list(reader)
-    except csv.Error as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
+    """Read a CSV file as a DataFrame.
 
+    Parameters
+    ----------
+    path : Path
+    *columns : str
+        Names of columns that it must have.
+    **options
+        Options of pandas.
 
-def read_table(path: Path, **options: Any) -> DataFrame:
-    """Read a CSV file as a DataFrame, with pandas' options; raise ProductError if it is damaged."""
+    Raises
+    ------
+    ProductError
+        If the file is missing or damaged, or lacks a column; the message names the file.
+    """
     import pandas as pd
 
+    # pandas raises ValueError for cells that are not of the type that is asked for.
     try:
         table: DataFrame = pd.read_csv(path, **options)
     except FileNotFoundError:
@@ -147,12 +160,6 @@ def read_table(path: Path, **options: Any) -> DataFrame:
     except (ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
+    if missing := [name for name in columns if name not in table]:
+        raise ProductError(f"{path}: column {missing[0]!r} is missing")
     return table
-
-
-def number(path: Path, text: str | SupportsFloat) -> float:
-    """Return a cell of a table as a number; raise ProductError, which names the file, if none."""
-    try:
-        return float(text)
-    except (TypeError, ValueError):
-        raise ProductError(f"{path}: damaged ({text!r} is no number)") from None

@@ -2,6 +2,9 @@
 
 A group of settings is a class. Its keys are read from keywords, from words `group.key=value` of
 a command line or from YAML; each wrong one is named with its value and the allowed range.
+
+Plain mappings go into `validate`, and checked, immutable groups come out. `deciding`, `leaves` and
+`as_overrides` turn groups into mappings and texts again.
 """
 
 from __future__ import annotations
@@ -51,6 +54,17 @@ Model = TypeVar("Model", bound=BaseModel)
 def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
     """Check a configuration tree against a pydantic model.
 
+    Parameters
+    ----------
+    model : type of pydantic model
+    tree : mapping
+        Values by key; groups are mappings.
+
+    Returns
+    -------
+    pydantic model
+        The settings, with defaults for keys that are not stated.
+
     Raises
     ------
     ConfigError
@@ -64,6 +78,7 @@ def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
 
 def _line(error: Mapping[str, Any]) -> str:
     """Return an error of pydantic's as a line with the key, its value and what is allowed."""
+    # Some of pydantic's messages say enough, or name the input already.
     key = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
@@ -72,8 +87,9 @@ def _line(error: Mapping[str, Any]) -> str:
         return f"{key}: missing"
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message
+    # All others get the value, cut to a line or two of a terminal.
     value = repr(error["input"])
-    value = value if len(value) <= 200 else f"{value[:200]}…"  # a line or two of a terminal
+    value = value if len(value) <= 200 else f"{value[:200]}…"
     return f"{key} = {value}: {message[0].lower()}{message[1:]}"
 
 
@@ -97,6 +113,7 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     and something that a person can paste.
     """
 
+    # Lists without spaces and quotes, as Hydra reads them.
     def literal(value: Any) -> str:
         if isinstance(value, list):
             return "[" + ",".join(map(literal, value)) + "]"
@@ -153,6 +170,10 @@ class Parts(Group):
     validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = Field(
         0.1, description="Part of the training stars that selects the best state"
     )
+
+
+# Settings that a function needs, by what of them it uses: the class of all settings is made when
+# it is needed (`Config`), and differs between the library and the paper.
 
 
 class WithNoise(Protocol):

@@ -25,6 +25,7 @@ def bar(name: str, count: int) -> Iterator[Advance]:
 
     import click
 
+    # The bar begins to be drawn when a second has passed, as of the start.
     start, completed_steps, is_shown = time.time(), 0, False
     progress_bar = click.progressbar(length=count, label=name, file=sys.stderr)
     with ExitStack() as stack:

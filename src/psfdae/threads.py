@@ -1,4 +1,9 @@
-"""Batches side by side in threads: numpy's and scipy's products leave Python's lock."""
+"""Batches side by side in threads: numpy's and scipy's products leave Python's lock.
+
+A function and batches go in, and results come out in the order of the batches, the same for any
+number of threads. The number of threads of the linear algebra itself changes last digits, so that
+it is fixed here, too.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +39,7 @@ def side_by_side(
     threads : int
         With one, everything runs in the caller's thread.
     """
+    # Without a pool, in the caller's thread.
     if threads == 1:
         return [work(batch) for batch in batches]
     with ThreadPoolExecutor(threads) as pool:
@@ -47,10 +53,22 @@ def in_order(
 
     Batches are taken as they are needed, by the caller's thread: at most `threads` + 1
     are under way. What `batches` or `work` raises is raised, and nothing new is begun.
+
+    Parameters
+    ----------
+    work : callable of a batch
+        Safe to be called from several threads at once.
+    batches : iterable
+    threads : int
+
+    Yields
+    ------
+    batch, result
     """
     waiting: deque[tuple[Batch, Future[Result]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
+            # One batch more than there are threads waits, so that no thread does.
             for batch in batches:
                 waiting.append((batch, pool.submit(work, batch)))
                 if len(waiting) > threads:
@@ -60,15 +78,15 @@ def in_order(
                 first, future = waiting.popleft()
                 yield first, future.result()
         finally:
+            # Not all batches may have been asked for.
             for _, future in waiting:
                 future.cancel()
 
 
 def available_cores() -> int:
     """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    has_affinity = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
 
 
 @contextmanager
@@ -79,6 +97,7 @@ def fixed_threads(threads: int) -> Iterator[None]:
     """
     from threadpoolctl import threadpool_limits
 
+    # torch is not imported for this: it takes seconds, and may be loaded within the block.
     torch = sys.modules.get("torch")
     before = torch.get_num_threads() if torch else available_cores()
     with threadpool_limits(threads):

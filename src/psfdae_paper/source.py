@@ -1,4 +1,9 @@
-"""Hash of the code of a stage, with which a workflow finds out that it has changed; git commit."""
+"""Hash of the code of a stage, with which a workflow finds out that it has changed; git commit.
+
+Names of commands, modules or programs go in; a hash of their code, and of all code of the packages
+that it imports, comes out. A rule of the workflow has it among its parameters, so that a job runs
+again when the hash has changed.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +58,17 @@ def source_hash(*names: str) -> str:
 
 @cache
 def _module(name: str) -> tuple[str, list[str]]:
-    """Return the digest of a module, or of a program's file, and the modules that it imports."""
+    """Return the digest of a module, or of a program's file, and the modules that it imports.
+
+    Raises
+    ------
+    ValueError
+        If there is no such module or file.
+    """
     path = SOURCES.parent / name if name.endswith(".py") else _path(name)
     if path is None or not path.is_file():
         raise ValueError(f"{name}: no such command, module or file")
+    # The syntax tree has neither comments nor formatting.
     tree = ast.parse(path.read_bytes())
     parts = [ast.dump(_without_docstrings(tree))]
     # A package may have tables, which its functions read.
@@ -77,34 +89,30 @@ def _path(module: str) -> Path | None:
 
 def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
     """Yield the modules of the packages that a module imports, and files beside a program."""
-    used = _used_names(tree)
-    for node in ast.walk(tree):
-        # `from a import b` imports the module a.b if there is one, else the module a.
-        if isinstance(node, ast.Import):
-            candidates = [[alias.name] for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names = [a.name for a in node.names if (a.asname or a.name) in used]
-            candidates = [[f"{node.module}.{name}", f"{node.module}"] for name in names]
-        else:
-            continue
-        for modules in candidates:
-            yield from [module for module in modules if _path(module)][:1]
-            file = program_folder and program_folder / f"{modules[-1]}.py"
-            if file and file.is_file():
-                yield str(file.relative_to(SOURCES.parent))
-
-
-def _used_names(tree: ast.Module) -> set[str]:
-    """Return the names that code uses, without those of annotations and decorators."""
-    # Identities of all nodes below annotations of arguments and variables, return types and
-    # decorators.
+    # Nodes below annotations of arguments and variables, return types and decorators: names that
+    # only these use decide no result.
     ignored_nodes = set()
     for node in ast.walk(tree):
         parts = [getattr(node, name, None) for name in ("annotation", "returns")]
         for part in [*parts, *getattr(node, "decorator_list", ())]:
             ignored_nodes |= {id(child) for child in ast.walk(part)} if part else set()
     names = (node for node in ast.walk(tree) if isinstance(node, ast.Name))
-    return {node.id for node in names if id(node) not in ignored_nodes}
+    used_names = {node.id for node in names if id(node) not in ignored_nodes}
+    for node in ast.walk(tree):
+        # `from a import b` imports the module a.b if there is one, else the module a.
+        if isinstance(node, ast.Import):
+            candidates = [[alias.name] for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            imports = [a.name for a in node.names if (a.asname or a.name) in used_names]
+            candidates = [[f"{node.module}.{name}", f"{node.module}"] for name in imports]
+        else:
+            continue
+        # Modules of other packages are passed over; a program may import files beside it.
+        for modules in candidates:
+            yield from [module for module in modules if _path(module)][:1]
+            file = program_folder and program_folder / f"{modules[-1]}.py"
+            if file and file.is_file():
+                yield str(file.relative_to(SOURCES.parent))
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
@@ -136,6 +144,14 @@ def git_commit() -> str:
 
 
 def git(*arguments: str) -> str:
-    """Return the output of git in the folder of the package; CalledProcessError, OSError."""
+    """Return the output of git in the folder of the package.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        If git fails.
+    OSError
+        If there is no git.
+    """
     command = ["git", "-C", str(SOURCES.parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,4 +1,8 @@
-"""Runs as MLflow shows them, read from the files in the results folder."""
+"""Runs as MLflow shows them, read from the files in the results folder.
+
+The results folder goes in, and `Run` come out, which name files, settings and metrics. Nothing
+here knows MLflow's database.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
@@ -20,7 +24,7 @@ from psfdae.files import ProductError, read_product
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
-from psfdae.reading import number, read_csv, read_json, read_yaml
+from psfdae.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.settings import leaves
 from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT, TRAINED
 from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
@@ -164,22 +168,17 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
         for path in evaluations:
             # Every method in the table of errors that leaves files is a run.
             split, reference = path.stem.split("-", 1)
-            key = {"dataset": dataset, "split": split, "reference": reference}
-            figures = _figures(results / "figures" / dataset, split, reference)
-            evaluated = {row["method"] for row in read_csv(path, "method")}
+            evaluated = {*read_table(path, "method").method}
             for kind in registered():
                 if kind.storage and kind.name in evaluated:
-                    runs.append(_run_of_fit(results, kind, key, stars, path, figures))
+                    runs.append(
+                        _run_of_fit(results, kind, (dataset, split, reference), stars, path)
+                    )
     return runs
 
 
 def _run_of_fit(
-    results: Path,
-    kind: type[Method],
-    key: dict[str, str],
-    stars: Path,
-    evaluation: Path,
-    figures: Mapping[str, Path],
+    results: Path, kind: type[Method], key: tuple[str, str, str], stars: Path, evaluation: Path
 ) -> Run:
     """Read a fit to the stars of a dataset, and its evaluation.
 
@@ -190,65 +189,56 @@ def _run_of_fit(
     ----------
     results : Path
     kind : type of Method
-    key : dict of str
+    key : tuple of three str
         Dataset, split and reference of the training.
     stars, evaluation : Path
         Product "stars", and table of errors.
-    figures : mapping of str to Path
-        Figures by their names within the run.
     """
+    dataset, split, reference = key
     # The model must have been trained on the stars of the dataset.
-    model = results / fits.place_of(kind, **key)
+    model = results / fits.place_of(kind, *key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
-    try:
-        experiment = str(product.config["scene"]["experiment"])
-    except (KeyError, TypeError):
-        raise ProductError(f"{stars}: its config has no scene.experiment") from None
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
     # Value and standard error at each noise level, then means over the levels.
+    table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
+    rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
-    columns = ("method", "noise_level", "metric", "value", "stderr")
-    rows = [row for row in read_csv(evaluation, *columns) if row["method"] == kind.name]
-    for row in rows:
-        metric, level = row["metric"], f"{number(evaluation, row['noise_level']):g}"
-        metrics[f"test_{metric}_{level}"] = number(evaluation, row["value"])
-        metrics[f"test_{metric}_stderr_{level}"] = number(evaluation, row["stderr"])
+    for row in rows.to_dict("records"):
+        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
+        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
     for metric in AVERAGED:
-        values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
-        if values:
-            metrics[f"test_{metric}"] = fmean(values)
+        if metric in {*rows.metric}:
+            metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
+    # Figures of the dataset, without those whose name has another split or reference.
+    figures = {}
+    folder = results / "figures" / dataset
+    for path in sorted(folder.rglob("*.png")):
+        name = path.relative_to(folder).as_posix()
+        label = re.match("(random|held_out)(-(realisation|template))?", name)
+        if label is None or label[0] in (split, f"{split}-{reference}"):
+            figures[f"figures/{name}"] = path
     # Methods that are trained in epochs have a history.
-    epochs: Sequence[Mapping[str, float]] = ()
-    if HISTORY in fits.storage_of(kind).diagnostics:
-        epochs = _epochs(fits.path_beside(kind, model, HISTORY), "train_mse", "validation_mse")
-    return replace(
-        _named_after_fit(kind, **key, experiment=experiment),
+    storage = fits.storage_of(kind)
+    history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
+    run_kind = storage.run or kind.name
+    return Run(
+        kind=run_kind,
+        dataset=dataset,
+        split=split,
+        reference=reference,
+        source=fits.place_of(kind, *key),
+        name=" ".join([*key, run_kind]),
+        experiment=from_tree(stars, product.config, "scene", lambda scene: scene["experiment"]),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
         config={**product.config, **settings},
         last_file=fits.outputs(kind, model)[0],
         metrics=metrics,
         data=stars,
         fit=(kind, model) if kind.packing else None,
-        epochs=epochs,
-    )
-
-
-def _named_after_fit(
-    kind: type[Method], dataset: str, split: str, reference: str, experiment: str
-) -> Run:
-    """Return a run with the name of a fit to the stars of a dataset, and nothing else."""
-    run_kind = fits.storage_of(kind).run or kind.name
-    return Run(
-        kind=run_kind,
-        dataset=dataset,
-        split=split,
-        reference=reference,
-        source=fits.place_of(kind, dataset, split, reference),
-        name=" ".join([dataset, split, reference, run_kind]),
-        experiment=experiment,
+        epochs=_epochs(history) if history else (),
     )
 
 
@@ -257,17 +247,6 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
     diagnostics = fits.storage_of(kind).diagnostics
     return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
-
-
-def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:
-    """List figures of a dataset, without those whose path names another split or reference."""
-    figures = {}
-    for path in sorted(folder.rglob("*.png")):
-        name = path.relative_to(folder).as_posix()
-        label = re.match("(random|held_out)(-(realisation|template))?", name)
-        if label is None or label[0] in (split, f"{split}-{reference}"):
-            figures[f"figures/{name}"] = path
-    return figures
 
 
 def runs_of_alignment(results: Path) -> list[Run]:
@@ -281,6 +260,8 @@ def runs_of_alignment(results: Path) -> list[Run]:
     errors = results / "tables/alignment_errors.csv"
     if not errors.is_file():
         raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
+    columns = ("test_set", "noise_level", "method", "parameter", "unit")
+    table = read_table(errors, *columns, "mean_abs_error", "bias", "variance")
     # All networks share the table of errors and the figures of the scene.
     figures = sorted((results / "figures/alignment").glob("*.png"))
     shared = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
@@ -290,20 +271,25 @@ def runs_of_alignment(results: Path) -> list[Run]:
         config = read_yaml(folder / CONFIG)
         config.pop("attempt", None)
         # Errors of the state in units of the range.
-        metrics = {}
-        for row in read_csv(errors, "test_set", "noise_level", "method", "parameter", "unit"):
-            if (row["method"], row["unit"]) == (kind, "range"):
-                level = f"{number(errors, row['noise_level']):g}"
-                for statistic in ("mean_abs_error", "bias", "variance"):
-                    name = f"{row['test_set']}_{row['parameter']}_{statistic}_{level}"
-                    metrics[name] = number(errors, row[statistic])
-        if not metrics:
+        rows = table[(table.method == kind) & (table.unit == "range")]
+        if rows.empty:
             raise ProductError(f"{errors}: no rows of method {kind!r}")
+        metrics = {
+            f"{row['test_set']}_{row['parameter']}_{name}_{row['noise_level']:g}": row[name]
+            for row in rows.to_dict("records")
+            for name in ("mean_abs_error", "bias", "variance")
+        }
         # The set of states on which it was trained.
         states = "grid" if kind == "dae" else ALIGNERS[kind].states
         runs.append(
-            replace(
-                _named_after_network(kind),
+            Run(
+                kind=kind,
+                dataset="alignment",
+                split="uniform and grid",
+                reference="states",
+                source=f"alignment/{kind}",
+                name=f"alignment {kind}",
+                experiment="scene3",
                 files={**_network_files(folder, weights), **shared},
                 config=config,
                 last_file=folder / weights,
@@ -334,15 +320,15 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
     # A row of the summary for each point.
-    rows = list(read_csv(summary, "point", "status"))
-    points = [_run_of_point(results, name, row["point"]) for row in rows]
+    table = read_table(summary, "point", "status", dtype=str)
+    points = [_run_of_point(results, name, point) for point in table.point]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
     paths = [*tables, *sorted((folder / "figures").glob("*.png"))]
     # Metrics of the best point, and numbers of points by their status.
-    best_point, statuses = read_yaml(folder / "best.yaml"), [row["status"] for row in rows]
+    best_point = read_yaml(folder / "best.yaml")
     metrics = {f"best_{key}": value for key, value in best_point.get("metrics", {}).items()}
     for status in ("finished", "stopped", "failed"):
-        metrics[f"points_{status}"] = float(statuses.count(status))
+        metrics[f"points_{status}"] = float((table.status == status).sum())
     parent = Run(
         kind="sweep",
         **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
@@ -399,41 +385,6 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
     )
 
 
-def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
-    """Return the run of a training under way, by its checkpoint's path; None if it has no run.
-
-    Trainings of datasets and of scene 3 have runs.
-    """
-    folder = results / "checkpoints"
-    if not checkpoint.is_relative_to(folder):
-        return None
-    # Either method/dataset/split-reference or alignment-network.
-    *folders, stem = checkpoint.relative_to(folder).with_suffix("").parts
-    network = stem.removeprefix("alignment-")
-    if len(folders) == 2:
-        (kind, dataset), (split, reference) = folders, stem.split("-", 1)
-        experiment = load((f"dataset={dataset}", f"preset={preset}")).scene.experiment
-        run = _named_after_fit(method(kind), dataset, split, reference, experiment)
-    elif network in WEIGHTS and network != stem:
-        run = _named_after_network(network)
-    else:
-        return None
-    return replace(run, status="RUNNING")
-
-
-def _named_after_network(kind: str) -> Run:
-    """Return a run with the name of a network of scene 3, and nothing else."""
-    return Run(
-        kind=kind,
-        dataset="alignment",
-        split="uniform and grid",
-        reference="states",
-        source=f"alignment/{kind}",
-        name=f"alignment {kind}",
-        experiment="scene3",
-    )
-
-
 def settings_of(run: Run, preset: str) -> dict[str, str]:
     """Return the settings that distinguish a run from others, by their dotted names.
 
@@ -464,10 +415,10 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
-    """Read the rows of a training history, which must have these columns."""
-    rows = read_csv(history, "epoch", "seconds", *columns)
-    return [{name: number(history, text) for name, text in row.items()} for row in rows]
+def _epochs(history: Path) -> list[dict[str, float]]:
+    """Read the rows of a training history."""
+    rows = read_table(history, "epoch", "seconds", dtype=float).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
 
 
 def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Metric]:

@@ -1,7 +1,8 @@
 """Tables of runs that open by links in the description of an MLflow experiment.
 
 MLflow stores a view of its table of runs that a user shares as a tag of the experiment, and opens
-it by an address with the tag's name. Views are made here in the same form.
+it by an address with the tag's name. Views are made here in the same form: runs go in, and tags of
+their experiment come out.
 """
 
 from __future__ import annotations
@@ -21,10 +22,20 @@ VIEW = "mlflow.sharedViewState."
 
 
 def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
-    """Set the views of the records of an experiment, and its description if no user wrote one."""
+    """Set the views of the records of an experiment, and its description if no user wrote one.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    experiment : str
+        Id of the experiment.
+    records : sequence of Run
+        Runs that were imported now; views of other datasets stay.
+    """
     description = "mlflow.note.content"  # MLflow's tag
     tags = dict(client.get_experiment(experiment).tags)
     new_tags = {f"{VIEW}{name}": view for name, view in views(records).items()}
+    # A description that is another one than ours is a user's, and stays.
     if tags.get(description) in (None, note(experiment, {*tags})):
         new_tags[description] = note(experiment, {*tags, *new_tags})
     for key, value in new_tags.items():
@@ -34,6 +45,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
 
 def views(records: Sequence[Run]) -> dict[str, str]:
     """Return the views of all runs with a model, and of those of each dataset by its name."""
+    # A sweep itself has no model, and its points are in no view of a dataset.
     with_model = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
     by_name = {"all": _view(with_model, "")} if with_model else {}
     for dataset in dict.fromkeys(r.dataset for r in with_model if r.fit and not r.parent):
@@ -64,6 +76,7 @@ def _view(records: Sequence[Run], condition: str) -> str:
     common = [*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse"]
     metrics = [name for name in common if any(name in r.metrics for r in records)]
     metrics = metrics or list(records[0].metrics)[:8]
+    # Axes of a sweep come first: they are what its points differ in.
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
     columns = [f"params.`{axis}`" for axis in axes] + [f"metrics.`{name}`" for name in metrics]
     state = {

@@ -35,7 +35,7 @@ from photutils.psf import (
 from scipy.spatial import cKDTree
 
 from psfdae import load_model
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput
 from psfdae.model import crowded
 from psfdae_paper.source import git_commit
 
@@ -209,7 +209,7 @@ class TrueField:
 
 def with_truth(stem: str, catalogue: str) -> None:
     """The catalogue of `psfdae photometry --detect` with the true PSF."""
-    observation = Source(Path(f"{stem}.fits"), detect=5.0).open(TrueField.stamp_px)
+    observation = ImageInput(Path(f"{stem}.fits"), detect=5.0).open(TrueField.stamp_px)
     crowded.photometry(TrueField(), observation, 5.0).stars.write(catalogue, overwrite=True)
 
 
@@ -231,7 +231,7 @@ def pipeline(stem: str, catalogue: str, psf: str) -> None:
 def apertures(stem: str, table: str, bundle: str) -> None:
     """Compare aperture corrections with the true ones, at places over the field."""
     model = load_model(bundle)
-    source = Source(Path(f"{stem}.fits"), detect=5.0)
+    source = ImageInput(Path(f"{stem}.fits"), detect=5.0)
     measured = crowded.photometry(model, source.open(model.info.stamp_px), 5.0)
     side = 2 * HALF_PX[1] + 1
     axis = (np.arange(side * INTEGRATED) + 0.5) / INTEGRATED - 0.5 - side // 2

@@ -16,7 +16,7 @@ from scipy.stats import sem
 
 from psfdae.cli import program
 from psfdae.files import atomic_path
-from psfdae.image.observation import central_pixel
+from psfdae.image.stamps import central_pixel
 from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.rng import stream

@@ -2,10 +2,7 @@
 
 SECTIONS = {
     "Your images": ("from-stars", "predict", "photometry", "exposure", "psf"),
-    "Models": ("describe", "export"),
+    "Models": ("describe",),
     "Telescopes": ("wavefront",),
 }
 """Headings of `psfdae --help` with the commands below each."""
-
-REQUIRED = {"export": "torch"}
-"""Modules of an extra without which a command cannot run, and is not listed."""

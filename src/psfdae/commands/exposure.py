@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 from psfdae.cli import command
-from psfdae.commands.predict import ImageOptions, check_targets
+from psfdae.commands.predict import check_targets
+from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.model.bundle import SUFFIX
-from psfdae.model.field_psfs import PredictionError
 from psfdae.model.psf_model import load_model
 from psfdae.options import File
 
@@ -15,7 +15,7 @@ from psfdae.options import File
 @command("exposure")
 def exposure(
     image: Annotated[File, {"argument": True}],
-    options: ImageOptions,
+    options: ImageStatements,
     overwrite: Annotated[bool, "Replace a file that exists."] = False,
     *,
     model: Annotated[File, "Bundle of from-stars --method field, of another exposure."],
@@ -26,10 +26,8 @@ def exposure(
     The stars of IMAGE show how its PSF differs from that of MODEL; ten may be enough.
     """
     # Refuse wrong options and files that exist before anything is computed.
-    source = options.source(image)
+    source = ImageInput(image, **vars(options))
     check_targets((*source.files(), model), out, overwrite=overwrite)
-    if options.all_extensions:
-        raise PredictionError(f"{image}: exposure takes one image, not --all-extensions")
     loaded = load_model(model)
 
     from psfdae.model.exposures import exposure as adapt_to_exposure

@@ -7,14 +7,13 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae import fits
-from psfdae.cli import command
+from psfdae.cli import command, typed_words
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
-from psfdae.commands.predict import ImageOptions, write_list
+from psfdae.commands.predict import write_list
 from psfdae.errors import Error
 from psfdae.files import (
     atomic_path,
@@ -25,7 +24,7 @@ from psfdae.files import (
     write_text,
 )
 from psfdae.image.errors import ObservationError
-from psfdae.image.observation import Source
+from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
 from psfdae.method import Method, facts_of
 from psfdae.methods import method
@@ -102,8 +101,8 @@ class ModelFiles:
 
     def paths(self) -> list[Path]:
         """Return the paths of all files but the star lists and the page."""
-        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
-        paths = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
+        names = ("selection.csv", "overrides.txt", "report.csv", "found.csv", "report.png")
+        paths = [self.path / name for name in names]
         for method_class in self.methods:
             paths += fits.outputs(method_class, self.fit(method_class))
         return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
@@ -111,9 +110,12 @@ class ModelFiles:
 
 @command("from-stars", SettingsReader())
 def from_stars(
-    config: Settings,
+    config: Settings | Mapping[str, Any],
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
-    options: ImageOptions,
+    options: ImageStatements,
+    all_extensions: Annotated[
+        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
+    ] = False,
     name: Annotated[str | None, "Name of the model.  [default: the image's; all]"] = None,
     licence: Annotated[str, "Licence of the model."] = "not stated",
     method_name: Annotated[
@@ -135,7 +137,7 @@ def from_stars(
     stamp_px: Annotated[
         int | None, "Side of the stamps, even.  [default: 16, more if stars are larger]"
     ] = None,
-) -> None:
+) -> str:
     """Train a model on the bright stars of IMAGE.
 
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
@@ -143,92 +145,55 @@ def from_stars(
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
     # The three options of the selection are settings of the configuration by shorter names.
+    job = dict(locals())
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
-    config = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
-    job = {key: value for key, value in locals().items() if key in signature(train).parameters}
-    stem = _model_name(image, name)
-    if not options.all_extensions:
-        print(train(**job))
-    elif len(image) > 1:
+    settings = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
+    stem, sentence = _model_name(image, name), ""
+    if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
-    else:
-        # Each image of the file gets a model in a folder of its own, by a process of its own.
+    if all_extensions:
+        # Each image of the file gets a model in a folder of its own, by a process of its own, which
+        # receives the settings as a tree.
         jobs = {
             extension: {
                 **job,
-                "config": config.model_dump(),
+                "config": settings.model_dump(),
                 "options": image_options,
+                "all_extensions": False,
                 "name": f"{stem}_{extension}",
                 "out": out / extension,
                 "page": path_of_image(page, extension),
             }
             for extension, image_options in options_by_image(image[0], options).items()
         }
-        run_for_images(train, jobs, image[0])
+        run_for_images(from_stars, jobs, image[0])
+    else:
+        sources = ImageInput(image[0], **vars(options)).of_each(image)
+        exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
+        if exposures and method_name is None and "field" in settings.methods:
+            # Validation stars would judge the field of all exposures, but each gets its own.
+            method_name = "field"
+        settings, methods, candidates = _methods(settings, method_name)
+        files = ModelFiles(out, stem, methods, exposures)
+        with _folder(files, sources, page, overwrite):
+            sentence = _write_model(settings, sources, files, licence, candidates, page)
+        print(sentence)
     # The command that applies the model to all stars of the image, or of the first exposure. A
     # list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
     if several and options.catalogue:
         options = replace(options, on_image=True)
     stem = _model_name(image[:1], None if several else name)
-    model = out if several or options.all_extensions else ModelFiles(out, stem, ()).bundle
-    outputs = ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
-    words = ["psfdae", "predict", str(image[0]), *options.words(), *outputs]
+    model = out if several or all_extensions else ModelFiles(out, stem, ()).bundle
+    words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
+    words += ["--all-extensions"] * all_extensions
+    words += ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
     print(f"next: {shlex.join(words)}")
-
-
-def train(
-    config: Settings | Mapping[str, Any],
-    image: tuple[Path, ...],
-    options: ImageOptions,
-    name: str | None,
-    licence: str,
-    method_name: str | None,
-    out: Path,
-    page: Path | None,
-    overwrite: bool,
-) -> str:
-    """Train a model on the stars of one image, or of exposures; return how good it is.
-
-    Parameters are those of `from_stars`; `config` may also be its tree, which another process
-    receives.
-
-    Returns
-    -------
-    str
-        A sentence on the error of the model.
-
-    Raises
-    ------
-    FolderError
-        If the folder holds a model, or another process works there.
-    ConfigError
-        If no method of the list makes models.
-    """
-    sources, settings = options.source(image[0]).of_each(image), of_config(config)
-    exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
-    if exposures and method_name is None and "field" in settings.methods:
-        # Validation stars would judge the field that all exposures share, but each gets its own.
-        method_name = "field"
-    settings, methods, candidates = _methods(settings, method_name)
-    files = ModelFiles(out, _model_name(image, name), methods, exposures)
-    # Refuse outputs that are inputs or exist, before anything is computed.
-    if files.name in exposures:
-        raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
-    lists = [files.star_list(source.name) for source in sources] if options.detect else []
-    inputs = [path for source in sources for path in source.files()]
-    check_outputs([*files.paths(), *lists, page], inputs)
-    if page is not None and page.exists() and not overwrite:
-        raise FolderError(f"{page}: exists already; --overwrite replaces it")
-    with _locked(out):
-        bundles = sorted(out.glob(f"*{SUFFIX}"))
-        if bundles and not overwrite:
-            raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
-        return _write_model(settings, sources, files, licence, candidates, page)
+    return sentence
 
 
 def _methods(
@@ -274,7 +239,7 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
     FolderError
         If no file can have such a name.
     """
-    name = name or (ALL if len(image) > 1 else Source(image[0]).name)
+    name = name or (ALL if len(image) > 1 else ImageInput(image[0]).name)
     # Linux allows 255 bytes in the name of a file.
     longest = 255 - len(SUFFIX)
     if "/" in name or len(name.encode()) > longest:
@@ -283,6 +248,31 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
             "folder"
         )
     return name
+
+
+@contextmanager
+def _folder(
+    files: ModelFiles, sources: Sequence[ImageInput], page: Path | None, overwrite: bool
+) -> Iterator[None]:
+    """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
+
+    Raises
+    ------
+    OutputError, FolderError
+        If a path is an input, the folder holds a model, or another process works there.
+    """
+    if files.name in files.exposures:
+        raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
+    lists = [files.star_list(source.name) for source in sources if source.detect]
+    inputs = [path for source in sources for path in source.files()]
+    check_outputs([*files.paths(), *lists, page], inputs)
+    if page is not None and page.exists() and not overwrite:
+        raise FolderError(f"{page}: exists already; --overwrite replaces it")
+    with _locked(files.path):
+        bundles = sorted(files.path.glob(f"*{SUFFIX}"))
+        if bundles and not overwrite:
+            raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
+        yield
 
 
 @contextmanager
@@ -299,30 +289,22 @@ def _locked(folder: Path) -> Iterator[None]:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / ".from_stars.lock"
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with path.open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # A process that has just ended may have removed the file that is open here, and
-                # a third one may have made it anew: then this lock protects nothing.
-                holds_lock = os.path.samestat(os.fstat(lock.fileno()), path.stat())
-            except (BlockingIOError, FileNotFoundError):
-                holds_lock = False
-            if not holds_lock:
-                raise FolderError(f"{folder}: another psfdae from-stars works there")
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderError(f"{folder}: another psfdae from-stars works there") from None
+        yield
     finally:
+        os.close(descriptor)
         with suppress(OSError):
             folder.rmdir()
 
 
 def _write_model(
     settings: Settings,
-    sources: list[Source],
+    sources: list[ImageInput],
     files: ModelFiles,
     licence: str,
     candidates: list[type[Method]],
@@ -339,7 +321,7 @@ def _write_model(
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
     for image_stars in stars.images:
-        if image_stars.observation.found is not None:
+        if image_stars.observation.detections is not None:
             write_list(image_stars.observation, files.star_list(image_stars.name))
     write_table(files.path / "selection.csv", stars.table)
     write_product(files.stars, "stars", stars.columns, stars.described())
@@ -380,8 +362,6 @@ def _write_model(
         # Stars that no fit has seen, degraded to low S/N, test the model.
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
-        write_columns(files.path / "evaluation.csv", report.evaluation.columns)
-        write_columns(files.path / "per_star.csv", report.per_star.columns)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.found.columns, digits=6)
         write_bytes(files.path / "report.png", report.strip_png)

@@ -15,22 +15,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.cli import REFUSABLE, refusal
+from psfdae.cli import refusal
 from psfdae.errors import Error
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.image.observation import require_sky
+from psfdae.image.positions import require_sky
 from psfdae.threads import available_cores
 
 if TYPE_CHECKING:
-    from psfdae.commands.predict import ImageOptions
+    from psfdae.image.image_input import ImageStatements
 
 
 class MosaicError(Error, RuntimeError):
     """Failure for some images of a file; the others are done."""
 
 
-def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOptions]:
+def options_by_image(path: Path, options: ImageStatements) -> dict[str, ImageStatements]:
     """Return the options of each image of a file by the image's name (`science_images`).
 
     A star list is that of all images: each image takes the stars that are on it.
@@ -48,7 +48,7 @@ def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOption
         raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
     if options.catalogue is not None:
         require_sky(options.catalogue, "--all-extensions")
-    one_image = replace(options, all_extensions=False, on_image=options.catalogue is not None)
+    one_image = replace(options, on_image=options.catalogue is not None)
     return {name: replace(one_image, extension=n) for name, n in science_images(path).items()}
 
 
@@ -113,7 +113,7 @@ def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool
     with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:
             return True, work(**job)
-        except REFUSABLE as error:
+        except Exception as error:
             message = refusal(error)
             if message is None:
                 raise

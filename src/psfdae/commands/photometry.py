@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.commands.predict import ImageOptions, check_targets
+from psfdae.commands.predict import check_targets
 from psfdae.errors import Error
 from psfdae.files import write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
-from psfdae.image.observation import list_offset
+from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.image.tables import SUFFIXES, star_table, write_table
 from psfdae.model.exchange import load_field
@@ -36,7 +37,7 @@ class PhotometryError(Error, ValueError):
 @command("photometry")
 def photometry(
     image: Annotated[File, {"argument": True}],
-    options: ImageOptions,
+    options: ImageStatements,
     zero_point: Annotated[float | None, "Magnitude of a flux of 1."] = None,
     reference: Annotated[File | None, "Star list with magnitudes, which give it."] = None,
     magnitude_column: Annotated[str, "Column of --reference with the magnitudes."] = "mag",
@@ -59,10 +60,9 @@ def photometry(
         raise PhotometryError("--zero-point takes a number, or --reference gives it")
     # With --detect, no list of the image needs an origin: --origin is that of the reference.
     origin_of_reference = reference is not None and options.detect
-    source = (replace(options, origin=None) if origin_of_reference else options).source(image)
+    source = ImageInput(image, **vars(options))
+    source = replace(source, origin=None) if origin_of_reference else source
     check_targets((*source.files(), reference, model), out, residual, overwrite=overwrite)
-    if options.all_extensions:
-        raise PhotometryError(f"{image}: photometry takes one image, not --all-extensions")
     if options.colour_column:
         raise PhotometryError(
             f"{image}: all stars get the PSF of the usual one: no --colour-column"
@@ -78,8 +78,8 @@ def photometry(
     # Read the stars of the reference before the long work, in case they cannot be used.
     magnitudes = None
     if reference is not None:
-        reference_options = replace(options, catalogue=reference, detect=False, on_image=False)
-        positions = reference_options.source(image).open(loaded.stamp_px).positions
+        listed = replace(source, catalogue=reference, origin=options.origin, detect=False)
+        positions = replace(listed, on_image=False).open(loaded.stamp_px).positions
         assert positions is not None  # of an image
         magnitudes = positions, as_catalogue(reference).numbers(magnitude_column)
 
@@ -105,8 +105,8 @@ def photometry(
         from astropy.io import fits
 
         write_fits(residual, fits.PrimaryHDU(measured.residual.astype(np.float32)))
-    summary = _summary(measured, out, options.detect)
-    print(*filter(None, [observation.said(), list_note, *summary]), sep="\n")
+    summary = _summary(measured, out, bool(options.detect))
+    print(*filter(None, [observation.summary(), list_note, *summary]), sep="\n")
 
 
 def _measure(
@@ -126,7 +126,7 @@ def _measure(
     # A row without a position cannot be fitted, and one of a star that is listed twice has no
     # light of its own: measure the others, and add flagged rows for these.
     unusable = observation.without_position() | observation.listed_again()
-    usable = observation.of(~unusable) if unusable.any() else observation
+    usable = observation.select(~unusable) if unusable.any() else observation
     measured = crowded_photometry(model, usable, threshold)
     if unusable.any():
         measured = replace(measured, stars=_with_rows(measured.stars, observation, unusable))
@@ -139,6 +139,7 @@ def _measure(
 
 def _summary(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str]:
     """Return lines on the number of stars, the light that fluxes contain, and their bias."""
+    # Stars with a flux, and how much of it the model of the PSF does not have.
     measured_count = int(np.isfinite(measured.stars["flux"]).sum())
     lines = [f"{out}: {len(measured.stars)} stars, {measured_count} measured"]
     if measured.wings is None:
@@ -173,6 +174,7 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
     from astropy.table import Table
 
     assert observation.positions is not None
+    # Each column with 0 or NaN in the rows that were not measured.
     rows = Table()
     for name in stars.colnames:
         measured = np.array(stars[name])
@@ -181,9 +183,10 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
             column[:] = np.nan
         column[~unusable] = measured
         rows[name] = column
-    rows["id"] = observation.identifiers
+    # What the list says of these stars.
+    rows["id"] = observation.stars.id
     rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
-    rows["flags"] |= observation.list_flags
+    rows["flags"] |= observation.stars.flags
     raise_flag(rows["flags"], StarFlag.NO_FLUX, unusable)
     return rows
 
@@ -252,6 +255,7 @@ def photometry_table(
     zero_point : float, optional
         Magnitude of a flux of 1; without it there are no magnitudes.
     """
+    # Columns of the fit; magnitudes if the zero point is known, and places on the sky.
     columns = {name: np.array(measured.stars[name]) for name in measured.stars.colnames}
     columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
     with np.errstate(all="ignore"):

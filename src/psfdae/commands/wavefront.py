@@ -13,11 +13,14 @@ import click
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.commands.predict import ImageOptions, check_targets, write_list
+from psfdae.commands.predict import check_targets, write_list
 from psfdae.figures import write_png
 from psfdae.files import write_fits
 from psfdae.image.catalogue import as_catalogue
-from psfdae.image.observation import Observation, central_pixel, list_offset
+from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.observation import Observation
+from psfdae.image.positions import list_offset
+from psfdae.image.stamps import central_pixel
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.options import File
 from psfdae.sensing.output import report_lines, wavefront_hdus
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 @command("wavefront")
 def wavefront(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
-    options: ImageOptions,
+    options: ImageStatements,
     telescope: Annotated[File, "YAML file of the telescope, as in config/telescope."],
     stamp_px: Annotated[int, click.IntRange(8, 64), "Side of the stamps."] = 16,
     axis: Annotated[
@@ -55,11 +58,9 @@ def wavefront(
     Two modes of a star are two wavefronts that its image does not tell apart.
     """
     # Refuse options that do not fit together, and outputs that exist.
-    if options.all_extensions:
-        raise SensingError("psfdae wavefront takes one image: name it with --extension")
     if options.colour_column:
         raise SensingError("psfdae wavefront takes light of one colour: no --colour-column")
-    source = options.source(stars)
+    source = ImageInput(stars, **vars(options))
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
     check_targets((*source.files(), telescope), out, plot, list_path, overwrite=overwrite)
     optics = read_telescope(telescope)
@@ -69,7 +70,7 @@ def wavefront(
     # All stars are one piece: the joint fit takes them together.
     stamps = next(observation.chunks(observation.count))
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
-    lines = [observation.said(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
+    lines = [observation.summary(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
     if list_path is not None:
         write_list(observation, list_path)
     if plot is not None:

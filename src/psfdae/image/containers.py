@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from astropy.io import fits
     from astropy.nddata import NDData
     from astropy.units import Quantity
-    from astropy.wcs import WCS
 
     Image: TypeAlias = (
         str | Path | np.ndarray | NDData | fits.HDUList | fits.PrimaryHDU | fits.ImageHDU
@@ -55,6 +54,7 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
         return Path(image) if isinstance(image, str) else image
     name = Path(type(image).__name__)
     if isinstance(image, np.ndarray):
+        # An array without mask and unit needs no file.
         data, mask, unit = parts_of_array(image)
         if mask is None and not unit:
             return data
@@ -63,6 +63,7 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
     if isinstance(image, fits.HDUList):
         return _written(Path(image.filename() or name), lambda: image)
     if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
+        # An extension stands behind a primary one.
         first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
         return _written(name, lambda: fits.HDUList([*first, image.copy()]))
     if not isinstance(image, NDData):
@@ -92,6 +93,7 @@ def sigma_of(data: NDData) -> np.ndarray | None:
 
     if data.uncertainty is None:
         return None
+    # The uncertainty may be a variance, and in another unit than the data.
     sigma = data.uncertainty.represent_as(StdDevUncertainty)
     values = sigma.array
     if sigma.unit is not None and data.unit is not None and sigma.unit != data.unit:
@@ -122,6 +124,7 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
 
     if not isinstance(value, u.Quantity):
         return value
+    # Counts, adu and DN are not converted into each other, so the first unit that fits is taken.
     for unit in units.split():
         try:
             return float(value.to_value(u.Unit(unit)))
@@ -134,6 +137,7 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
 def _of_nddata(data: NDData) -> fits.HDUList:
     """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS."""
     from astropy.io import fits
+    from astropy.wcs import WCS
 
     header = fits.Header()
     for key, value in data.meta.items():
@@ -146,20 +150,13 @@ def _of_nddata(data: NDData) -> fits.HDUList:
     if unit := fits_unit(data.unit):
         header["BUNIT"] = unit
     hdus = _hdus(np.asarray(data.data), header, data.mask, sigma_of(data))
-    wcs = None if data.wcs is None else _fits_wcs(data.wcs)
-    if wcs is not None:
+    # A WCS of another kind than FITS has is left out.
+    wcs = getattr(data.wcs, "low_level_wcs", data.wcs)
+    if isinstance(wcs, WCS):
         first, *tables = wcs.to_fits(relax=True)
         hdus[0].header.update(first.header)
         hdus += tables
     return hdus
-
-
-def _fits_wcs(wcs: Any) -> WCS | None:
-    """Return the WCS of FITS that an NDData holds, None if it is of another kind."""
-    from astropy.wcs import WCS
-
-    low_level = getattr(wcs, "low_level_wcs", wcs)
-    return low_level if isinstance(low_level, WCS) else None
 
 
 def fits_unit(unit: Any) -> str:
@@ -191,7 +188,9 @@ def _hdus(
 
 
 def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
+    """Return a temporary file with an image, which is called `name` in messages."""
     content = io.BytesIO()
     with reading(name):
         hdus().writeto(content, output_verify="silentfix+ignore")
-    return temporary_file(name, content.getvalue())
+    content.seek(0)
+    return temporary_file(name, content)

@@ -13,43 +13,37 @@ import numpy as np
 
 from psfdae.errors import Error
 
-LONGEST = 160
-"""Characters of a library's message that are passed on."""
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""First characters of what a spreadsheet takes for a formula and executes."""
-
 
 def one_line(text: object) -> str:
-    """The text without line breaks and characters that do not print."""
+    """Return the text without line breaks and characters that do not print."""
     words = " ".join(str(text).split())
     return "".join(c if c.isprintable() else "?" for c in words)
 
 
 def ascii_line(text: object) -> str:
-    """A text in the characters that FITS headers hold, others as question marks."""
+    """Return a text in the characters that FITS headers hold, others as question marks."""
     return one_line(text).encode("ascii", "replace").decode()
 
 
 def no_formula(text: str) -> str:
-    """The text, with an apostrophe before it if a spreadsheet would execute it; numbers stay."""
-    if not text.startswith(FORMULA):
+    """Return the text, with an apostrophe before it if a spreadsheet would execute it."""
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
         return text
     try:
-        float(text)
+        float(text)  # numbers stay
     except ValueError:
         return "'" + text
     return text
 
 
 def shorten(names: list[str], length_max: int = 20) -> str:
-    """A list of names for a message, cut after `most`."""
+    """Return a list of names for a message, cut after `length_max` of them."""
     ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""
     return ", ".join(name[:40] for name in names[:length_max]) + ellipsis if names else "none"
 
 
 class ObservationError(Error, ValueError):
-    """An input file cannot be used; one line that names the file."""
+    """Input file that cannot be used; one line that names the file."""
 
     def __init__(self, path: str | Path, problem: str) -> None:
         super().__init__(one_line(f"{path}: {problem}"))
@@ -89,6 +83,7 @@ def reading(path: str | Path) -> Iterator[None]:
     with silent():
         try:
             yield
+        # Refusals of our own pass; those of the operating system get plain words.
         except ObservationError:
             raise
         except FileNotFoundError:
@@ -102,7 +97,8 @@ def reading(path: str | Path) -> Iterator[None]:
         except Exception as error:
             if _is_bug(error):
                 raise
-            problem = one_line(error)[:LONGEST] or type(error).__name__
+            # The start of the library's message, which may be long, or the kind of error.
+            problem = one_line(error)[:160] or type(error).__name__
             raise ObservationError(path, f"damaged or of a wrong format ({problem})") from error
 
 
@@ -117,5 +113,6 @@ def _is_bug(error: Exception) -> bool:
         return True
     if not isinstance(error, TypeError | AttributeError | LookupError | AssertionError):
         return False
+    # The module of the line that raised it.
     *_, (frame, _) = walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__", "")).partition(".")[0] == "psfdae"

@@ -19,8 +19,8 @@ import numpy as np
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
 from psfdae.image.interpolation import interpolated_stamps
-from psfdae.image.observation import Observation, central_pixel
-from psfdae.image.stamps import Stamps, StarFlag, cut, sky_around
+from psfdae.image.observation import Observation
+from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut, sky_around
 from psfdae.image.star_criteria import (
     brightest_pixels,
     crowded,

@@ -1,4 +1,8 @@
-"""Stamps of stars: the container, what may be said against a star, its border and its centre."""
+"""Stamps of stars: the container, flags of stars, and how stamps are cut, measured and centred.
+
+A stamp is a square of pixels about a star, sky included. Positions in an image go in where stamps
+are cut; sky, scatter and displacement of each stamp come out.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +10,66 @@ import warnings
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import cache
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from psfdae.moments import FWHM_OF_SIGMA
 
+if TYPE_CHECKING:
+    from psfdae.image.fits_file import Pixels
+
 
 @dataclass(frozen=True)
 class Stamps:
-    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars."""
+    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars.
 
-    data: np.ndarray  # (n, s, s), counts, sky included; 0 where not finite or off the image
-    bad: np.ndarray  # (n, s, s), masked pixels, and those that `data` does not show
-    saturated: np.ndarray  # (n, s, s)
-    flags: (
-        np.ndarray
-    )  # (n,), uint16, `StarFlag`s of the list; TRUNCATED: off the image, margin aside
-    id: np.ndarray  # (n,), int64 or str
-    x: np.ndarray  # (n,), position in the image, 0-based pixel centres; NaN where unknown
+    Attributes
+    ----------
+    data : ndarray, shape (n, s, s)
+        Counts, sky included; 0 where not finite or off the image.
+    bad, saturated : ndarray of bool, shape (n, s, s)
+        Masked pixels, and those that `data` does not show; pixels at the saturation.
+    flags : ndarray of uint16, shape (n,)
+        `StarFlag`s of the list; TRUNCATED: off the image, margin aside.
+    id : ndarray of int64 or str, shape (n,)
+    x, y : ndarray, shape (n,)
+        Position in the image, 0-based pixel centres.
+    flux, background, noise : ndarray, shape (n,)
+        Flux inside the stamp, sky level, and RMS of the sky in a pixel; NaN where they are to be
+        estimated.
+    gain : ndarray, shape (n,)
+        Electrons per unit of the stamps.
+    magnitude : ndarray, shape (n,)
+        Magnitude for which the PSF is asked; NaN for that of the flux that is estimated.
+    colour : ndarray, shape (n,)
+        By the list, such as g − r.
+    listed : ndarray, shape (n, 2)
+        Centre (row, column) from index s//2 by the list.
+
+    All are NaN where unknown.
+    """
+
+    data: np.ndarray
+    bad: np.ndarray
+    saturated: np.ndarray
+    flags: np.ndarray
+    id: np.ndarray
+    x: np.ndarray
     y: np.ndarray
-    flux: np.ndarray  # (n,), inside the stamp; NaN where it is to be estimated
-    background: np.ndarray  # (n,), sky level, likewise
-    noise: np.ndarray  # (n,), RMS of the sky in a pixel, likewise
-    gain: np.ndarray  # (n,), electrons per unit of the stamps; NaN where unknown
-    magnitude: np.ndarray  # (n,), for which the PSF is asked; NaN: that of the flux that is found
-    colour: np.ndarray  # (n,), by the list, such as g − r; NaN where unknown
-    # (n, 2), centre (row, column) from index s//2 that a list says; NaN where unknown
+    flux: np.ndarray
+    background: np.ndarray
+    noise: np.ndarray
+    gain: np.ndarray
+    magnitude: np.ndarray
+    colour: np.ndarray
     listed: np.ndarray
 
     def __len__(self) -> int:
         return len(self.data)
 
     def part(self, rows: slice) -> Stamps:
-        """A part of the stars."""
+        """Return some of the stars."""
         return Stamps(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
@@ -53,59 +84,112 @@ class StarFlag(IntFlag):
     True
     """
 
-    MASKED = 1
-    OUTLIER = 2
-    FAINT = 4
-    NO_FLUX = 8
-    SATURATED = 16
-    TRUNCATED = 32
-    SNR_LOW = 64
-    SNR_HIGH = 128
-    OFF_CENTRE = 256
-    UNLIKE_TRAINING = 512
-    BLENDED = 1024
-    SKY_OFF = 2048
-    POOR_FIT = 4096
-    BEYOND = 8192
-    SHARP = 16384
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str = "") -> Self:
+        """Make a flag with a line that says what it means."""
+        flag = int.__new__(cls, value)
+        flag._value_ = value
+        flag.meaning = meaning
+        return flag
+
+    MASKED = 1, "pixels that are masked, not finite or off the image; replaced"
+    OUTLIER = 2, "pixels that no star of the training set can have; replaced"
+    FAINT = 4, "flux below three times its error"
+    NO_FLUX = 8, "no usable flux: PSF, residual and uncertainty are NaN"
+    SATURATED = 16, "saturated pixels, replaced; or the star list says so"
+    TRUNCATED = 32, "part of the stamp is off the image; or the star list says so"
+    SNR_LOW = 64, "S/N less than 1/1.25 of the least that the training had"
+    SNR_HIGH = 128, "S/N over 1.25 times the largest of the training; not of field models"
+    OFF_CENTRE = (
+        256,
+        "brightest pixel farther from the centre than the stamp could be moved; in "
+        "photometry, the fit moved the star by half a FWHM and three errors of its place",
+    )
+    UNLIKE_TRAINING = 512, "farther from the training set than 99.9 % of its test stars"
+    BLENDED = (
+        1024,
+        "the star list says that it was parted from a neighbour; in photometry, a star is "
+        "nearer than one FWHM",
+    )
+    SKY_OFF = 2048, "the sky that was given is over 5 sigma off the border of the stamp"
+    POOR_FIT = 4096, "chi2 above 10: the residual is far above the noise; or a fit did not end"
+    BEYOND = (
+        8192,
+        "brighter, fainter or of another colour than all stars of the training, where the "
+        "PSF changes with that",
+    )
+    SHARP = 16384, "a cosmic ray or hot pixel within 1 px of its position: perhaps no star"
 
 
-MEANING: dict[StarFlag, str] = {
-    StarFlag.MASKED: "pixels that are masked, not finite or off the image; replaced",
-    StarFlag.OUTLIER: "pixels that no star of the training set can have; replaced",
-    StarFlag.FAINT: "flux below three times its error",
-    StarFlag.NO_FLUX: "no usable flux: PSF, residual and uncertainty are NaN",
-    StarFlag.SATURATED: "saturated pixels, replaced; or the star list says so",
-    StarFlag.TRUNCATED: "part of the stamp is off the image; or the star list says so",
-    StarFlag.SNR_LOW: "S/N less than 1/1.25 of the least that the training had",
-    StarFlag.SNR_HIGH: "S/N over 1.25 times the largest of the training; not of field models",
-    StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved; "
-    "in photometry, the fit moved the star by half a FWHM and three errors of its place",
-    StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
-    StarFlag.BLENDED: "the star list says that it was parted from a neighbour; in photometry, a "
-    "star is nearer than one FWHM",
-    StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
-    StarFlag.POOR_FIT: "chi2 above 10: the residual is far above the noise; or a fit did not end",
-    StarFlag.BEYOND: "brighter, fainter or of another colour than all stars of the training, where "
-    "the PSF changes with that",
-    StarFlag.SHARP: "a cosmic ray or hot pixel within 1 px of its position: perhaps no star",
-}
-"""One line for every flag."""
-
-
-def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray | np.bool) -> None:
+def raise_flag(flags: np.ndarray, flag: StarFlag, stars: np.ndarray | np.bool) -> None:
     """Add a flag to some stars of `flags`, shape (n,), uint16."""
-    flags[where] |= np.uint16(flag)
+    flags[stars] |= np.uint16(flag)
+
+
+# Cutting stamps out of an image.
+
+LARGEST_POSITION_PX = 2**30
+"""Positions are clipped to ± this many pixels, far off any image."""
+
+
+def central_pixel(position: np.ndarray) -> np.ndarray:
+    """Return the pixel in which a 0-based position lies, int64; one far off the image for NaN.
+
+    Pixel k covers k − ½ ≤ position < k + ½.
+    """
+    far = LARGEST_POSITION_PX
+    rounded = np.floor(np.nan_to_num(position, nan=-far, posinf=far, neginf=-far) + 0.5)
+    return np.asarray(np.clip(rounded, -far, far), np.int64)
+
+
+def cut_image(
+    pixels: Pixels | np.ndarray,
+    shape: tuple[int, ...],
+    x: np.ndarray,
+    y: np.ndarray,
+    stamp_px: int,
+    margin: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a stamp around each star, with the star's pixel at index d//2 + margin.
+
+    Parameters
+    ----------
+    pixels : array-like of that shape, indexed once with arrays of rows and columns
+    x, y : ndarray, shape (n,)
+        0-based positions; NaN is off the image.
+    stamp_px, margin : int
+        d, and pixels added on every side.
+
+    Returns
+    -------
+    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin), 0 off the image
+    inside : ndarray of bool, the same shape: the pixel is on the image
+    truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
+    """
+    side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
+    rows = central_pixel(y)[:, None] + side
+    columns = central_pixel(x)[:, None] + side
+    row_inside: np.ndarray = (rows >= 0) & (rows < shape[0])
+    column_inside: np.ndarray = (columns >= 0) & (columns < shape[1])
+    # Pixels off the image are those at its edge first, and 0 then.
+    stamps: np.ndarray = pixels[
+        np.clip(rows, 0, shape[0] - 1)[:, :, None], np.clip(columns, 0, shape[1] - 1)[:, None, :]
+    ]
+    inside = row_inside[:, :, None] & column_inside[:, None, :]
+    if not inside.all():
+        stamps = np.where(inside, stamps, 0)
+    stamp = slice(margin, margin + stamp_px)
+    is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
+    return stamps, inside, np.asarray(~is_whole)
 
 
 # The border and what is around it: where there is most sky and least star.
 
-SKY_CLIP = 3.0  # pixels of the sky this many σ off their median belong to other stars
-
 
 @cache
 def border_pixels(side: int) -> np.ndarray:
-    """Flat indices of the ring at the edge of a stamp, an eighth of its side wide."""
+    """Return the flat indices of the ring at the edge of a stamp, an eighth of its side wide."""
     width = max(1, side // 8)
     border = np.ones((side, side), dtype=bool)
     border[width:-width, width:-width] = False
@@ -113,13 +197,17 @@ def border_pixels(side: int) -> np.ndarray:
 
 
 def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Median of the good pixels in the border of every stamp (n, s, s), shape (n,), float64.
+    """Return the median of the good pixels in the border of every stamp (n, s, s).
 
-    Of all good pixels where the border has none; 0 where no pixel is good.
+    Returns
+    -------
+    ndarray, shape (n,), float64
+        Median of all good pixels where the border has none; 0 where no pixel is good.
     """
     size = (len(stamps), stamps.shape[-1] ** 2)
     flat, hidden = stamps.reshape(size), bad.reshape(size)
     ring = border_pixels(stamps.shape[-1])
+    # All stamps at once, then those with bad pixels one by one.
     median = np.median(flat[:, ring], axis=1).astype(np.float64)
     for star in np.flatnonzero(hidden.any(axis=1)):
         good = flat[star, ring][~hidden[star, ring]]
@@ -129,10 +217,19 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
 
 
 def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
-    """σ of the pixels in the border of every stamp from their median deviation, (n,).
+    """Return σ of the pixels in the border of every stamp from their median deviation.
 
-    Light of the star in the border is in it. Pixels that are `bad` (n, s, s) are left out, unless
-    all are.
+    Light of the star in the border is in it.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, s, s)
+    bad : ndarray of bool, shape (n, s, s), optional
+        Pixels that are left out, unless all are bad.
+
+    Returns
+    -------
+    ndarray, shape (n,)
     """
     from astropy.stats import mad_std
 
@@ -148,10 +245,10 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
 
 
 def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median and scatter of the pixels outside the stamps, other stars clipped.
+    """Return median and scatter of the pixels outside the stamps, other stars clipped.
 
-    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
-    the stamp itself; light of the star in them counts as sky then.
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of the stamp itself;
+    light of the star in them counts as sky then.
 
     Parameters
     ----------
@@ -168,44 +265,45 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     """
     from astropy.stats import sigma_clipped_stats
 
+    # The ring around the stamp.
     side = window.shape[-1]
     hole_px = stamp_px if side >= stamp_px + 4 else side - 4
     start = side // 2 - hole_px // 2
     ring = np.ones((side, side), dtype=bool)
     ring[start : start + hole_px, start : start + hole_px] = False
+    # Pixels of the ring more than 3 σ off their median belong to other stars.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
         _, level, noise = sigma_clipped_stats(
             window[:, ring],
             mask=bad[:, ring],
-            sigma=SKY_CLIP,
+            sigma=3.0,
             cenfunc="median",
             stdfunc="mad_std",
             axis=1,
         )
-    # Where no pixel counts in any stamp, both are one masked value.
-    statistics = np.nan_to_num(np.stack([np.ma.filled(a, np.nan) for a in (level, noise)])).astype(
-        float
-    )
+    # Where no pixel counts in any stamp, both are one masked value; 0 stands for no pixel.
+    statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
+    statistics = np.nan_to_num(statistics).astype(float)
     level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
     return level, noise
 
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).
 
-SIGNIFICANCE = 5.0  # least excess of a peak elsewhere over the middle, in σ of their difference
-SMOOTHED_NOISE = 0.53  # √2 · (6/16): that σ of two pixels of a smoothed stamp, in σ of a pixel
+SMOOTHED_NOISE = 0.53
+"""σ of the difference of two pixels of a smoothed stamp, √2 · (6/16), in σ of a pixel."""
 
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
-    """Stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
+    """Return stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
     padded = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
 
 
 def softened(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
-    """Stamps (n, s, s) convolved with a Gaussian of that FWHM, edges repeated; 0 is none.
+    """Return stamps (n, s, s) convolved with a Gaussian of a FWHM, edges repeated; 0 is none.
 
     A ring, or a star that is wide beside its pixels, has its brightest pixel in its middle then.
     """
@@ -218,12 +316,12 @@ def softened(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
 
 
 def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -> np.ndarray:
-    """How far each star lies off the place where the training would have put it.
+    """Return how far each star lies off the place where the training would have put it.
 
-    The training moves stars by up to `jitter_px` whole pixels, so only a star beyond
-    that is moved. Noise must not move a star, nor may the second peak of an aberrated
-    one: the brightest pixel counts as elsewhere only if the smoothed stamp has its
-    maximum there as well, and well above all of the middle.
+    The training moves stars by up to `jitter_px` whole pixels, so only a star beyond that is moved.
+    Noise must not move a star, nor may the second peak of an aberrated one: the brightest pixel
+    counts as elsewhere only if the smoothed stamp has its maximum there as well, and well above all
+    of the middle.
 
     Parameters
     ----------
@@ -237,44 +335,57 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
     Returns
     -------
     ndarray of int, shape (n, 2)
-        (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie
-        within `jitter_px`, or of which that cannot be said.
+        (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie within
+        `jitter_px`, or of which that cannot be said.
     """
     middle = stamps.shape[-1] // 2
-    nearby = slice(middle - jitter_px, middle + jitter_px + 1)
+    centre = slice(middle - jitter_px, middle + jitter_px + 1)
+    # Brightest pixels of the stamps, and of the stamps smoothed once more.
     soft = softened(stamps, centring_px)
     smooth = smoothed(soft)
-    brightest, second = (peaks(images) - middle for images in (soft, smooth))
-    outside = np.abs(brightest).max(axis=1) > jitter_px
-    star = np.flatnonzero(outside & (np.abs(brightest - second).max(axis=1) <= 1))
-    out = np.zeros((len(stamps), 2), dtype=np.int16)
+    brightest, brightest_smooth = (peaks(images) - middle for images in (soft, smooth))
+    # Stars of which both are elsewhere, and agree to a pixel.
+    agrees = np.abs(brightest - brightest_smooth).max(axis=1) <= 1
+    star = np.flatnonzero((np.abs(brightest).max(axis=1) > jitter_px) & agrees)
+    offset = np.zeros((len(stamps), 2), dtype=np.int16)
     if not star.size:
-        return out
-    excess = smooth[star].max(axis=(1, 2)) - smooth[star, nearby, nearby].max(axis=(1, 2))
-    sure = excess > SIGNIFICANCE * SMOOTHED_NOISE * border_scatter(stamps[star])
-    out[star[sure]] = brightest[star[sure]]
-    return out
+        return offset
+    # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels.
+    excess = smooth[star].max(axis=(1, 2)) - smooth[star, centre, centre].max(axis=(1, 2))
+    significant = excess > 5.0 * SMOOTHED_NOISE * border_scatter(stamps[star])
+    offset[star[significant]] = brightest[star[significant]]
+    return offset
 
 
 def peaks(images: np.ndarray) -> np.ndarray:
-    """(row, column) of the brightest pixel of every image, the first in that order among equals."""
+    """Return (row, column) of the brightest pixel of every image, of equal ones the first."""
     flat = images.reshape(len(images), -1).argmax(axis=1)
     return np.stack(np.divmod(flat, images.shape[-1]), axis=1)
 
 
-def cut(wide: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> np.ndarray:
-    """Stamps (n, d, d) out of wider ones (n, s, s), index d//2 from s//2 + offset (n, 2).
+def cut(window: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> np.ndarray:
+    """Cut stamps (n, d, d) out of larger ones (n, s, s), index d//2 from s//2 + offset.
 
-    The offset is (row, column), none by default. What would lie beyond the wide stamp
-    repeats its edge.
+    Parameters
+    ----------
+    window : ndarray, shape (n, s, s)
+    stamp_px : int
+        Side d.
+    offset : ndarray of int, shape (n, 2), optional
+        (row, column); none by default. What would lie beyond the window repeats its edge.
+
+    Returns
+    -------
+    ndarray, shape (n, d, d)
     """
-    side = wide.shape[-1]
+    side = window.shape[-1]
     pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
-    middle = wide[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
+    middle = window[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
     if offset is None or not offset.any():
         return np.ascontiguousarray(middle)
+    # Only stars with an offset are cut by themselves.
     star = np.flatnonzero(offset.any(axis=1))
     stamps = middle.copy()
     rows, columns = (np.clip(offset[star, i, None] + pixels, 0, side - 1) for i in (0, 1))
-    stamps[star] = wide[star[:, None, None], rows[:, :, None], columns[:, None, :]]
+    stamps[star] = window[star[:, None, None], rows[:, :, None], columns[:, None, :]]
     return stamps

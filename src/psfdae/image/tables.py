@@ -94,6 +94,7 @@ def star_table(
     from astropy.table import QTable
     from astropy.units import Quantity, Unit
 
+    # Columns with units, as they are shown, and what they mean.
     table = QTable()
     for name, values in columns.items():
         unit, form, meaning = COLUMNS.get(name, ("", "", ""))
@@ -106,6 +107,7 @@ def star_table(
             table[name].info.format = form
     if of_list is None:
         return table
+    # Columns of the list behind them, under names of their own.
     for name in of_list.colnames:
         column_name, names = name, {column.lower() for column in table.colnames}
         while column_name.lower() in names:
@@ -129,9 +131,11 @@ def fits_values(column: Column) -> np.ndarray:
     Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
     that are missing are NaN, whole ones the least of their type.
     """
+    # Values without mask and unit, and which of them are missing.
     unmasked = getattr(column, "unmasked", column)
     values = np.ma.getdata(np.asarray(getattr(unmasked, "value", unmasked)))
     is_missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
+    # Characters of four bytes become one byte each.
     if values.dtype.kind in "US":
         width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
         texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
@@ -163,6 +167,7 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
     from astropy.io import fits
     from astropy.table import Table
 
+    # A table of FITS's types; astropy keeps the formats in which columns are shown.
     plain = Table({column: fits_values(table[column]) for column in table.colnames})
     for column in table.colnames:
         if isinstance(form := table[column].info.format, str):
@@ -170,6 +175,7 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
     with silent():
         hdu = fits.table_to_hdu(plain)
     hdu.name = name
+    # Unit, value that stands for a missing one, and meaning of each column.
     for number, column in enumerate(table.colnames, start=1):
         info = table[column].info
         if info.unit is not None and str(info.unit):
@@ -210,6 +216,7 @@ def write_table(path: Path, table: QTable) -> None:
         else:
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
+            # Formats are those of the columns; numbers that are missing are written as such.
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
                     plain[column.name] = column.filled(np.nan)

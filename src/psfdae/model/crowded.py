@@ -121,7 +121,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = _pixel_error(sky.noise, fit.light + wing_light, observation.gain)
-        if turn == 0 and observation.found is not None:
+        if turn == 0 and observation.detections is not None:
             place, flux = _with_hidden(sky, sigma, place, flux, threshold, fwhm)
             origin = np.concatenate([origin, place[len(origin) :]])
         elif turn > 0:
@@ -149,9 +149,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     sigma_px = np.hypot(stars["x_error"], stars["y_error"])
     is_far = distance_px > np.maximum(SAME_FWHM * fwhm, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
-    if observation.found is None:
-        stars["id"] = observation.identifiers
-        stars["flags"] |= observation.list_flags
+    if observation.detections is None:
+        stars["id"] = observation.stars.id
+        stars["flags"] |= observation.stars.flags
     return result
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
-from psfdae.image.observation import Observation, Source, list_offset
+from psfdae.image.image_input import ImageInput
+from psfdae.image.observation import Observation
+from psfdae.image.positions import list_offset
 from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import creation_date
@@ -21,7 +23,7 @@ MIN_STARS = 5
 """Number of bright stars of an exposure from which cross-validation can judge a change."""
 
 
-def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]:
+def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, str]:
     """Adapt a model to the bright stars of another exposure of the same camera.
 
     The PSF at a position changes from that of `model` by as much as cross-validation with the stars
@@ -32,7 +34,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     ----------
     model : PsfModel
         Model of the method field, trained on an exposure with many stars.
-    source : Source
+    source : ImageInput
         The other exposure, and what is stated about it.
     name : str
         Name of the new model.

@@ -15,14 +15,15 @@ from functools import cached_property
 import numpy as np
 
 from psfdae.errors import Error
-from psfdae.image.observation import cut_image
+from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
+from psfdae.image.stamps import cut_image
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
 from psfdae.model.fitting import fitted_to
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.stars import DETECTED_SIGMA, Stars
+from psfdae.model.stars import Stars
 
 
 class _Field(FieldPsfs):
@@ -87,11 +88,11 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
         # bright stars in the cleaned image.
         field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
         try:
-            photometry = crowded.photometry(field, observation, DETECTED_SIGMA)
+            photometry = crowded.photometry(field, observation, ImageInput.threshold)
             # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
             isolation_px = 1.25 * field.fwhm_px()
             light = light_of_others(photometry, observation.positions)
-            cleaned = replace(observation, others=light)
+            cleaned = replace(observation, neighbour_light=light)
             candidates = collect(cleaned, calibration, settings.framing, isolation_px)
             isolated = Stars.of_candidates(stars.source, cleaned, candidates, settings)
         except Error as error:
@@ -124,7 +125,7 @@ def light_of_others(
     -------
     callable
         Its arguments are a slice of the list, the side of the stamps and the margin around them, as
-        `psfdae.image.observation.cut_image` takes them. It returns the light (m, s, s), s with both
+        `psfdae.image.stamps.cut_image` takes them. It returns the light (m, s, s), s with both
         margins.
     """
     from scipy.spatial import cKDTree

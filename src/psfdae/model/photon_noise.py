@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.field_psf import SLOPE_PX
+from psfdae.image.camera import CameraValue
 from psfdae.moments import SIGMA_OF_MAD
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observatio
     measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
     if measured is None:
         return observation
-    source = (measured[0], "about, by the scatter of the pixels of stars")
-    return replace(observation, camera=observation.camera | {"gain": source})
+    gain = CameraValue(measured[0], "about, by the scatter of the pixels of stars")
+    return replace(observation, camera=observation.camera | {"gain": gain})
 
 
 def measure_gain(

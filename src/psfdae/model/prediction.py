@@ -26,7 +26,7 @@ from psfdae.bundle_info import FORMAT_VERSION
 from psfdae.files import atomic_path
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
-from psfdae.image.stamps import MEANING, StarFlag
+from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import COLUMNS, as_fits, fits_values, html_table, star_table
 from psfdae.version import __version__
 
@@ -313,8 +313,8 @@ def _cube_header(name: str, meaning: str, count: int, stamp_px: int, unit: str) 
 def _table_header(header: Header, count: int) -> Header:
     """Return the header of a table of so many stars, with the meaning of their flags."""
     header["NAXIS2"] = count
-    for flag, meaning in MEANING.items():
+    for flag in StarFlag:
         # A FITS keyword has eight characters.
         header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name
-        header["COMMENT"] = f"{int(flag)} {flag.name}: {meaning}"
+        header["COMMENT"] = f"{int(flag)} {flag.name}: {flag.meaning}"
     return header

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
+from psfdae.image.camera import other_instruments
 from psfdae.image.containers import parts_of_array, sigma_of
-from psfdae.image.observation import Observation, other_instruments
+from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.method import KnowsField, Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle

@@ -143,7 +143,7 @@ class SettingsReader:
 
     choice: tuple[str, ...] = ()
 
-    def of(self, options: Mapping[str, object]) -> tuple[str, ...]:
+    def names(self, options: Mapping[str, object]) -> tuple[str, ...]:
         """Return the names of the groups of settings."""
         return tuple(settings_model().model_fields)
 

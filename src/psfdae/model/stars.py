@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -14,15 +14,12 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
+from psfdae.image.camera import other_instruments
 from psfdae.image.containers import as_images
 from psfdae.image.errors import ObservationError
-from psfdae.image.observation import (
-    ASSUMED_SCALE,
-    Observation,
-    Source,
-    list_offset,
-    other_instruments,
-)
+from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.observation import ASSUMED_SCALE_ARCSEC, Observation
+from psfdae.image.positions import list_offset
 from psfdae.image.selection import Candidates, Verdict, collect
 from psfdae.image.selection_advice import advice
 from psfdae.image.source_size import SourceSize, measure_size
@@ -37,7 +34,6 @@ from psfdae.splits import Split, held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import QTable
-    from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
@@ -61,9 +57,6 @@ MIN_STARS_WITH_ERROR = 5
 MIN_CROWDED_RATIO = 1.0
 """Ratio of bright stars with neighbours to those without from which neighbours are subtracted."""
 
-DETECTED_SIGMA = 5.0
-"""Default threshold of the search for stars, in σ of the sky."""
-
 
 @dataclass(frozen=True, eq=False)
 class Stars:
@@ -73,7 +66,7 @@ class Stars:
 
     Attributes
     ----------
-    source : Source
+    source : ImageInput
         The image, and what was stated about it; of several, the first one.
     observation : Observation
         The image with all of its stars; of several, the first one under a name for all.
@@ -99,7 +92,7 @@ class Stars:
     ['training', 'held out']
     """
 
-    source: Source
+    source: ImageInput
     observation: Observation
     candidates: Candidates
     held_out: np.ndarray
@@ -113,22 +106,7 @@ class Stars:
         cls,
         image: Image | Sequence[Image],
         catalogue: StarList | None = None,
-        *,
-        detect: bool | float = False,
-        extension: str | int | None = None,
-        origin: int | None = None,
-        mask: str | int | Path | np.ndarray | None = None,
-        bad_bits: int | None = None,
-        weight: str | int | Path | np.ndarray | None = None,
-        variance: str | int | Path | np.ndarray | None = None,
-        error: str | int | Path | np.ndarray | None = None,
-        pixel_scale_arcsec: float | Quantity | None = None,
-        gain: float | Quantity | None = None,
-        read_noise: float | Quantity | None = None,
-        saturate: float | Quantity | None = None,
-        colour_column: str | None = None,
-        accept_offset: bool = False,
-        **settings: object,
+        **statements: Any,
     ) -> Stars:
         """Choose the bright stars of an image and make training data of them.
 
@@ -141,60 +119,32 @@ class Stars:
         catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
             Star list: a file, a table with its columns, or positions (x, y), 0-based; of several
             images, one with sky coordinates.
-        detect : bool or float
-            Search for stars instead, this many σ above the sky (True: 5).
-        extension : str or int, optional
-            With the stars, if the file has several.
-        origin : 0 or 1, optional
-            Index of the first pixel's centre in the list, where its columns do not say it.
-        mask, weight, variance, error : extension, path or array as large as the image, optional
-            Bad pixels are other than 0, or those with one of `bad_bits`; 1/σ² but for a factor;
-            σ² of the pixels; σ. Of a file with extensions DQ and ERR, these by default; "none"
-            takes neither.
-        bad_bits : int, optional
-        pixel_scale_arcsec, gain, read_noise, saturate : float or Quantity, optional
-            Arcseconds per pixel, electrons per count, electrons, counts; instead of the header's.
-        colour_column : str, optional
-            Of the star list, such as g − r; the PSF may change with it.
-        accept_offset : bool
-            Take a star list that is off by more than a pixel.
-        **settings
-            Keys of `CalibrationStars`, `Stamp`, `Parts`, or `seed`; such as `snr_min=50` or
-            `stamp_px=24`.
+        **statements
+            Statements on the image, named and explained in
+            `psfdae.image.image_input.ImageStatements`, such as `gain=1.5`: `detect` (True, or the
+            threshold in σ), `threshold`, `on_image`, `extension`, `origin`, `mask`, `bad_bits`,
+            `weight`, `variance`, `error`, `pixel_scale_arcsec`, `gain`, `read_noise`, `saturate`,
+            `colour_column`, `accept_offset`. All others are settings, keys of `CalibrationStars`,
+            `Stamp` and `Parts`, or `seed`; such as `snr_min=50` or `stamp_px=24`.
 
         Raises
         ------
         Error
             If the image or the list cannot be used, or too few stars are bright enough.
         """
-        # All images are opened with the same statements.
-        threshold = DETECTED_SIGMA if detect is True else detect or None
         images = as_images(image)
         if not images:
             raise ObservationError("image", "no image, expected at least one")
-        source = Source(
-            images[0],
-            catalogue,
-            threshold,
-            extension,
-            origin=origin,
-            mask=mask,
-            bad_bits=bad_bits,
-            weight=weight,
-            variance=variance,
-            error=error,
-            pixel_scale_arcsec=pixel_scale_arcsec,
-            gain=gain,
-            read_noise=read_noise,
-            saturate=saturate,
-            colour_column=colour_column,
-            accept_offset=accept_offset,
-        )
+        names = {field.name for field in fields(ImageStatements)}
+        settings = {name: value for name, value in statements.items() if name not in names}
+        stated = {name: value for name, value in statements.items() if name in names}
+        # All images are opened with the same statements.
+        source = ImageInput(images[0], catalogue=catalogue, **stated)
         settings_of_all = with_keywords(settings_model()(), IMAGE_GROUPS, settings)
         return cls.of(source.of_each(images), settings_of_all)
 
     @classmethod
-    def of(cls, sources: Sequence[Source], settings: Settings) -> Stars:
+    def of(cls, sources: Sequence[ImageInput], settings: Settings) -> Stars:
         """Choose the bright stars of images with their options; errors are those of `from_image`.
 
         A single image must have enough stars itself; of several, all together must.
@@ -280,13 +230,17 @@ class Stars:
 
     @classmethod
     def of_candidates(
-        cls, source: Source, observation: Observation, candidates: Candidates, settings: Settings
+        cls,
+        source: ImageInput,
+        observation: Observation,
+        candidates: Candidates,
+        settings: Settings,
     ) -> Stars:
         """Return the bright stars among the measured stars of an observation.
 
         Parameters
         ----------
-        source : Source
+        source : ImageInput
         observation : Observation
         candidates : Candidates
             Measured stars of the observation.
@@ -302,7 +256,7 @@ class Stars:
         offset_note = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
-        notes = [observation.said(), *filter(None, [offset_note])]
+        notes = [observation.summary(), *filter(None, [offset_note])]
         # Advice on stamps and saturation needs enough stars for a median.
         if len(bright) >= settings.calibration_stars.stars_min:
             notes += advice(candidates, observation, settings.framing.stamp_px)
@@ -627,7 +581,7 @@ def few_stars_notes(stars: Stars) -> list[str]:
     return [f"few stars: {sentence}"]
 
 
-def _require_unique_names(sources: Sequence[Source]) -> None:
+def _require_unique_names(sources: Sequence[ImageInput]) -> None:
     """Refuse images whose models would have the same name.
 
     Raises
@@ -667,7 +621,7 @@ def _require_one_camera(opened: Sequence[Observation]) -> None:
                 first.instrument, observation.instrument
             )
         ]
-        scales = [o.pixel_scale_arcsec or ASSUMED_SCALE for o in (first, observation)]
+        scales = [o.pixel_scale_arcsec or ASSUMED_SCALE_ARCSEC for o in (first, observation)]
         if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
             first_text, text = (f"{scale:.6g} arcsec" for scale in scales)
             differences.insert(0, ("the pixel scale", first_text, text))

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from psfdae.image.observation import central_pixel
-from psfdae.image.stamps import Stamps
+from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
 from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch

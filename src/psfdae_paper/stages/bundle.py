@@ -1,4 +1,8 @@
-"""Stages `bundle` and `ship`: a fitted method as one file, which astronomers apply to images."""
+"""Stages `bundle` and `ship`: a fitted method as one file, which astronomers apply to images.
+
+A fit and the stars that it was trained on go in. Out comes a bundle: the weights, the errors that
+the method makes of stars that were left out, and telescope, camera and noise.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae import fits
-from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
+from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require, require_origin
 from psfdae.files import Product
 from psfdae.method import CONFIG, Method
 from psfdae.methods import method
@@ -19,7 +23,7 @@ from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae.options import AboveZero, File, Folder
 from psfdae.rng import stream
-from psfdae.settings import Reference, SplitKind, as_overrides
+from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
@@ -53,6 +57,7 @@ def bundle(
     out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
     """Pack a trained network with its errors and all that it takes to apply it."""
+    # Exactly one option names a fit; its name is that of the method.
     limit_threads(config.evaluation.threads)
     fits_by_name = {key: place for key, place in vars(models).items() if place is not None}
     if len(fits_by_name) != 1:
@@ -65,6 +70,7 @@ def bundle(
     target = fit_config.get("reference") or reference or "realisation"
     product = read_stars(stars, target)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
+    # The errors are measured now, which takes most of the time.
     fitted = method_class.load(place, target, config.evaluation)
     labels = name or out.name.removesuffix(SUFFIX), licence
     model = packing.model_of(fitted, product, target, config, fit_config, *labels, largest_mb)
@@ -74,7 +80,15 @@ def bundle(
 def _fit_config(
     method_class: type[Method], place: Path, config: Config, split: str | None
 ) -> dict[str, Any]:
-    """Return the configuration of a fit; BundleError if it is not that of the stage."""
+    """Return the configuration of a fit, which must be that of the stage.
+
+    Raises
+    ------
+    BundleError
+        If a file of the fit, or a key of its configuration, is missing.
+    ProductError
+        For the first setting that differs.
+    """
     for path in fits.own_files(method_class, place):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
@@ -86,24 +100,9 @@ def _fit_config(
         raise BundleError(f"{path}: key {min(missing)!r} is missing")
     stage_config = config.model_dump(include={*SEEN_BY_TRAINING})
     stage_config |= {"split": split or fit_config["split"]}
-    _refuse_mismatch({key: fit_config[key] for key in stage_config}, stage_config, path)
+    keys = (*SEEN_BY_TRAINING, "split")
+    require(path, fit_config, keys, stage_config, "the configuration of the bundle")
     return fit_config
-
-
-def _refuse_mismatch(trained: dict[str, Any], configured: dict[str, Any], path: Path) -> None:
-    """Raise BundleError that names the first setting in which two configurations differ."""
-    trained_words, configured_words = (
-        [word.strip("+") for word in as_overrides(tree)] for tree in (trained, configured)
-    )
-    differing = sorted({*trained_words} - {*configured_words})
-    differing = differing or sorted({*configured_words} - {*trained_words})
-    if differing:
-        key = differing[0].split("=")[0]
-        same_key = (word for word in configured_words if word.startswith(f"{key}="))
-        raise BundleError(
-            f"{path}: the network was trained with {differing[0]}, "
-            f"but the configuration of the bundle has {next(same_key, f'no {key}')}"
-        )
 
 
 @command("ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
@@ -117,6 +116,7 @@ def ship(
 
     Flux and sky of these stars are estimated, and every noise level counts alike.
     """
+    # The candidate with the smallest error.
     product, errors = read_stars(stars), {}
     for path in bundle:
         errors[path] = _validation_error(read_bundle(path), product, config)
@@ -153,6 +153,8 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
         weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
         bundle = replace(bundle, weights=weights)
     model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
+    # Flux and sky of the noisy stars are unknown to the model; the PSF of flux 1 is compared with
+    # the noise-free star.
     log_errors = []
     for level in data.levels:
         rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)

@@ -20,7 +20,7 @@ from psfdae.files import ProductError, write_text
 from psfdae.method import CONFIG, HISTORY
 from psfdae.methods import method
 from psfdae.options import File, Folder
-from psfdae.reading import read_csv, read_yaml
+from psfdae.reading import read_table, read_yaml
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.evaluation import comparison
@@ -130,15 +130,15 @@ def errors_of(folder: Path) -> Path:
 def read_run(folder: Path, errors: Path) -> Run:
     """Read a network's settings, training history and errors per star; raises ProductError."""
     config = read_yaml(folder / CONFIG)
-    rows = read_csv(folder / HISTORY, "epoch", "train_mse", "validation_mse", "seconds")
+    columns = ("epoch", "train_mse", "validation_mse", "seconds")
+    history = read_table(folder / HISTORY, *columns, dtype=str)
     try:
         table = pd.read_parquet(errors, page_checksum_verification=True)
     except FileNotFoundError:
         raise ProductError(f"{errors}: no such file; evaluate the run first") from None
     except (OSError, ValueError) as error:
         raise ProductError(f"{errors}: damaged ({error}); delete it and run again") from error
-    history = pd.DataFrame(rows).apply(pd.to_numeric, errors="coerce")
-    return Run(str(folder), flatten(config), history, table)
+    return Run(str(folder), flatten(config), history.apply(pd.to_numeric, errors="coerce"), table)
 
 
 def describe(first: Run, second: Run) -> str:

@@ -1,7 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
 A training logs where the environment asks for it (`psfdae.networks.training.listener`). Its run
-lasts until `psfdae track` replaces it by the finished one.
+lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which says
+whose training it is, and a function of the rows of the history comes out.
 """
 
 from __future__ import annotations
@@ -15,16 +16,15 @@ from typing import TYPE_CHECKING
 from psfdae_paper.stages.track import (
     LIVE,
     client_of,
+    delete_live,
     experiment_of,
     first_line,
     locked,
     log_metrics,
     ours_to_explain,
-    runs_of_slot,
     server,
-    tags_of,
 )
-from psfdae_paper.tracking import epoch_metrics, training_at
+from psfdae_paper.tracking import epoch_metrics
 
 if TYPE_CHECKING:
     from psfdae.networks.training import Row
@@ -36,35 +36,35 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
     Trainings that MLflow does not show, such as points of sweeps, are passed over. So are those of
     jobs of a cluster, unless MLFLOW_TRACKING_URI names a server: its nodes open no database.
     """
-    results, preset = Path(os.environ["PSFDAE_RESULTS"]), os.environ["PRESET"]
-    uri, database = server(), results / "mlflow.db"
-    run = training_at(checkpoint, results, preset)
-    if not uri and "SLURM_JOB_ID" in os.environ:
-        run = None
+    uri, database = server(), Path(os.environ["PSFDAE_RESULTS"], "mlflow.db")
+    # Checkpoints are METHOD/DATASET/SPLIT-REFERENCE.pt and, of scene 3, alignment-NETWORK.pt.
+    source = os.path.relpath(checkpoint.with_suffix(""), database.with_name("checkpoints"))
+    source = source.replace("alignment-", "alignment/")
+    is_shown = bool(uri or "SLURM_JOB_ID" not in os.environ) and "/" in source
+    # MLflow's id of the run, and the last epoch that it has; "" before the first one.
     run_id, last_epoch = "", 0.0
 
     def log(row: Row) -> None:
-        nonlocal run, run_id, last_epoch
-        if run is None:
+        nonlocal is_shown, run_id, last_epoch
+        if not is_shown:
             return
+        # The history counts seconds from the start of the training, MLflow from 1970.
         start_ms = int(1000 * (time.time() - row["seconds"]))
         try:
             with locked(database):
                 client = client_of(uri, database)
                 if row["epoch"] <= last_epoch or not run_id:
                     # A training that starts anew, or goes on from its checkpoint, has a new run.
-                    experiment = experiment_of(client, run.experiment, uri, database)
-                    tags = {**tags_of(run), "preset": preset, "config_hash": LIVE}
-                    for old in runs_of_slot(client, experiment, tags):
-                        if old.data.tags["config_hash"] == LIVE:
-                            client.delete_run(old.info.run_id)
-                    run_id = client.create_run(experiment, start_ms, tags, run.name).info.run_id
+                    experiment = experiment_of(client, LIVE, uri, database)
+                    delete_live(client, source)
+                    tags = {"source": source, "preset": os.environ["PRESET"]}
+                    run_id = client.create_run(experiment, start_ms, tags, source).info.run_id
                 log_metrics(client, run_id, epoch_metrics([row], start_ms))
                 last_epoch = row["epoch"]
         except Exception as error:
             if not ours_to_explain(error):
                 raise
-            run = None  # a training ends whatever becomes of its picture
+            is_shown = False  # a training ends whatever becomes of its picture
             print(f"the training is not shown in MLflow any more: {first_line(error)}", flush=True)
 
     return log

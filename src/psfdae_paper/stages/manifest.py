@@ -22,6 +22,7 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
     # Runs with other presets, and the run of record, may lie below that with the preset "fast".
     other_runs = {"reference", *(path.stem for path in (config_dir() / "preset").glob("*.yaml"))}
     no_products = {"logs", "benchmarks", "benchmarks_on_request", "checkpoints", "mlartifacts"}
+    # Lines as `sha256sum` prints them, in the order of the names.
     lines = []
     for path in sorted(results.glob("*/**/*")):
         place = path.relative_to(results)

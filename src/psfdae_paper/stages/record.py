@@ -1,9 +1,12 @@
-"""Stages `runtime` and `reference`: the cost of a run, and the run of record."""
+"""Stages `runtime` and `reference`: the cost of a run, and the run of record.
+
+A finished run in `results` goes in. Out come `runtime.csv` with the cost of each job, and
+`results/reference` with tables and figures of the run and, in `provenance.json`, how they were
+made. The record is in git, and pages take their numbers from it.
+"""
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import json
 import os
 import platform
@@ -11,8 +14,8 @@ import re
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterable, Mapping
+import timeit
+from collections.abc import Iterable
 from datetime import date
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +26,7 @@ import numpy as np
 
 from psfdae.files import ProductError, write_csv, write_text
 from psfdae.options import File, Folder
+from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 
@@ -30,9 +34,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from psfdae_paper.configuration.schema import Config
-
-VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
-"""Packages whose versions can change a number; recorded with the run."""
 
 ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
@@ -61,13 +62,16 @@ def runtime(
     """Collect wall time, CPU time and memory of a run's jobs.
 
     Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
-    line of its log (`workflow/rules/cpu_time.smk`), which has the name of its benchmark.
+    line of its log, which has the name of its benchmark.
     """
-    write_csv(out, _costs(results), 6)
+    write_csv(out, job_costs(results), 6)
 
 
-def _costs(results: Path) -> pd.DataFrame:
-    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job."""
+def job_costs(results: Path) -> pd.DataFrame:
+    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job.
+
+    NaN stands where Snakemake has no number, or the log of a job no CPU time.
+    """
     import pandas as pd
 
     folder = results / "benchmarks"
@@ -75,40 +79,21 @@ def _costs(results: Path) -> pd.DataFrame:
     for path in sorted(folder.rglob("*.tsv")):
         job = path.relative_to(folder).with_suffix("")
         rule, *wildcards = job.parts
-        wall_s, peak_mb = _cost(path, "s", "max_rss")
-        cpu_s = _cpu_seconds(results / "logs" / job.with_name(f"{job.name}.log"))
-        rows.append((rule, "/".join(wildcards), wall_s, cpu_s, peak_mb))
+        # The last line of a log is that of bash's `times`, 1m2.003s for user and system each
+        # (workflow/rules/cpu_time.smk).
+        log = results / "logs" / job.with_name(f"{job.name}.log")
+        last_line = log.read_text(encoding="utf-8").splitlines()[-1:] if log.is_file() else []
+        times = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", " ".join(last_line))
+        seconds = [60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in times]
+        cpu_s = sum(seconds) if len(seconds) == 2 else float("nan")
+        last_run = _last_run(path)
+        rows.append((rule, "/".join(wildcards), last_run["s"], cpu_s, last_run["max_rss"]))
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
 
 
-def _cost(path: Path, *names: str) -> list[float]:
-    """Return columns of a job's last run, NaN where Snakemake has no number.
-
-    For a damaged benchmark file these are NaN, too, with a message: its job need not be repeated.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        columns, *_, last_run = (line.split("\t") for line in lines)
-        job = dict(zip(columns, last_run, strict=True))
-        return [float("nan" if job[name] in ("-", "NA") else job[name]) for name in names]
-    except (ValueError, KeyError) as error:
-        print(f"{path}: damaged ({error}); its cost is left out", file=sys.stderr, flush=True)
-        return [float("nan")] * len(names)
-
-
-def _cpu_seconds(log: Path) -> float:
-    """Return user plus system time from the last line of a log, in the format of bash's `times`.
-
-    NaN, with a message, if the log has no such line.
-    """
-    try:
-        *_, last_line = log.read_text(encoding="utf-8").splitlines()
-        times = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", last_line)
-        user, system = (60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in times)
-        return user + system
-    except (OSError, ValueError) as error:
-        print(f"{log}: no CPU time ({error}); it is left out", file=sys.stderr, flush=True)
-        return float("nan")
+def _last_run(benchmark: Path) -> pd.Series[float]:
+    """Return Snakemake's numbers of the last run of a job; ProductError if they are damaged."""
+    return read_table(benchmark, "s", "max_rss", sep="\t", na_values=["-"]).iloc[-1]
 
 
 @command("reference")
@@ -131,8 +116,9 @@ def reference(
     """
     from psfdae_paper.configuration.compose import load
 
-    commit = _current_commit()
-    renewed = _up_to_date(results, plans)
+    # What a commit does not have, and what it would make anew, is refused.
+    commit = clean_commit()
+    renewed = files_up_to_date(results, plans)
     # Files of the earlier record that stay, with its commit and date.
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
@@ -143,10 +129,17 @@ def reference(
         for name in names
         if name not in renewed and MAY_STAY.fullmatch(name)
     }
+    # A commit that is in the history can be checked out again.
+    for name, record in retained.items():
+        try:
+            git("merge-base", "--is-ancestor", record["commit"], "HEAD")
+        except subprocess.CalledProcessError:
+            raise ProductError(
+                f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
+                " make it anew, or remove it from the record"
+            ) from None
     sources = {name: results / name for name in renewed}
     sources |= {name: out / name for name in retained}
-    for name, record in retained.items():
-        _require_history(name, record)
     # The new record is complete before it replaces the earlier one.
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
@@ -161,10 +154,13 @@ def reference(
     staging.rename(out)
 
 
-def _current_commit() -> str:
+def clean_commit() -> str:
     """Return the commit that is checked out.
 
-    ProductError if files that decide the products of a run differ from it.
+    Raises
+    ------
+    ProductError
+        If files that decide the products of a run differ from it, or git fails.
     """
     try:
         changed = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
@@ -178,22 +174,38 @@ def _current_commit() -> str:
     return commit
 
 
-def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
+def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     """Return the files of the record that Snakemake finds up to date.
 
-    ProductError if others, which may not stay from an earlier record, are not.
+    Parameters
+    ----------
+    results : Path
+        Folder of the run.
+    plans : iterable of Path
+        Tables of `snakemake --summary`.
+
+    Returns
+    -------
+    list of str
+        Names of files, relative to the folder.
+
+    Raises
+    ------
+    ProductError
+        If others, which may not stay from an earlier record, are not up to date.
     """
     # Snakemake's plan for every file of the run: "no update", or the reason to make it.
     plan_by_name: dict[str, str] = {}
-    for plan in plans:
-        for row in csv.DictReader(plan.read_text(encoding="utf-8").splitlines(), delimiter="\t"):
-            path = Path(row["output_file"])
-            if path.is_relative_to(results):
-                plan_by_name[path.relative_to(results).as_posix()] = row["plan"]
+    for path in plans:
+        table = read_table(path, "output_file", "plan", sep="\t")
+        for name, plan in zip(table["output_file"], table["plan"], strict=True):
+            if Path(name).is_relative_to(results):
+                plan_by_name[Path(name).relative_to(results).as_posix()] = plan
     if "runtime.csv" not in plan_by_name:
         raise ProductError(
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
+    # A record is of one commit, but for files that take too long to be made for each.
     recorded = {name: plan for name, plan in plan_by_name.items() if RECORDED.fullmatch(name)}
     outdated = {name for name, plan in recorded.items() if plan != "no update"}
     refused = sorted(name for name in outdated if not MAY_STAY.fullmatch(name))
@@ -205,33 +217,26 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     return [name for name in recorded if name not in outdated]
 
 
-def _require_history(name: str, record: Mapping[str, str]) -> None:
-    """Raise ProductError if the commit of a recorded file is not an ancestor of this one."""
-    try:
-        git("merge-base", "--is-ancestor", record["commit"], "HEAD")
-    except subprocess.CalledProcessError:
-        raise ProductError(
-            f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
-            " make it anew, or remove it from the record"
-        ) from None
-
-
 def provenance(results: Path, config: Config) -> dict[str, object]:
-    """Describe a run: date, configuration, machine, versions, and its cost."""
-    costs = _costs(results)
-    # Targets beyond `make reproduce` that belong to the record.
-    targets = (
-        *("benchmark", "bounds", "own_stars", "prediction"),
-        *("scaling", "stability", "training_knee"),
-    )
-    canonical = json.dumps(config.model_dump(), sort_keys=True)
+    """Describe a run: date, machine, versions, threads, and its cost.
+
+    Times are in seconds, sizes in MB. `wall_s` is the time during which a job of `make reproduce`
+    ran, `on_request_s` that of each target beyond it.
+    """
+    costs = job_costs(results)
+    # Jobs of targets beyond `make reproduce`, such as the bounds.
+    on_request = sorted(path for path in (results / ON_REQUEST).glob("*") if path.is_dir())
+    # The last `make test` leaves its time in a report of JUnit's form.
+    report = results / "tests.xml"
+    tests = ElementTree.parse(report).getroot().find("testsuite") if report.is_file() else None
+    # Packages whose versions can change a number.
+    packages = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
     return {
         "date": date.today().isoformat(),
-        "config_sha256": hashlib.sha256(canonical.encode()).hexdigest(),
         "cpu": cpu_model(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in VERSIONED},
+        "versions": {name: metadata.version(name) for name in packages},
         "threads": {
             "simulation": config.optics.threads,
             "training": config.train.threads,
@@ -239,14 +244,10 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         },
         "matrix_product_gflops": round(matrix_product_speed(), 1),
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
-        "on_request_s": {
-            name: round(_busy_seconds(results / ON_REQUEST / name), 1)
-            for name in targets
-            if (results / ON_REQUEST / name).is_dir()
-        },
+        "on_request_s": {path.name: round(_busy_seconds(path), 1) for path in on_request},
         **_installation(),
         "results_mb": round(_size_mb(results), 1),
-        "tests_s": _test_seconds(results / "tests.xml"),
+        "tests_s": None if tests is None else round(float(tests.get("time", "nan")), 1),
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
@@ -254,6 +255,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
 def cpu_model() -> str:
     """Return the model of the processor as the operating system names it."""
+    # Linux; others say it to Python.
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text().splitlines():
@@ -268,13 +270,8 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
     Run times of two machines are expected to be in the inverse ratio of these speeds.
     """
     a = np.ones((size, size), dtype=np.float32)
-    shortest = float("inf")
-    for _ in range(repeats):
-        start = time.perf_counter()
-        a @ a
-        shortest = min(shortest, time.perf_counter() - start)
     # A product takes 2 n³ operations.
-    return 2.0 * size**3 / shortest / 1e9
+    return 2.0 * size**3 / min(timeit.repeat(lambda: a @ a, repeat=repeats, number=1)) / 1e9
 
 
 def _busy_seconds(benchmarks: Path) -> float:
@@ -282,9 +279,9 @@ def _busy_seconds(benchmarks: Path) -> float:
 
     Pauses between jobs, such as those before a run is resumed, do not count.
     """
-    files = benchmarks.rglob("*.tsv")
-    ends = ((p.stat().st_mtime, np.nan_to_num(_cost(p, "s")[0])) for p in files)
-    spans = sorted((end - float(seconds), end) for end, seconds in ends)
+    # Start and end of each job: a benchmark is written when its job ends.
+    ends = ((path.stat().st_mtime, _last_run(path)["s"]) for path in benchmarks.rglob("*.tsv"))
+    spans = sorted((end - np.nan_to_num(seconds), end) for end, seconds in ends)
     # Length of the union of all jobs' intervals, which are sorted by their start.
     busy_seconds, covered_until = 0.0, float("-inf")
     for start, end in spans:
@@ -295,6 +292,7 @@ def _busy_seconds(benchmarks: Path) -> float:
 
 def _installation() -> dict[str, float]:
     """Return time and disk space of the environment that `make` created, from its files."""
+    # venv writes pyvenv.cfg first, and make the other file last.
     environment = Path(sys.prefix)
     start, end = environment / "pyvenv.cfg", environment / ".complete"
     if not (start.is_file() and end.is_file()):
@@ -304,18 +302,6 @@ def _installation() -> dict[str, float]:
 
 
 def _size_mb(folder: Path) -> float:
-    """Return the size of all files of a folder in MB."""
+    """Return the size of all files of a folder in MB, links left out."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return sum(path.stat().st_size for path in files) / 1e6
-
-
-def _test_seconds(report: Path) -> float | None:
-    """Return the wall time of the last `make test`, from its JUnit report."""
-    if not report.is_file():
-        return None
-    try:
-        suite = ElementTree.parse(report).getroot().find("testsuite")
-    except ElementTree.ParseError as error:
-        print(f"{report}: damaged ({error}); left out", file=sys.stderr, flush=True)
-        return None
-    return None if suite is None else round(float(suite.get("time", "nan")), 1)

@@ -1,7 +1,9 @@
 """Stage `track`: finished runs become MLflow runs, and again without duplicates.
 
 The results folder is the truth and the database a view of it: a lost database is rebuilt by
-running the stage again.
+running the stage again. Folders with results go in (`psfdae_paper.tracking` reads them). Out come
+runs in a database or on a server, their models (`psfdae_paper.registry`) and views
+(`psfdae_paper.views`), and a receipt with what was done.
 """
 
 from __future__ import annotations
@@ -11,13 +13,13 @@ import math
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.errors import Error
-from psfdae.files import as_yaml, write_columns
+from psfdae.files import as_csv, as_yaml, write_text
 from psfdae.method import CONFIG
 from psfdae.options import File, Folder
 from psfdae.version import __version__
@@ -39,13 +41,12 @@ from psfdae_paper.views import show
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Metric
-    from mlflow.entities import Run as MlflowRun
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
 
 LIVE = "live"
-"""Stands for the hash of the config of a run that is under way; the import replaces it."""
+"""Experiment of trainings that are under way; the import of the finished run deletes them."""
 
 PARENT = "mlflow.parentRunId"
 """Tag by which MLflow shows a run as a part of another."""
@@ -83,7 +84,24 @@ def track(
 
 
 def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
-    """Import runs; see `track`. Raises TrackingError if the database cannot be used."""
+    """Import runs, and write what was done with each.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        A parent before its children.
+    preset : str
+        Goes into the tags.
+    database : Path
+        SQLite file, unless the environment names a server.
+    receipt : Path
+        CSV with MLflow's id of each run, the action and the tags that name it.
+
+    Raises
+    ------
+    TrackingError
+        If the database cannot be used.
+    """
     uri = server()
     import_tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
     # MLflow's id of each run, and what was done with it.
@@ -93,6 +111,7 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
             for outcome in _import(runs, import_tags, uri, database):
                 outcomes.append(outcome)
         except Exception as error:
+            # A server that fails must not stop a workflow; a database is a file to be mended.
             if not ours_to_explain(error):
                 raise
             if not uri:
@@ -106,12 +125,14 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
                 "To send later, repeat the import (snakemake --forcerun track)."
             )
     outcomes += [("", "not sent")] * (len(runs) - len(outcomes))
-    ids, actions = [run_id for run_id, _ in outcomes], [action for _, action in outcomes]
-    columns = {"run_id": ids, "action": actions, "experiment": [run.experiment for run in runs]}
-    tags = [{"preset": preset, **tags_of(run)} for run in runs]
-    columns |= {key: [row[key] for row in tags] for key in (*SLOT, "config_hash")}
-    write_columns(receipt, columns)
-    counts = sorted(Counter(actions).items())
+    # The receipt: a row for each run.
+    rows = []
+    for run, (run_id, action) in zip(runs, outcomes, strict=True):
+        tags = {"preset": preset, **tags_of(run)}
+        row = {"run_id": run_id, "action": action, "experiment": run.experiment}
+        rows.append(row | {key: tags[key] for key in (*SLOT, "config_hash")})
+    write_text(receipt, as_csv(rows))
+    counts = sorted(Counter(action for _, action in outcomes).items())
     print(f"{len(runs)} runs:", ", ".join(f"{count} {action}" for action, count in counts))
 
 
@@ -129,6 +150,7 @@ def locked(database: Path) -> Iterator[None]:
     """Wait for other importers: two that meet on a new database would ruin it."""
     import fcntl
 
+    # The lock of a process that ends is given up by the system.
     database.parent.mkdir(parents=True, exist_ok=True)
     with database.with_name(f".{database.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -150,6 +172,7 @@ def _import(
     database : Path
     """
     client = client_of(uri, database)
+    # MLflow's ids of the experiments by name, and of the runs by their source.
     experiments: dict[str, str] = {}
     imported: dict[str, str] = {}
     for run in runs:
@@ -158,9 +181,10 @@ def _import(
         tags = {**import_tags, **tags_of(run)}
         if run.parent:
             tags[PARENT] = imported[run.parent]
-        outcome = _import_run(client, experiments[run.experiment], run, tags)
+        outcome = import_run(client, experiments[run.experiment], run, tags)
         imported[run.source] = outcome[0]
         yield outcome
+    # What depends on all runs: the best version of each model, and tables that compare runs.
     for name in dict.fromkeys(registered_name(run) for run in runs if run.fit):
         choose_best(client, name)
     for name, experiment in experiments.items():
@@ -176,6 +200,15 @@ def client_of(uri: str, database: Path) -> MlflowClient:
 
 def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> str:
     """Return the id of an experiment, which is made if missing.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    name : str
+        Name of the experiment.
+    uri : str
+        Address of a server; "" for the database.
+    database : Path
 
     Raises
     ------
@@ -199,27 +232,41 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
     return str(experiment.experiment_id)
 
 
-def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str]) -> list[MlflowRun]:
-    """Return the active runs of a place in the results folder that this stage has made."""
-    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
-    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
-    return list(client.search_runs([experiment], query))
+def delete_live(client: MlflowClient, source: str) -> None:
+    """Delete the runs of trainings, seen live, whose model has a place in the results folder."""
+    if experiment := client.get_experiment_by_name(LIVE):
+        for run in client.search_runs([experiment.experiment_id], f"tags.source = '{source}'"):
+            client.delete_run(run.info.run_id)
 
 
-def _import_run(
+def import_run(
     client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]
 ) -> tuple[str, str]:
     """Leave exactly one active run with the files and settings of a run.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    experiment : str
+        Id of the experiment.
+    run : Run
+    tags : dict of str
+        All tags of the run.
 
     Returns
     -------
     run_id, action : str
         MLflow's id of the run, and what was done.
     """
-    slot = runs_of_slot(client, experiment, tags)
+    # Active runs of the same place in the results folder that this stage has made.
+    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
+    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
+    slot = client.search_runs([experiment], query)
+    # Of these, the ones with the same settings, and the one with the same files as well.
     of_config = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
     # An import that was killed leaves a run without content_hash.
     unchanged = [r for r in of_config if r.data.tags.get("content_hash") == run.content_hash]
+    # A run that is there with the same files is left alone but for tags that others decide.
     if unchanged:
         run_id, action = str(unchanged[0].info.run_id), "unchanged"
         for key in ("superseded", PARENT):
@@ -227,21 +274,27 @@ def _import_run(
             if key in tags and unchanged[0].data.tags.get(key) != tags[key]:
                 client.set_tag(run_id, key, tags[key])
     else:
-        run_id = _create(client, experiment, run, tags)
+        run_id = create_run(client, experiment, run, tags)
         action = "updated" if of_config else "created"
-    # Runs of the same settings, or under way, give way; those of other settings are superseded.
+    # Other runs of the same settings give way, and so does the training as it was seen live; runs
+    # of other settings are superseded.
     for old in slot:
         if old.info.run_id == run_id:
             continue
-        if old in of_config or old.data.tags["config_hash"] == LIVE:
+        if old in of_config:
             forget(client, old.info.run_id)
         elif old.data.tags.get("superseded") != "true":
             client.set_tag(old.info.run_id, "superseded", "true")
+    delete_live(client, run.source)
     return run_id, action
 
 
-def _create(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]) -> str:
-    """Create a run in MLflow with all that belongs to it, and return its id."""
+def create_run(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]) -> str:
+    """Create a run in MLflow with all that belongs to it, and return its id.
+
+    These are its tags, data, model, metrics, parameters and files. The parameters are the settings
+    that distinguish it (`settings_of`); all are in its file config.yaml.
+    """
     from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
 
     run_id: str = client.create_run(experiment, run.start_ms, tags, run.name).info.run_id
@@ -256,6 +309,7 @@ def _create(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str
         origin = {"dataset_name": data.name, "dataset_digest": data.digest}
     if model_id := log_model(client, experiment, run_id, run):
         origin["model_id"] = model_id
+    # Metrics of each epoch, and those of the finished run as epoch 0.
     metrics = epoch_metrics(run.epochs, run.start_ms)
     metrics += [Metric(key, v, run.end_ms, 0, **origin) for key, v in run.metrics.items()]
     log_metrics(client, run_id, metrics)
@@ -263,7 +317,7 @@ def _create(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str
     params = [Param(key, v[:6000]) for key, v in settings_of(run, tags["preset"]).items()]
     for i in range(0, len(params), 100):
         client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
-    # Files that are not part of the model.
+    # Files that are not part of the model: tables, figures and settings.
     with tempfile.TemporaryDirectory() as folder:
         link({k: path for k, path in run.files.items() if not k.startswith(MODEL)}, Path(folder))
         client.log_artifacts(run_id, folder)
@@ -282,7 +336,10 @@ def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) ->
 
 
 def tags_of(run: Run) -> dict[str, str]:
-    """Return the tags of a run in MLflow, but for those of the whole import."""
+    """Return the tags of a run in MLflow, but for those of the whole import.
+
+    A run with other settings that takes the place of this one sets `superseded` to "true".
+    """
     slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
     return {**slot, **run.tags, "config_hash": run.config_hash, "superseded": "false"}
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from psfdae.files import atomic_path, write_fits
-from psfdae.image.observation import central_pixel
+from psfdae.image.stamps import central_pixel
 from psfdae.noise import noise_equivalent_px
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil

@@ -1,0 +1,376 @@
+"""Camera of an image: its pixel scale, gain, read noise and saturation, and who says so.
+
+A header and what the user states go in. Each value comes out with its origin, after a comparison
+with the pixels: of the header's values, those that cannot be right are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from psfdae.image.errors import ObservationError, reading
+from psfdae.image.fits_file import ImageFile, card_value, open_pixels
+from psfdae.image.sky_level import noise_correlation
+
+BLOCK_PX = 32
+"""Side of the squares in which sky and noise are measured."""
+
+LARGEST_STAMP_PX = 256
+"""Side of the largest stamps; planes of a cube that are larger are images."""
+
+HEADER_KEYS: dict[str, tuple[str, ...]] = {
+    # Arcseconds; the second is POPPY's.
+    "pixel scale": (
+        *("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1", "PIXSCAL1", "IM_SCALE", "SCALE"),
+    ),
+    # Electrons per count.
+    "gain": (*("EGAIN", "GAIN", "ESO DET OUT1 CONAD", "ATODGAIN", "CCDGAIN", "GAIN1", "GAINA"),),
+    # Electrons.
+    "read noise": (
+        *("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE"),
+        *("ESO DET OUT1 RON", "CCDNOISE", "RDNOISE1", "RDNOISEA"),
+    ),
+    # Counts.
+    "saturation": ("SATURATE", "SATLEVEL", "SATURATA", "MAXLIN"),
+}
+"""Keys under which headers have a value of the camera; the first number above 0 is taken."""
+
+
+class CameraValue(NamedTuple):
+    """Number and its origin: "given", "WCS" or a key of the header.
+
+    The number is None where it is not known; then the origin says why.
+    """
+
+    value: float | None
+    origin: str
+
+
+class CheckedCamera(NamedTuple):
+    """Camera values that fit the pixels, and a sentence on each that does not."""
+
+    values: dict[str, CameraValue]
+    remarks: list[str]
+
+
+@dataclass(frozen=True)
+class SkySample:
+    """Sky of an image from squares spread over it, in the image's unit.
+
+    Attributes
+    ----------
+    level, noise : float
+        Median over the squares of their median and of their scatter, σ by the median deviation
+        and, where pixels share their noise, that of sums of pixels.
+    highest : float
+        Largest pixel of all squares.
+    """
+
+    level: float
+    noise: float
+    highest: float
+
+
+def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[str, CameraValue]:
+    """Return pixel scale, gain, read noise and saturation, each with its origin.
+
+    Parameters
+    ----------
+    image : ImageFile
+    stated : mapping
+        Values by the names of `HEADER_KEYS`. They go before those of WCS and header; None is not
+        stated.
+    """
+    values = {
+        "pixel scale": pixel_scale(image),
+        "gain": electrons_per_count(image),
+        "read noise": header_number(image, HEADER_KEYS["read noise"]),
+        "saturation": header_number(image, HEADER_KEYS["saturation"]),
+    }
+    values |= {name: CameraValue(v, "given") for name, v in stated.items() if v is not None}
+    return values
+
+
+def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
+    """Return the first finite number above 0 under one of the keys, in the order of the keys."""
+    for key in keys:
+        for header in image.headers:
+            value = card_value(header, key)
+            try:
+                number = float("nan" if isinstance(value, bool) else value)
+            except (TypeError, ValueError):
+                continue
+            if np.isfinite(number) and number > 0:
+                return CameraValue(number, key)
+    return CameraValue(None, "not known")
+
+
+def pixel_scale(image: ImageFile) -> CameraValue:
+    """Return arcseconds per pixel by the WCS, or by other cards of the header."""
+    from astropy.wcs.utils import proj_plane_pixel_area
+
+    if image.wcs is not None:
+        # Side of a square as large as a pixel at the reference point.
+        with reading(image.path):
+            scale = float(np.sqrt(proj_plane_pixel_area(image.wcs))) * 3600.0
+        if math.isfinite(scale) and scale > 0:
+            return CameraValue(scale, "WCS")
+    header_scale = header_number(image, HEADER_KEYS["pixel scale"])
+    # Amateurs' cameras have the width of a pixel in micrometres, and the focal length in
+    # millimetres: angle = width / focal length.
+    width_um, focus_mm = (header_number(image, (key,)).value for key in ("XPIXSZ", "FOCALLEN"))
+    if header_scale.value is None and width_um and focus_mm:
+        scale = float(np.rad2deg(width_um * 1e-3 / focus_mm)) * 3600.0
+        return CameraValue(scale, "XPIXSZ and FOCALLEN")
+    return header_scale
+
+
+def electrons_per_count(image: ImageFile) -> CameraValue:
+    """Return electrons per count of the pixels.
+
+    Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
+    per second, or of a calibrated brightness, the gain of the camera is not that of the pixels.
+    """
+    unit = image.unit.lower().replace(" ", "")
+    if unit in {"electron", "electrons", "e-", "e"}:
+        return CameraValue(1.0, "BUNIT")
+    if unit.endswith(("/s", "/sec", "/second", "s-1", "s**-1", "s^-1")):
+        return CameraValue(None, "not known, the image is a rate")
+    if "jy" in unit or "erg" in unit:
+        return CameraValue(None, f"not known, the image is in {image.unit}")
+    gain = header_number(image, HEADER_KEYS["gain"])
+    if gain.origin == "GAIN":
+        # A whole number from 20 on without a unit is a setting, as of amateurs' cameras.
+        header = next(h for h in image.headers if card_value(h, "GAIN") is not None)
+        value, comment = header["GAIN"], str(card_value(header.comments, "GAIN"))
+        has_unit = re.search("e-|electron|adu", comment, re.IGNORECASE)
+        if isinstance(value, int) and value >= 20 and not has_unit:
+            return CameraValue(None, f"not known, GAIN = {gain.value:g} is a setting of the camera")
+    return gain
+
+
+def sky_sample(image: ImageFile) -> SkySample | None:
+    """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
+
+    Squares of one value, such as an area without data, do not count.
+    """
+    rows, columns = image.shape
+    # Bands of 32 rows, evenly spread over the image.
+    last_row = max(rows - BLOCK_PX, 0)
+    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // BLOCK_PX))).astype(int))
+    levels, noises, highest = [], [], -np.inf
+    # Deviations from the sky in σ, band below band, with four rows without values between them.
+    deviations: list[np.ndarray] = []
+    with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
+        for start in starts:
+            band = pixels[start : start + BLOCK_PX]
+            band = np.where(np.isfinite(band), band, np.nan)
+            deviation = np.full((BLOCK_PX + 4, columns), np.nan)
+            deviations.append(deviation)
+            for column in range(0, columns, BLOCK_PX):
+                square = band[:, column : column + BLOCK_PX]
+                values = square[np.isfinite(square)]
+                if values.size < BLOCK_PX:
+                    continue
+                # Stars in a square hardly change its median.
+                highest = max(highest, float(values.max()))
+                level = float(np.median(values))
+                # σ of a normal distribution is 1.4826 times its median deviation.
+                noise = 1.4826 * float(np.median(np.abs(values - level)))
+                if noise > 0:
+                    deviation[: len(band), column : column + BLOCK_PX] = (square - level) / noise
+                    levels.append(level)
+                    noises.append(noise)
+    if not levels:
+        return None
+    # Resampled pixels share noise: sums of them scatter by more than independent ones.
+    correlation = noise_correlation(np.concatenate(deviations))
+    return SkySample(float(np.median(levels)), correlation * float(np.median(noises)), highest)
+
+
+def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
+    """Return the largest value of an image, and its pixels, if the image was cut off there.
+
+    Noise gives no five pixels far above the sky exactly the same value; those of saturated stars
+    lie together, and those of a value for bad pixels do not. A value that over a hundredth of the
+    image has is that of an area without data.
+    """
+    largest, count, pairs = -np.inf, 0, 0
+    with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
+        for start in range(0, image.shape[0], 8 * BLOCK_PX):
+            band = pixels[start : start + 8 * BLOCK_PX]
+            top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
+            if top > largest:
+                largest, count, pairs = top, 0, 0
+            # Pixels of the largest value, and pairs of them side by side.
+            full = band == largest
+            count += int(np.count_nonzero(full))
+            pairs += int(np.count_nonzero(full[:, 1:] & full[:, :-1]))
+            pairs += int(np.count_nonzero(full[1:] & full[:-1]))
+    # Few pixels, most of them in pairs, far above the sky.
+    suits_stars = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
+    clipped = suits_stars and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
+    return (largest, count) if clipped else None
+
+
+def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> CheckedCamera:
+    """Leave out header values that the pixels contradict; those that are given stay, with a word.
+
+    Parameters
+    ----------
+    image : ImageFile
+        An image, no cube of stamps.
+    camera : mapping
+        Values by the names of `HEADER_KEYS`.
+
+    Raises
+    ------
+    ObservationError
+        If a saturation that is given is below the sky.
+    """
+    sky, values = sky_sample(image), dict(camera)
+    if sky is None:
+        return CheckedCamera(values, [])
+    values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
+    # A gain of the header that cannot be right is not used, one that is stated is.
+    problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
+    if problem is None:
+        return CheckedCamera(values, remarks)
+    origin = camera["gain"].origin
+    if origin == "given":
+        return CheckedCamera(values, [*remarks, f"{image.path}: {problem}: used as stated"])
+    values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
+    remarks.append(
+        f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
+        "subtracted?): not used, errors come from the pixels; --gain states another one"
+    )
+    # A scale on which the gain is none cannot have the saturation of the camera, either.
+    level, origin = values["saturation"]
+    if level is not None and origin != "given" and sky.highest <= 1.0 < level:
+        values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
+    return CheckedCamera(values, remarks)
+
+
+def checked_saturation(
+    image: ImageFile, sky: SkySample, saturation: CameraValue
+) -> tuple[CameraValue, list[str]]:
+    """Return the saturation that fits the pixels, and sentences on another one.
+
+    It is the largest value, if the image was cut off there, below the level of the header.
+    """
+    unit, (level, origin) = image.unit or "counts", saturation
+    remarks = []
+    # A pixel of the sky cannot be saturated.
+    if level is not None and level <= sky.level:
+        problem = f"saturation at {level:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
+        if origin == "given":
+            raise ObservationError(image.path, f"{problem}; --saturate takes that of a pixel")
+        saturation = CameraValue(None, f"not known, {origin} is below the sky")
+        remarks.append(f"{image.path}: {problem}: not used, --saturate states another one")
+    # A pile-up of the largest value below the level of the header shows a lower saturation.
+    clipped = None if origin == "given" else clipped_level(image, sky)
+    if clipped is not None and (saturation.value is None or clipped[0] < saturation.value):
+        saturation = CameraValue(clipped[0], "the largest value")
+        remarks.append(
+            f"{image.path}: {clipped[1]} pixels have exactly the largest value, {clipped[0]:g} "
+            f"{unit}: taken as saturated, --saturate states another level"
+        )
+    return saturation, remarks
+
+
+def gain_contradiction(
+    image: ImageFile, sky: SkySample, gain: CameraValue, read_noise: CameraValue
+) -> str | None:
+    """Return how gain and read noise contradict the pixels; None if they do not.
+
+    Photons of the sky alone scatter by √(sky / gain), and the electronics by read noise / gain.
+    """
+    if not gain.value:
+        return None
+    photons = np.sqrt(max(sky.level, 0.0) / gain.value)
+    electronics = read_noise.value / gain.value if read_noise.value else 0.0
+    least_sigma = max(photons, electronics)
+    cause = f"{gain.origin} = {gain.value:g}"
+    # A mean of two frames has 0.71 of the noise of one; resampling leaves about 0.8.
+    if sky.noise < 0.75 * least_sigma:
+        if electronics >= photons:
+            cause = f"{read_noise.origin} = {read_noise.value:g} and {cause}"
+        return (
+            f"{cause} mean a noise of the sky of at least {least_sigma:.3g} "
+            f"{image.unit or 'counts'}, but the pixels scatter by {sky.noise:.3g}"
+        )
+    # A gain of counts on pixels of another unit, such as an image scaled to 0 … 1.
+    if sky.highest <= 1.0 and gain.origin not in ("given", "BUNIT"):
+        return f"{cause} is of counts, but no pixel is above 1"
+    return None
+
+
+def sky_coordinate_remarks(image: ImageFile) -> list[str]:
+    """Return sentences on a WCS that is damaged, or that says two things of its distortion."""
+    projection = str(image.card("CTYPE1") or "")
+    if image.wcs is None and projection[:4].strip("-") in ("RA", "DEC", "GLON", "GLAT"):
+        return [
+            f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
+            "coordinates, and the pixel scale is that of other keys"
+        ]
+    distorted = image.wcs is not None and image.wcs.sip is not None
+    if distorted and not projection.endswith("-SIP"):
+        return [
+            f"{image.path}: CTYPE1 = {projection} has no -SIP, but there is a polynomial of "
+            "distortion (A_ORDER): it is used; remove its keys if the image was resampled without "
+            "distortion"
+        ]
+    return []
+
+
+def refuse_colours(image: ImageFile) -> None:
+    """Refuse a frame of a colour camera, debayered or not: a PSF belongs to one colour.
+
+    Raises
+    ------
+    ObservationError
+        If the image has 3 or 4 large planes, the fourth for luminance or transparency; or one plane
+        of which BAYERPAT or its like names several colours.
+    """
+    shape = image.shape
+    if len(shape) == 3:
+        # A few large planes are no stamps of stars, whose side is at most 256 px.
+        first, last = shape[0] in (3, 4), shape[-1] in (3, 4)
+        if last or (first and max(shape[1:]) > LARGEST_STAMP_PX):
+            plane, size = ("[0]", shape[1:]) if first else ("[..., 0]", shape[:-1])
+            raise ObservationError(
+                image.path,
+                f"{shape[0] if first else shape[-1]} planes of {size[0]}×{size[1]} pixels, as of a "
+                "colour image; a PSF belongs to one colour: write one plane to a file of its own, "
+                f"such as astropy.io.fits.getdata(…){plane}, or their sum",
+            )
+        return
+    # The pattern of a colour filter array, four letters.
+    for header in image.headers:
+        for key in ("BAYERPAT", "COLORTYP", "CFAPAT"):
+            pattern = str(card_value(header, key) or "").strip().upper()
+            if len(pattern) == 4 and set(pattern) <= set("RGBCMYW") and len(set(pattern)) > 1:
+                raise ObservationError(
+                    image.path,
+                    f"an undebayered colour frame ({key} = {pattern}), neighbouring pixels are of "
+                    "different colours: debayer it, or take the pixels of one colour, such as "
+                    "data[0::2, 0::2], and write them without this card",
+                )
+
+
+def other_instruments(
+    training_instrument: Mapping[str, object], image_instrument: Mapping[str, str]
+) -> list[tuple[str, str, str]]:
+    """Return keys of telescope, camera or filter that differ in two headers, with both values."""
+    return [
+        (key, str(value), image_instrument[key])
+        for key, value in training_instrument.items()
+        if key in image_instrument
+        and image_instrument[key].strip().casefold() != str(value).strip().casefold()
+    ]

@@ -1,0 +1,197 @@
+"""Statements on an image and its stars, once for the command line and for Python.
+
+An option of `psfdae predict`, a keyword of `psfdae.Stars.from_image` and a row of a table on the
+pages are fields of `ImageStatements`. `ImageInput` adds the image, and opens it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+import numpy as np
+
+from psfdae.image.containers import in_unit
+from psfdae.image.errors import ObservationError
+from psfdae.image.fits_file import PlainFile
+from psfdae.image.positions import require_sky
+from psfdae.options import Extension, File
+
+if TYPE_CHECKING:
+    from astropy.units import Quantity
+
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.observation import Observation
+
+    Number: TypeAlias = float | Quantity
+else:
+    # What the command line takes in their place.
+    StarList, Number = File, float
+
+Layer: TypeAlias = Extension | Path | np.ndarray
+"""Extension of the image's file, another file, or an array as large as the image."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageStatements:
+    """Statements on an image and its stars; each goes before what the header says.
+
+    The text beside the type of a field is the help of its option, and its meaning in Python. There,
+    `catalogue` takes all that `psfdae.image.catalogue.as_catalogue` does, `detect` also the
+    threshold itself, a map an array as well, and numbers may have units (`astropy.units`).
+    """
+
+    catalogue: Annotated[StarList | None, "Star list of an image, FITS or CSV."] = None
+    detect: Annotated[bool | float, "Find the stars of an image; the list is written, too."] = False
+    on_image: Annotated[bool, "Leave out stars of the list that are off the image."] = False
+    threshold: Annotated[float, "Detection limit of --detect, in σ above the sky."] = 5.0
+    pixel_scale_arcsec: Annotated[
+        Number | None, {"flag": "--pixel-scale"}, "Arcseconds per pixel.  [default: the WCS's]"
+    ] = None
+    origin: Annotated[Literal[0, 1] | None, "Index of the first pixel's centre."] = None
+    extension: Annotated[Extension | None, "Name or number of the extension with the stars."] = None
+    mask: Annotated[
+        Layer | None,
+        "Extension or FITS file; pixels other than 0 are bad.  [default: DQ of the file; none]",
+    ] = None
+    bad_bits: Annotated[int | None, "Sum of the mask's bits that are bad.  [default: all]"] = None
+    weight: Annotated[Layer | None, "Extension or FITS file with 1/variance of the pixels."] = None
+    variance: Annotated[Layer | None, "Extension or FITS file with their variance."] = None
+    error: Annotated[
+        Layer | None, "Extension or FITS file with their σ.  [default: ERR of the file; none]"
+    ] = None
+    gain: Annotated[Number | None, "Electrons per count.  [default: the header's]"] = None
+    read_noise: Annotated[Number | None, "Electrons.  [default: the header's]"] = None
+    saturate: Annotated[Number | None, "Counts of a saturated pixel.  [default: the header's]"] = (
+        None
+    )
+    colour_column: Annotated[
+        str | None,
+        "Colours of the list's stars, with which the PSF may change; empty where unknown.",
+    ] = None
+    accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
+
+    @property
+    def detection_sigma(self) -> float | None:
+        """Threshold of the search for stars in σ above the sky; None without a search."""
+        if not self.detect:
+            return None
+        return self.threshold if self.detect is True else float(self.detect)
+
+
+@dataclass(frozen=True)
+class ImageInput(ImageStatements):
+    """FITS file with stars, or an array, and what is stated about it.
+
+    Attributes
+    ----------
+    image : Path, PlainFile or ndarray
+        Image, or cube of stamps, of which a catalogue has a row for each.
+    flux_column, background_column : str or None
+        Columns of the catalogue with fluxes inside the stamp, and with sky levels per pixel, that
+        are not to be estimated.
+    """
+
+    image: Path | PlainFile | np.ndarray
+    flux_column: str | None = field(default=None, kw_only=True)
+    background_column: str | None = field(default=None, kw_only=True)
+
+    @property
+    def path(self) -> Path:
+        """The image's file, or what an array is called in messages."""
+        if isinstance(self.image, PlainFile):
+            return self.image.name
+        return self.image if isinstance(self.image, Path) else Path("array")
+
+    @property
+    def name(self) -> str:
+        """Default name of a model of its stars: the file's name without its suffixes."""
+        suffixes = re.compile(r"(\.(fits|fit|fts|fz|gz|bz2|xz|zip))+$", re.IGNORECASE)
+        return suffixes.sub("", self.path.name) or "model"
+
+    def files(self) -> tuple[object, ...]:
+        """Return all that is read."""
+        return (self.image, self.catalogue, self.mask, self.weight, self.variance, self.error)
+
+    def of_each(self, images: Sequence[Path | PlainFile | np.ndarray]) -> list[ImageInput]:
+        """Return the same of each image; each takes the stars of a common list that are on it.
+
+        Raises
+        ------
+        ObservationError
+            If the list of several images has no sky coordinates.
+        """
+        on_image = self.on_image
+        if self.catalogue is not None and len(images) > 1:
+            require_sky(self.catalogue, "a training on several images")
+            on_image = True
+        return [replace(self, image=image, on_image=on_image) for image in images]
+
+    def camera(self, image_unit: str = "") -> dict[str, float | None]:
+        """Return the camera's values that are stated as plain numbers, None for the others.
+
+        Parameters
+        ----------
+        image_unit : str
+            Unit of the image's pixels, in which the saturation may be.
+
+        Returns
+        -------
+        dict
+            By the names of `psfdae.image.camera.HEADER_KEYS`: arcseconds per pixel, electrons per
+            count, electrons, counts.
+
+        Raises
+        ------
+        ObservationError
+            If a value has another unit, or is no number above 0; likewise the threshold.
+        """
+        stated: dict[str, tuple[Number | None, str]] = {
+            "pixel scale": (self.pixel_scale_arcsec, "arcsec/pix arcsec"),
+            "gain": (self.gain, "electron/adu electron/ct electron/DN"),
+            "read noise": (self.read_noise, "electron"),
+            "saturation": (self.saturate, f"adu ct DN {image_unit.replace(' ', '')}"),
+        }
+        numbers = {
+            name: in_unit(value, units, name, self.path) for name, (value, units) in stated.items()
+        }
+        for name, number in {**numbers, "threshold": self.detection_sigma}.items():
+            if number is not None and not (math.isfinite(number) and number > 0):
+                raise ObservationError(self.path, f"{name} {number!r}, expected a number above 0")
+        return numbers
+
+    def open(self, stamp_px: int, margin: int = 0) -> Observation:
+        """Check all that can be checked without reading pixels, and describe the stars.
+
+        Pixels are read to find stars, and where there is a map of noise.
+
+        Parameters
+        ----------
+        stamp_px : int
+            Side of the stamps.
+        margin : int
+            Pixels around each of them; those of a cube get as many of these as they have.
+
+        Raises
+        ------
+        ObservationError
+            If the image, its list or a statement cannot be used; one line that names the file.
+        """
+        from psfdae.image.observation import open_observation
+
+        if stamp_px < 1:
+            raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
+        if margin < 0:
+            raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
+        if self.origin not in (None, 0, 1):
+            raise ObservationError(
+                self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
+            )
+        # A mask has up to 63 bits and a sign.
+        if self.bad_bits is not None and not 0 < self.bad_bits < 2**63:
+            raise ObservationError(self.path, f"bad bits {self.bad_bits}, expected 1 to 2**63 - 1")
+        return open_observation(self, stamp_px, margin)

@@ -1,0 +1,484 @@
+"""Mask and map of noise of an image, and what its pixels are by them.
+
+The statements on an image go in, and `find_layers` finds what they name, or what the image's own
+file has beside it: extensions such as DQ and ERR. Out come `Layers`: the image, which of its pixels
+are bad, their σ, and the sky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
+from psfdae.image.camera import CameraValue
+from psfdae.image.detection import Sky, sky_of
+from psfdae.image.errors import ObservationError, reading, silent
+from psfdae.image.fits_file import (
+    MAPS,
+    SCIENCE,
+    ImageFile,
+    Pixels,
+    array_image,
+    card_value,
+    find_image,
+    has_pixels,
+    is_science,
+    open_hdus,
+    open_pixels,
+)
+from psfdae.image.trails import with_trails
+
+if TYPE_CHECKING:
+    from psfdae.image.image_input import ImageInput
+
+NOISE_MAPS = {"weight": "a weight map", "variance": "a variance map", "error": "a map of σ"}
+"""Words for the kinds of maps of noise: 1/σ² but for a factor, σ², σ."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseMap:
+    """Map of the noise of an image's pixels.
+
+    Attributes
+    ----------
+    image : ImageFile
+    kind : str
+        A key of `NOISE_MAPS`.
+    scale : float
+        Factor from σ of the map to σ in the image, where the sky shows it.
+    photons : float
+        Variance of the map for a unit of light above the sky; 0 for a map of the sky alone.
+    """
+
+    image: ImageFile
+    kind: str
+    scale: float = 1.0
+    photons: float = 0.0
+
+    def sigma(self, values: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return σ of the sky in pixels from their values in the map, NaN where it has none.
+
+        The photons of stars, `light` above the sky, are taken out of a map that has them.
+        """
+        # σ² of the sky and of the light of stars.
+        with np.errstate(all="ignore"):
+            if self.kind == "weight":
+                variance = 1.0 / values
+            else:
+                variance = values**2 if self.kind == "error" else values
+            has_value = np.isfinite(variance) & (variance > 0)
+            # Light is noisy, too; at least a hundredth of the variance is of the sky.
+            variance = np.clip(variance - self.photons * light, 0.01 * variance, 2.0 * variance)
+        return self.scale * np.sqrt(np.where(has_value, variance, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Image with its mask and map of noise, and how they are read.
+
+    Attributes
+    ----------
+    image : ImageFile
+    mask : ImageFile or None
+    bad_bits : int or None
+        Bits of the mask that are bad; None for all.
+    noise : NoiseMap or None
+    least_noise : float
+        Read noise in counts; 0 where it or the gain is not known.
+    saturate : float or None
+        Counts from which a pixel is saturated.
+    """
+
+    image: ImageFile
+    mask: ImageFile | None = None
+    bad_bits: int | None = None
+    noise: NoiseMap | None = None
+    least_noise: float = 0.0
+    saturate: float | None = None
+    # The bad pixels, once they are found. Copies with another map of noise share them.
+    _bad_pixels: list[BadPixels] = field(default_factory=list, repr=False)
+
+    @contextmanager
+    def open(self, in_pieces: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
+        """Yield the pixels of image, mask and map of noise, None for what there is not.
+
+        Parameters
+        ----------
+        in_pieces : bool
+            See `psfdae.image.fits_file.open_pixels`.
+        """
+        with ExitStack() as files:
+
+            def pixels_of(image: ImageFile, dtype: type[np.floating] = np.float32) -> Pixels:
+                return files.enter_context(open_pixels(image, in_pieces=in_pieces, dtype=dtype))
+
+            pixels = pixels_of(self.image)
+            # Bits of whole numbers do not fit into the mantissa of a float32.
+            mask = None if self.mask is None else pixels_of(self.mask, np.float64)
+            noise = None if self.noise is None else pixels_of(self.noise.image)
+            yield pixels, mask, noise
+
+    def is_bad(self, values: np.ndarray) -> np.ndarray:
+        """Return True for the values of the mask that are bad; those that are no number are."""
+        if self.bad_bits is None:
+            return np.asarray(values != 0)
+        with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
+            return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
+
+    def sky(self) -> Sky:
+        """Return the image as a whole with its sky.
+
+        Raises
+        ------
+        ObservationError
+            If the sky was clipped, or too few pixels have a value.
+        """
+        return _sky(self)
+
+    @property
+    def bad_pixels(self) -> BadPixels:
+        """Pixels of the image that are left out; raises ObservationError if its sky was clipped."""
+        return self._bad_pixels[0] if self._bad_pixels else self.find_bad(*self.read()[:2])
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return the image (h, w), its masked pixels, and σ of all pixels if there is a map."""
+        sigma = None
+        # Pixels without a number, of the mask, or without noise in its map are masked.
+        with self.open(in_pieces=False) as (pixels, mask, noise):
+            image = pixels[:]
+            masked = ~np.isfinite(image)
+            if mask is not None:
+                masked |= self.is_bad(mask[:])
+            if noise is not None and self.noise is not None:
+                sigma = replace(self.noise, photons=0.0).sigma(noise[:])
+                masked |= np.isnan(sigma)
+        return image, masked, sigma
+
+    def find_bad(self, image: np.ndarray, masked: np.ndarray) -> BadPixels:
+        """Search for bad pixels in what `read` returns, once."""
+        if not self._bad_pixels:
+            try:
+                with silent():
+                    bad_pixels = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    self._bad_pixels.append(with_trails(image, bad_pixels))
+            except ClippedSkyError as error:
+                raise ObservationError(self.image.path, str(error)) from None
+        return self._bad_pixels[0]
+
+
+@lru_cache(maxsize=1)
+def _sky(layers: Layers) -> Sky:
+    """Return the image of layers with its sky; that of the last ones is kept for more calls."""
+    # The sky is measured without bad pixels, in units of the map of σ if there is one.
+    image, masked, sigma = layers.read()
+    bad_pixels = layers.find_bad(image, masked)
+    with silent():
+        try:
+            measured = bad_pixels.sky
+            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)
+        except ValueError:  # nothing to measure the sky on
+            problem = "too few pixels of the image have a value that is not masked"
+            if layers.mask is not None and layers.bad_bits is None:
+                problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
+            raise ObservationError(layers.image.path, problem) from None
+    if layers.noise is None or not layers.noise.photons:
+        return sky
+    # σ without the photons of the stars, whose light is known now.
+    with layers.open(in_pieces=False) as (_, _, noise):
+        assert noise is not None
+        sigma = layers.noise.sigma(noise[:], sky.flat)
+    return replace(sky, noise=(sky.noise_scale * sigma).astype(np.float32))
+
+
+def find_layers(
+    source: ImageInput, image: ImageFile, is_cube: bool, camera: dict[str, CameraValue]
+) -> tuple[Layers, list[str]]:
+    """Find mask and map of noise of an image, those that are stated or those of its own file.
+
+    Parameters
+    ----------
+    source : ImageInput
+        What is stated of them.
+    image : ImageFile
+    is_cube : bool
+        The image is a cube of stamps, of which the file's other extensions are not used.
+    camera : dict of str to CameraValue
+
+    Returns
+    -------
+    layers : Layers
+    remarks : list of str
+        Sentences on what is used of the image's own file.
+
+    Raises
+    ------
+    ObservationError
+        If a layer cannot be found, or is not as large as the image; or if statements exclude each
+        other.
+    """
+    # The mask, and the noise of the electronics in counts: read noise / gain.
+    layers_of_file = {} if is_cube else layers_beside(image)
+    mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
+    gain, read_noise = camera["gain"].value, camera["read noise"].value
+    layers = Layers(
+        image,
+        mask,
+        bad_bits,
+        least_noise=read_noise / gain if read_noise and gain else 0.0,
+        saturate=camera["saturation"].value,
+    )
+    # The map of noise: one that is stated, else that of the file, if nothing is.
+    maps = {kind: getattr(source, kind) for kind in NOISE_MAPS}
+    stated = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
+    if len(stated) > 1 or (stated and is_cube):
+        raise ObservationError(
+            source.path,
+            "an image takes one map of weight, variance or error, a cube of stamps none",
+        )
+    notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
+    for kind, place in stated.items():
+        noise = _layer_of(image, place, NOISE_MAPS[kind])
+        if zeros := count_zeros(noise, kind):
+            remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
+        layers = replace(layers, noise=NoiseMap(noise, kind))
+    # Without a statement, the map of the image's own file.
+    if all(place is None for place in maps.values()):
+        for kind in layers_of_file.keys() & NOISE_MAPS.keys():
+            noise = layers_of_file[kind]
+            # In a map of the file 0 is for bad pixels; it must have values for half of all.
+            with open_pixels(noise, in_pieces=False) as pixels:
+                good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
+            if good < 0.5:
+                notes.insert(0, f"not {noise.label} ({100 * good:.0f} % of its pixels are above 0)")
+            else:
+                layers = replace(layers, noise=NoiseMap(noise, kind))
+                notes.insert(0, f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}")
+    if notes:
+        line = f"{source.path}: uses {' and '.join(notes)}"
+        if mask is not None and source.mask is None:
+            # A bit may mark pixels that are fine; then good stars would be lost.
+            with open_pixels(mask, in_pieces=False, dtype=np.float64) as pixels:
+                share = float(np.mean(layers.is_bad(pixels[:])))
+            if share > 0.2:
+                line += (
+                    f"; {100 * share:.0f} % of the pixels have a bit of {mask.label}: "
+                    "state --bad-bits, or --mask none"
+                )
+        remarks.insert(0, line)
+    return layers, remarks
+
+
+def mask_and_bits(
+    source: ImageInput, image: ImageFile, mask: ImageFile | None
+) -> tuple[ImageFile | None, int | None, list[str]]:
+    """Return the mask that is stated, else that of the image's file, its bad bits, and remarks."""
+    if source.mask is not None:
+        mask = None if _is_none(source.mask) else _layer_of(image, source.mask, "a mask")
+    if mask is None and source.bad_bits is not None:
+        raise ObservationError(source.path, "bits are given, but no mask that has them")
+    bits_of_header = None if mask is None else bits_of_bad_pixels(mask)
+    if mask is None or source.bad_bits is not None or bits_of_header is None:
+        return mask, source.bad_bits, []
+    bits, planes = bits_of_header
+    note = f"{source.path}: bad pixels by {mask.label}: {planes} (bits {bits})"
+    return mask, bits, [note]
+
+
+def _is_none(place: object) -> bool:
+    """Return True for the word that takes no layer, not even that of the image's file."""
+    return isinstance(place, str) and place.strip().lower() == "none"
+
+
+def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
+    """Return a layer that is stated, with a pixel for every one of the image, or of its stamps.
+
+    Parameters
+    ----------
+    image : ImageFile
+    place : str, int, Path or ndarray
+        Extension of the image's file, another file, or an array.
+    role : str
+        Words for the layer, for messages.
+    """
+    # An array, the path of a file, or else an extension; a text may be either of these two.
+    is_array = isinstance(place, np.ndarray)
+    is_file = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
+    if image.values is not None and not (is_array or is_file):
+        raise ObservationError(image.path, f"{role} of an array is an array, too, or a file")
+    if is_array:
+        layer = array_image(np.asarray(place, dtype=np.float64), role)
+    else:
+        layer = find_image(Path(place)) if is_file else find_image(image.file, place)
+    # It has the shape of the image.
+    shape = image.shape
+    if len(layer.shape) == 3 and layer.shape[0] == 1 and len(shape) == 2:
+        layer = layer.one_plane()
+    # All stamps of a cube may share the mask of one.
+    if layer.shape != shape and not (len(shape) == 3 and layer.shape == shape[1:]):
+        size, expected = ("×".join(map(str, s)) for s in (layer.shape, shape))
+        raise ObservationError(layer.path, f"{role} of {size} pixels, expected {expected}")
+    return layer
+
+
+def count_zeros(noise: ImageFile, kind: str) -> int:
+    """Return the number of pixels, bad ones, in which a map of noise that is stated is 0.
+
+    Raises
+    ------
+    ObservationError
+        If its name says another kind, or it has values that no map of its kind has.
+    """
+    kind_by_name = map_kind(noise)
+    if kind_by_name in NOISE_MAPS and kind_by_name != kind:
+        raise ObservationError(
+            noise.path,
+            f"extension {noise.label} is {NOISE_MAPS[kind_by_name]}, not {NOISE_MAPS[kind]}: "
+            f"--{kind_by_name} {noise.label}",
+        )
+    with open_pixels(noise, in_pieces=False) as pixels:
+        values = pixels[:]
+    # Values that no σ², 1/σ² or σ has.
+    negative, zeros = int(np.count_nonzero(values < 0)), int(np.count_nonzero(values == 0))
+    # SWarp and SExtractor write the weight or σ 0 where there are no data.
+    may_be_0 = kind != "variance"
+    if negative or (zeros and not may_be_0):
+        raise ObservationError(
+            noise.path,
+            f"{NOISE_MAPS[kind]} of which {negative + (not may_be_0) * zeros} of {values.size} "
+            f"pixels are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, "
+            "or a mask",
+        )
+    return zeros
+
+
+def with_photons(
+    layers: Layers, camera: dict[str, CameraValue], sky: Sky
+) -> tuple[Layers, dict[str, CameraValue], list[str]]:
+    """Return layers that know how the map of noise grows with the light of stars.
+
+    Where photons make the noise, variance = variance of the sky + light / gain. A map of the sky
+    alone does not grow, and nothing changes.
+
+    Parameters
+    ----------
+    layers : Layers
+        With a map of noise.
+    camera : dict of str to CameraValue
+    sky : Sky
+        The image without its sky.
+
+    Returns
+    -------
+    layers : Layers
+    camera : dict of str to CameraValue
+        With the gain that the map shows, if it is not known otherwise.
+    remarks : list of str
+        A sentence on this gain.
+    """
+    assert layers.noise is not None
+    with layers.open(in_pieces=False) as (_, _, noise):
+        assert noise is not None
+        sigma = layers.noise.sigma(noise[:])
+    # Pixels of stars in which photons of the star are a large part of the variance, if any are;
+    # and pixels of the sky.
+    good = ~sky.bad & np.isfinite(sigma)
+    variance, snr = sigma**2, sky.flat / np.where(sky.noise > 0, sky.noise, np.inf)
+    bright = good & (sky.flat > 0)
+    bright &= snr >= np.quantile(snr[bright], 0.9) if bright.any() else False
+    faint = good & (np.abs(snr) < 1.0)
+    if np.count_nonzero(bright) < 50 or not faint.any():
+        return layers, camera, []
+    # Slope of the variance with the light, and its scatter: 1.48 median deviations.
+    growth = (variance[bright] - np.median(variance[faint])) / sky.flat[bright]
+    slope = float(np.median(growth))
+    spread = 1.48 * float(np.median(np.abs(growth - slope)))
+    if not (slope > 0 and spread < 0.3 * slope):
+        return layers, camera, []
+    # σ is scaled by the measured noise of the sky, and so is the slope of its square.
+    noise_map = replace(layers.noise, photons=slope / layers.noise.scale**2)
+    layers = replace(layers, noise=noise_map)
+    if camera["gain"].value is not None:
+        return layers, camera, []
+    label = noise_map.image.label
+    words = f"{layers.image.path}: {label} grows with the light of the stars: gain {1 / slope:.4g}"
+    return layers, camera | {"gain": CameraValue(1.0 / slope, label)}, [words]
+
+
+def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
+    """Find the mask and the map of noise that a file has for an image, by the names in `MAPS`.
+
+    They have its size. If names repeat, their versions (EXTVER) belong together; of a file with
+    several science images that do not, none is taken.
+
+    Returns
+    -------
+    dict of str to ImageFile
+        Under "mask"; under one of "error", "variance".
+    """
+    if image.values is not None:
+        return {}
+    with reading(image.path), open_hdus(image.file) as hdus:
+        # Layers belong to a science image if it is the only one, or that of a pipeline.
+        images = [(k, hdu) for k, hdu in enumerate(hdus) if has_pixels(hdu)]
+        science_hdu = hdus[image.index]
+        science_count = sum(is_science(hdu.name) for _, hdu in images)
+        of_pipeline = science_hdu.name.upper() in SCIENCE
+        if not is_science(science_hdu.name) or (science_count > 1 and not of_pipeline):
+            return {}
+        # Layers of its size and version, whose name is no part of another, such as VAR_POISSON.
+        places = [
+            k
+            for k, hdu in images
+            if not is_science(hdu.name)
+            and "_" not in hdu.name
+            and tuple(hdu.shape)[-2:] == image.shape[-2:]
+            and hdu.ver == science_hdu.ver
+        ]
+    # The first layer of each kind.
+    layers: dict[str, ImageFile] = {}
+    for place in places:
+        layer = find_image(image.file, place)
+        if len(layer.shape) > len(image.shape):
+            layer = layer.one_plane()
+        kind = map_kind(layer)
+        if layer.shape == image.shape and kind is not None:
+            layers.setdefault(kind, layer)
+    # A standard deviation goes before a variance; weights have no unit that could be trusted.
+    names = ("mask", "error" if "error" in layers else "variance")
+    return {name: layers[name] for name in names if name in layers}
+
+
+def map_kind(image: ImageFile) -> str | None:
+    """Return which of `MAPS` an extension is by its name or UTYPE, None if neither says it."""
+    name = str(image.card("EXTNAME") or "").strip().upper()
+    kind = next((kind for kind, names in MAPS.items() if names.fullmatch(name)), None)
+    if kind != "error":
+        return kind
+    # CCDData writes the type of its uncertainty as UTYPE.
+    types = {"STD": "error", "VAR": "variance", "IVAR": "weight"}
+    return types.get(str(image.card("UTYPE") or "STD").strip().upper(), kind)
+
+
+def bits_of_bad_pixels(mask: ImageFile) -> tuple[int, str] | None:
+    """Return the sum of the mask's bits that are bad by its header, and who says so.
+
+    None if the header does not say it. LSST names its planes (MP_BAD = 0 for bit 0); JWST's and
+    Roman's bit 1 is DO_NOT_USE.
+    """
+    # Planes of LSST of which the pixels show no light of stars; others mark good pixels.
+    lsst_planes = ("BAD", "SAT", "INTRP", "CR", "NO_DATA", "UNMASKEDNAN")
+    for header in mask.headers:
+        planes = {name: card_value(header, f"MP_{name}") for name in lsst_planes}
+        bits = {name: bit for name, bit in planes.items() if isinstance(bit, int) and 0 <= bit < 63}
+        if bits:
+            return sum(1 << bit for bit in set(bits.values())), ", ".join(bits)
+        if str(card_value(header, "TELESCOP")).strip().upper() in ("JWST", "ROMAN"):
+            return 1, "DO_NOT_USE"
+    return None

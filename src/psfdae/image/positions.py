@@ -1,0 +1,268 @@
+"""Positions of the stars of a list in an image: from its pixels or its sky coordinates, checked.
+
+A star list and an image go in; 0-based positions (n, 2), x and y, come out, NaN for stars that no
+pixel of the plane of the image shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.image.catalogue import Catalogue, as_catalogue
+from psfdae.image.errors import ObservationError, reading
+from psfdae.image.fits_file import ImageFile
+from psfdae.image.list_origin import TOLERANCE_PX, origin_of
+from psfdae.image.position_columns import Positions
+from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
+
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.layers import Layers
+
+SAME_STAR_PX = 0.1
+"""Distance below which two rows of a list are one star."""
+
+
+def require_sky(stars: StarList, purpose: str) -> None:
+    """Refuse a star list of several images that has no sky coordinates."""
+    table = as_catalogue(stars)
+    if not table.positions().sky:
+        raise ObservationError(
+            table.path,
+            f"{purpose} takes a list with sky coordinates, or --detect: pixels do not say which "
+            "image they are of",
+        )
+
+
+def positions_in_image(
+    image: ImageFile, table: Catalogue, columns: Positions, is_cube: bool
+) -> np.ndarray | None:
+    """Return the positions of the catalogue's stars, NaN in rows without one.
+
+    Parameters
+    ----------
+    image : ImageFile
+    table : Catalogue
+    columns : Positions
+        Columns of the list, and the origin of its pixels.
+    is_cube : bool
+        The image is a cube of stamps, one for each row of the list.
+
+    Returns
+    -------
+    ndarray or None, shape (n, 2)
+        None for a cube with a list on the sky.
+
+    Raises
+    ------
+    ObservationError
+        If the list has no star on the image, more than pixels, another number than the cube has
+        stamps, or pixels of an unknown origin; or if a WCS is missing.
+    """
+    if is_cube and len(table) != image.shape[0]:
+        raise ObservationError(
+            table.path, f"{len(table)} stars for the {image.shape[0]} stamps of {image.path}"
+        )
+    names = f"{columns.first},{columns.second}"
+    # From the sky by the WCS, or from pixels by their origin.
+    if columns.sky:
+        if is_cube:
+            return None
+        ra, dec = table.sky(columns)
+        if image.wcs is None:
+            raise ObservationError(
+                image.path,
+                f"no usable celestial WCS, which the sky coordinates {names} of {table.path} need",
+            )
+        with reading(image.path):
+            positions = np.stack(sky_to_pixel(image.wcs, ra, dec, image.shape), axis=1)
+    else:
+        if columns.origin is None:
+            raise ObservationError(
+                table.path,
+                f"the origin of columns {names} must be stated: is the centre of the first pixel "
+                "0 or 1? --origin says it",
+            )
+        listed = [table.pixels(name) for name in (columns.first, columns.second)]
+        positions = np.stack(listed, axis=1) - columns.origin
+    # What is beyond any image is no position: its squares would not even be numbers.
+    positions = np.where(np.abs(positions) < LARGEST_POSITION_PX, positions, np.nan)
+    if not is_cube:
+        check_overlap(image, table, columns, positions)
+    return positions
+
+
+def with_origin(
+    table: Catalogue, columns: Positions, layers: Layers
+) -> tuple[Positions, list[str]]:
+    """Return the columns of a list with the origin that the stars of an image show.
+
+    Returns
+    -------
+    columns : Positions
+        Unchanged if the stars do not show it clearly, or the image has no sky.
+    remarks : list of str
+        A sentence on the origin.
+    """
+    # Centroids of the stars differ from the listed pixels by the origin.
+    listed = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
+    try:
+        data_origin = origin_of(layers.sky(), listed)
+    except ObservationError:  # no sky can be measured
+        data_origin = None
+    if data_origin is None:
+        return columns, []
+    origin, offset, count = data_origin
+    sentence = (
+        f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
+        f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
+        "--origin states it"
+    )
+    return replace(columns, origin=origin), [sentence]
+
+
+def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return True for positions (n, 2), x and y, on an image (rows, columns)."""
+    pixel = central_pixel(positions[:, ::-1])
+    return np.asarray(((pixel >= 0) & (pixel < shape)).all(axis=1))
+
+
+def check_overlap(
+    image: ImageFile, table: Catalogue, columns: Positions, positions: np.ndarray
+) -> None:
+    """Refuse a list without a star on the image, or with more there than the image has pixels."""
+    height, width = image.shape
+    size = f"{image.path} of {width} columns and {height} rows"
+    count = np.count_nonzero(on_image(positions, image.shape))
+    if count > height * width:
+        raise ObservationError(
+            table.path, f"{count} stars are on the image {size}, more than it has pixels"
+        )
+    if count:
+        return
+    # The range of the positions shows a wrong unit, or another image.
+    ranges = "nowhere in its projection"
+    located = positions[np.isfinite(positions).all(axis=1)]
+    if len(located):
+        (x0, y0), (x1, y1) = located.min(axis=0), located.max(axis=0)
+        ranges = f"at x {x0:.6g} … {x1:.6g}, y {y0:.6g} … {y1:.6g}"
+    if columns.sky:
+        ranges += f" ({columns.first},{columns.second} without a unit are degrees)"
+    raise ObservationError(
+        table.path, f"none of the {len(table)} stars is on the image {size}; they are {ranges}"
+    )
+
+
+def repeated_rows(positions: np.ndarray) -> np.ndarray:
+    """Return True for positions (n, 2) within `SAME_STAR_PX` of an earlier one, shape (n,)."""
+    from scipy.spatial import cKDTree
+
+    located = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    is_repeated = np.zeros(len(positions), dtype=bool)
+    # Of each pair of rows at one place, the later one is a repetition.
+    pairs = cKDTree(positions[located]).query_pairs(SAME_STAR_PX, output_type="ndarray")
+    is_repeated[located[pairs.max(axis=1)]] = True
+    return is_repeated
+
+
+def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
+    """Return a sentence on how far stars are off the positions of their list.
+
+    Parameters
+    ----------
+    path : Path or None
+        The list.
+    off : ndarray, shape (n, 2)
+        Position of each star less that of the list, x and y in px; NaN where unknown.
+    accept : bool
+        Take the list whatever the offset is.
+
+    Returns
+    -------
+    str or None
+        None if fewer than five are known, or without a list.
+
+    Raises
+    ------
+    ObservationError
+        If half of the stars are off by more than 1 px along an axis, or all by 1 px along both.
+    """
+    offsets = off[~np.isnan(off).any(axis=1)]
+    if path is None or len(offsets) < 5:
+        return None
+    # Medians: neighbours and defects move some stars.
+    x, y = np.median(offsets, axis=0)
+    distance = np.median(np.abs(offsets), axis=0)
+    sentence = (
+        f"stars are off its positions by x {x:+.2f}, y {y:+.2f} px in the median, half of them "
+        f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(offsets)} stars)"
+    )
+    if accept:
+        return f"{path}: {sentence}"
+    # A list whose pixels count from the other origin is off by one pixel along both axes.
+    x1, y1 = round(x), round(y)
+    if x1 == y1 and abs(x1) == 1 and max(abs(x - x1), abs(y - y1)) < TOLERANCE_PX:
+        origin = int(x1 < 0)
+        raise ObservationError(
+            path,
+            f"{sentence}: its positions count from {origin}? --origin {origin} says so "
+            "(--accept-offset takes it as it is)",
+        )
+    # Half of the stars more than 1 px off: the list belongs to something else.
+    if (distance > 1.0).any():
+        raise ObservationError(
+            path,
+            f"{sentence}: a list of another image or origin, or x and y exchanged? --accept-offset "
+            "takes it as it is",
+        )
+    return f"{path}: {sentence}"
+
+
+def sky_to_pixel(
+    wcs: WCS, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions of stars in an image from their ICRS coordinates.
+
+    Distortions are inverted by iteration, and only for stars near the image: far from it their
+    polynomials fold back, and a star degrees away would seem to be in the image (Shupe et al. 2005,
+    ASP Conf. 347, 491 define them for the image).
+
+    Parameters
+    ----------
+    wcs : WCS
+    ra, dec : ndarray, shape (n,)
+        Degrees.
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Returns
+    -------
+    x, y : ndarray, shape (n,)
+        0-based; NaN for stars that the projection cannot show.
+    """
+    from astropy.coordinates import SkyCoord
+    from astropy.wcs import NoConvergence
+    from astropy.wcs.utils import skycoord_to_pixel
+
+    # First by the projection without its distortions.
+    stars = SkyCoord(ra, dec, unit="deg")
+    x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
+    # Stars at most one size of the image off its edge.
+    rows, columns = shape
+    is_near = (np.abs(x - columns / 2) < 1.5 * columns) & (np.abs(y - rows / 2) < 1.5 * rows)
+    if wcs.has_distortion and is_near.any():
+        try:
+            x[is_near], y[is_near] = skycoord_to_pixel(stars[is_near], wcs, mode="all")
+        # Where the iteration does not end, its last step counts, unless it runs away.
+        except NoConvergence as error:
+            solution = np.array(error.best_solution, dtype=np.float64)
+            if error.divergent is not None:
+                solution[error.divergent] = np.nan
+            x[is_near], y[is_near] = solution.T
+    return x, y
