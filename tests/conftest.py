@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 from contextlib import contextmanager
 
 import pytest
@@ -15,6 +16,7 @@ from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
 from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import annular_pupil
+from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     StateTracer,
     design_states,
@@ -22,7 +24,7 @@ from psfdae_paper.alignment.telescope import (
     grid_states,
 )
 from psfdae_paper.configuration.alignment import CHOICE
-from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.compose import clear_caches, config_dir, load
 from workflow_runs import PATH, snakemake
 
 
@@ -93,10 +95,28 @@ def noise():
 
 
 @pytest.fixture(scope="session")
-def tracer():
+def scene3():
+    """Configuration of scene 3, as the workflow uses it."""
+    return load(CHOICE)
+
+
+@pytest.fixture(scope="session")
+def tracer(scene3):
     """Ray tracer of scene 3."""
-    config = load(CHOICE)
-    return StateTracer(config.telescope, config.prescription, config.alignment)
+    return StateTracer(scene3.telescope, scene3.prescription, scene3.alignment)
+
+
+@pytest.fixture(scope="session")
+def operator(scene3):
+    """Propagation to the stamps of scene 3."""
+    return AlignmentStamps(scene3.telescope, scene3.optics, scene3.alignment)
+
+
+@pytest.fixture(scope="session")
+def exact_operator(scene3):
+    """The same on a finer pupil, in double precision."""
+    optics = scene3.optics.model_copy(update={"pupil_samples": [254], "precision": "complex128"})
+    return AlignmentStamps(scene3.telescope, optics, scene3.alignment)
 
 
 @pytest.fixture(scope="session")
@@ -141,6 +161,16 @@ def network(shipped):
 def field_psfs(tmp_path_factory):
     """384 noise-free stars of the shipped model's scene, 16 × 16, flux 1."""
     return fresh_psfs(tmp_path_factory.mktemp("field"), 384)
+
+
+@pytest.fixture
+def config_folder(tmp_path, monkeypatch):
+    """A copy of the configuration that commands take instead, and that a test may change."""
+    shutil.copytree(config_dir(), tmp_path / "config")
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
+    clear_caches()
+    yield tmp_path / "config"
+    clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -32,31 +32,12 @@ from psfdae_paper.alignment.telescope import (
     twin_states,
     uniform_states,
 )
-from psfdae_paper.configuration.alignment import CHOICE, Cnn, Perceptron
-from psfdae_paper.configuration.compose import load
-
-FIT = load(CHOICE).fit
-EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
+from psfdae_paper.configuration.alignment import Cnn, Perceptron
 
 
-@pytest.fixture(scope="module")
-def config():
-    return load(CHOICE)
-
-
-def _optics(config, movable, precision="complex64"):
-    optics = config.optics.model_copy(update={"precision": precision})
-    return AlignmentStamps(config.telescope, optics, config.alignment, movable)
-
-
-@pytest.fixture(scope="module")
-def operator(config):
-    return _optics(config, False)
-
-
-@pytest.fixture(scope="module")
-def exact_operator(config):
-    return _optics(config, False, "complex128")
+def _optics(scene3, movable, precision="complex64"):
+    optics = scene3.optics.model_copy(update={"precision": precision})
+    return AlignmentStamps(scene3.telescope, optics, scene3.alignment, movable)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +72,8 @@ CNN = Cnn(widths=[4] * 5, kernels=[3] * 5, strides=[1, 2, 1, 2, 2], leak=0.01)
 PERCEPTRON = Perceptron(components=10, widths=[16, 8])
 
 
-def test_cnn_is_the_paper_s(config):
-    network = AlignmentCnn(config.cnn, 9, 16)
+def test_cnn_is_the_paper_s(scene3):
+    network = AlignmentCnn(scene3.cnn, 9, 16)
     kinds = [type(layer) for layer in network.features]
     assert kinds == [nn.Conv2d, nn.BatchNorm2d, nn.LeakyReLU] * 5
     assert network.features[0].in_channels == 9
@@ -100,7 +81,7 @@ def test_cnn_is_the_paper_s(config):
     assert len(linear) == 1
     assert linear[0].out_features == 4
     assert network(torch.zeros(3, 9, 16, 16)).shape == (3, 4)
-    train = config.train_original
+    train = scene3.train_original
     assert (train.batch, train.epochs, train.lr) == (10, 100, 1e-3)
     assert not train.mirrors
 
@@ -112,9 +93,9 @@ def tiny():
     return rng.random((6, 9, 16, 16), dtype=np.float32), rng.uniform(-1, 1, (6, 4))
 
 
-def _training(config, epochs, data, seed=3, network=CNN):
+def _training(scene3, epochs, data, seed=3, network=CNN):
     stamps, states = data
-    defaults = config.train_original if network is CNN else config.train_noise_trained
+    defaults = scene3.train_original if network is CNN else scene3.train_noise_trained
     settings = defaults.model_copy(
         update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
     )
@@ -126,9 +107,9 @@ def _train(path, *arguments, report=lambda row: None):
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
-def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, network, tmp_path):
+def test_training_is_deterministic_and_resumes_where_it_was(scene3, tiny, network, tmp_path):
     complete, other_seed = (
-        _train(tmp_path / str(seed), config, 4, tiny, seed, network) for seed in (3, 4)
+        _train(tmp_path / str(seed), scene3, 4, tiny, seed, network) for seed in (3, 4)
     )
 
     def interrupt(row):
@@ -136,10 +117,10 @@ def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, networ
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "c", config, 4, tiny, 3, network, report=interrupt)
+        _train(tmp_path / "c", scene3, 4, tiny, 3, network, report=interrupt)
     epochs = []
     resumed = _train(
-        *(tmp_path / "c", config, 4, tiny, 3, network),
+        *(tmp_path / "c", scene3, 4, tiny, 3, network),
         report=lambda row: epochs.append(row["epoch"]),
     )
     assert epochs == [3, 4]
@@ -150,14 +131,14 @@ def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, networ
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
-def test_networks_learn_states_from_clean_stamps(config, stamps, states, network, tmp_path):
-    training = _train(tmp_path / "x", config, 45, (stamps, states), 3, network)
+def test_networks_learn_states_from_clean_stamps(scene3, stamps, states, network, tmp_path):
+    training = _train(tmp_path / "x", scene3, 45, (stamps, states), 3, network)
     error = np.abs(predict_states(training.model, stamps) - states).mean()
     assert error < 0.7 * np.abs(states).mean()
 
 
-def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, states):
-    model = _training(config, 1, (stamps, states), network=PERCEPTRON).model
+def test_perceptron_sees_uncorrelated_numbers_of_variance_1(scene3, stamps, states):
+    model = _training(scene3, 1, (stamps, states), network=PERCEPTRON).model
     images = np.concatenate([m.stamps(stamps) for m in mirror_symmetries(8)])
     scaled = torch.from_numpy(images).flatten(1) * stamps.shape[-1] ** 2
     features = ((scaled - model.mean) @ model.axes).numpy()
@@ -172,32 +153,32 @@ def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, stat
 # --- batches
 
 
-def _batches(config, size, data, epoch=0):
+def _batches(scene3, size, data, epoch=0):
     """Batches of an epoch without mirror images, as arrays."""
-    settings = config.train_original.model_copy(update={"batch": size})
-    training = NetworkTraining(data, config.cnn, settings, 1, "x")
+    settings = scene3.train_original.model_copy(update={"batch": size})
+    training = NetworkTraining(data, scene3.cnn, settings, 1, "x")
     batches = [tuple(part.numpy() for part in batch) for batch in training.batches(epoch)]
     assert len(batches) == training.steps
     return batches
 
 
-def test_every_epoch_shows_every_state_once(config, states, stamps):
+def test_every_epoch_shows_every_state_once(scene3, states, stamps):
     data = TrainingStates(states, stamps)
     first, second = (
-        np.concatenate([truth for _, truth in _batches(config, 8, data, epoch)]) for epoch in (0, 1)
+        np.concatenate([truth for _, truth in _batches(scene3, 8, data, epoch)]) for epoch in (0, 1)
     )
     once = sorted(states.astype(np.float32).tolist())
     assert sorted(first.tolist()) == sorted(second.tolist()) == once
     assert first.tolist() != second.tolist()
-    assert len(_batches(config, 8, data)) == 4
+    assert len(_batches(scene3, 8, data)) == 4
     # A batch of one has no variance to normalise.
-    assert len(_batches(config, 29, data)) == 1
+    assert len(_batches(scene3, 29, data)) == 1
 
 
-def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, states):
+def test_components_are_those_of_mirrored_noisy_stamps(scene3, noise, stamps, states):
     """A perceptron learns from components that its network would find in the stamps."""
-    network = config.perceptron.model_copy(update={"components": 20})
-    settings = config.train_noise_trained.model_copy(update={"epochs": 1, "batch": 5})
+    network = scene3.perceptron.model_copy(update={"components": 20})
+    settings = scene3.train_noise_trained.model_copy(update={"epochs": 1, "batch": 5})
     level = 0.005
     draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
     for data in (TrainingStates(states, draws), TrainingStates(states, stamps, noise, [level])):
@@ -241,9 +222,9 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 
 
 @pytest.mark.parametrize("movable", [False, True])
-def test_noise_free_parameters_are_recovered(model, config, noise, movable):
+def test_noise_free_parameters_are_recovered(model, scene3, noise, movable):
     """The start is 0.08 of the range aside; with flux and place unknown, they are found, too."""
-    optics = StateOptics(model, _optics(config, movable, "complex128"))
+    optics = StateOptics(model, _optics(scene3, movable, "complex128"))
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
     parameters = optics.parameters_of(truth)
     parameters[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, parameters[:, 4:].shape)
@@ -251,19 +232,22 @@ def test_noise_free_parameters_are_recovered(model, config, noise, movable):
     flux = 1 + parameters[:, 4::3] if movable else np.ones((2, 9))
     assert images.sum(axis=(2, 3)) == pytest.approx(flux)
     likelihood = Likelihood(optics, noise, 0.002, images)
-    fit = likelihood.maximise(optics.parameters_of(truth + 0.08), EXACT)
+    settings = scene3.fit.model_copy(update={"iterations": 25, "tolerance": 1e-7})
+    fit = likelihood.maximise(optics.parameters_of(truth + 0.08), settings)
     assert fit.converged.all()
     assert fit.parameters == pytest.approx(parameters, abs=1e-6)
     assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("movable", [False, True])
-def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
+def test_scatter_of_the_fit_is_the_bound(model, scene3, noise, states, stamps, movable):
     """The estimator is efficient at low noise: χ² of 20 × 4 errors within its 99.9 % range."""
-    optics = StateOptics(model, _optics(config, movable))
+    optics = StateOptics(model, _optics(scene3, movable))
     level, truth = 2e-4, states[:20]
     images = noise.draw(stamps[:20], level, np.random.default_rng(7))
-    fit = Likelihood(optics, noise, level, images).maximise(optics.parameters_of(truth + 0.01), FIT)
+    fit = Likelihood(optics, noise, level, images).maximise(
+        optics.parameters_of(truth + 0.01), scene3.fit
+    )
     covariances = bound_covariances(optics, noise, [level], truth, [movable])[0, 0]
     error = fit.parameters[:, :4] - truth
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
@@ -275,9 +259,9 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
     )
 
 
-def test_free_flux_and_place_cost_precision(model, config, operator, noise, states):
+def test_free_flux_and_place_cost_precision(model, scene3, operator, noise, states):
     """Errors grow by a quarter to a third, and shrink in no direction."""
-    movable, fixed = StateOptics(model, _optics(config, True)), StateOptics(model, operator)
+    movable, fixed = StateOptics(model, _optics(scene3, True)), StateOptics(model, operator)
     covariances = bound_covariances(movable, noise, [0.002], states[:12], [False, True])
     known_flux, unknown = covariances[:, 0]
     without_flux = bound_covariances(fixed, noise, [0.002], states[:12], [False])[0, 0]
@@ -287,9 +271,9 @@ def test_free_flux_and_place_cost_precision(model, config, operator, noise, stat
     assert np.linalg.eigvalsh(unknown - known_flux).min() > -1e-9
 
 
-def test_emulator_of_few_states(model, operator, states, stamps):
+def test_emulator_of_few_states(scene3, model, operator, states, stamps):
     """Stamps that it was given come back, in all mirror images; derivatives are differences."""
-    settings = FIT.model_copy(update={"outer_states": 5})
+    settings = scene3.fit.model_copy(update={"outer_states": 5})
     emulator = StampEmulator(StateOptics(model, operator), states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
     emulated, slopes = emulator(mirror.states(states))
@@ -302,13 +286,13 @@ def test_emulator_of_few_states(model, operator, states, stamps):
 
 
 @pytest.mark.parametrize("movable", [False, True])
-def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, movable):
-    optics = StateOptics(model, _optics(config, movable))
+def test_wrong_twin_is_left_for_the_more_likely_state(model, scene3, noise, movable):
+    optics = StateOptics(model, _optics(scene3, movable))
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt), tilt])
     images, _ = optics(optics.parameters_of(truth))
     likelihood = Likelihood(optics, noise, 0.002, images)
-    settings = FIT.model_copy(update={"tolerance": 0.05})
+    settings = scene3.fit.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
     twin = optics.parameters_of(twin_states(model, truth))
     stuck = likelihood.maximise(twin, settings.model_copy(update={"iterations": 1}))

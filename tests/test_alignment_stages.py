@@ -104,7 +104,7 @@ def test_same_configuration_gives_the_same_bytes(results, tmp_path):
         words = (*CHOICE, "preset=smoke", override)
         config = load_stage(states.stage.settings.reads, words)
         states(config, "uniform", tmp_path / f"{name}.h5")
-    first, again, other = (
+    first, repeated, with_other_seed = (
         read_product(path, "alignment_states")
         for path in (
             results / "data/alignment/uniform.h5",
@@ -112,8 +112,8 @@ def test_same_configuration_gives_the_same_bytes(results, tmp_path):
             tmp_path / "other.h5",
         )
     )
-    assert all((first[name] == again[name]).all() for name in first.arrays)
-    assert not np.isin(other["states"], first["states"]).any()
+    assert all((first[name] == repeated[name]).all() for name in first.arrays)
+    assert not np.isin(with_other_seed["states"], first["states"]).any()
 
 
 @pytest.mark.parametrize(
@@ -142,10 +142,10 @@ def test_tables_hold_every_method(results):
     """Flux and place are free for uniform states only."""
     errors = alignment_table(results, "errors")
     everyone = set(ALIGNERS) - {"cramer_rao_pooled"}
-    free = {name for name in everyone if name.endswith("_free")}
+    with_free_flux = {name for name in everyone if name.endswith("_free")}
     for (kind, level), rows in errors.groupby(["test_set", "noise_level"]):
         assert (rows.groupby("method").size() == 8).all()
-        noisy = everyone if kind == "uniform" else everyone - free
+        noisy = everyone if kind == "uniform" else everyone - with_free_flux
         clean = {"constant", *(method.name for method in LEARNED)}
         assert set(rows.method) == (noisy if level else clean)
     assert set(errors.noise_level) == {0, 0.002, 0.005}
@@ -161,8 +161,8 @@ def test_paper_s_rows_stand_beside_ours(results):
 
 def test_twin_is_closer_in_focus(results):
     table = alignment_table(results, "twin")
-    near = table[np.isclose(table.position, -1) & np.isclose(table.noise_level, 0.002)]
-    chi2 = near.set_index("defocus_mm").chi2
+    at_twin = table[np.isclose(table.position, -1) & np.isclose(table.noise_level, 0.002)]
+    chi2 = at_twin.set_index("defocus_mm").chi2
     assert chi2[0.2] > 10 * chi2[0.0]
     at_the_state = table[np.isclose(table.position, 1)]
     assert at_the_state.chi2.to_numpy() == pytest.approx(0, abs=1e-6)

@@ -13,29 +13,10 @@ from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.telescope.raytracing import annulus_points, misalign
 from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae_paper.alignment.telescope import uniform_states
-from psfdae_paper.configuration.alignment import CHOICE
-from psfdae_paper.configuration.compose import load
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
 """State and field of three stamps: aligned, astigmatic and comatic, a corner of the range."""
-
-
-@pytest.fixture(scope="module")
-def config():
-    return load(CHOICE)
-
-
-@pytest.fixture(scope="module")
-def operator(config):
-    return AlignmentStamps(config.telescope, config.optics, config.alignment)
-
-
-@pytest.fixture(scope="module")
-def exact(config):
-    """A finer pupil in double precision."""
-    optics = config.optics.model_copy(update={"pupil_samples": [254], "precision": "complex128"})
-    return AlignmentStamps(config.telescope, optics, config.alignment)
 
 
 def shown_zernikes(tracer):
@@ -54,7 +35,7 @@ def test_mean_slope_of_zernikes_over_the_annulus():
     assert mean_slope(9, OBSCURATION) == (0.0, 0.0)
 
 
-def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
+def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, scene3):
     """The tolerance is a hundredth of a pixel over the image's period; a longer one is better."""
     zernikes, worst = shown_zernikes(tracer), []
     for samples in (126, 254):
@@ -65,22 +46,22 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
         images = ModalStamps(pupil, modes, sampling, pixel).stamps(zernikes)
         parseval = (pupil.amplitude**2).sum() / pupil.amplitude.sum()
         assert images.sum(axis=(1, 2)) == pytest.approx(parseval, abs=1e-12)
-        position = (np.arange(samples) - 0.5 * (samples - 1)) * pixel / config.telescope.pixel
+        position = (np.arange(samples) - 0.5 * (samples - 1)) * pixel / scene3.telescope.pixel
         centroids = [images.sum(axis=axis) @ position for axis in (1, 2)]
         worst.append(np.abs(centroids).max())
     assert worst[1] < 0.01
     assert worst[1] < 0.6 * worst[0]
 
 
-def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
+def test_period_sampling_integrates_pixels_exactly(tracer, exact_operator, scene3):
     """The stamp propagator approaches it spectrally as its points increase."""
     zernikes = shown_zernikes(tracer)
-    modal = exact.propagation.operator(254)
+    modal = exact_operator.propagation.operator(254)
     pupil = annular_pupil(254, OBSCURATION)
     stamps = modal.stamps(zernikes)
     errors = []
     for extra in (6, 12, 18):
-        kernel = StampPropagator(pupil, 16, config.telescope.pixel, extra)
+        kernel = StampPropagator(pupil, 16, scene3.telescope.pixel, extra)
         errors.append(np.abs(kernel(modal.opd(zernikes)) - stamps).max() / stamps.max())
     assert errors[0] < 1e-3
     assert errors[1] < 1e-5
@@ -107,13 +88,13 @@ def test_derivatives_by_coefficients_are_differences(kind, product_cost):
     assert along == pytest.approx(np.einsum("bkj,bjyx->bkyx", directions, slopes), abs=1e-12)
 
 
-def test_derivatives_by_state_are_differences(model, exact):
+def test_derivatives_by_state_are_differences(model, exact_operator):
     states = uniform_states(1, np.random.default_rng(5))
-    stamps, slopes = exact.derivatives(model(states), model.jacobian(states))
-    assert stamps == pytest.approx(exact(model(states))[0], abs=1e-14)
+    stamps, slopes = exact_operator.derivatives(model(states), model.jacobian(states))
+    assert stamps == pytest.approx(exact_operator(model(states))[0], abs=1e-14)
     assert slopes.sum(axis=(3, 4)) == pytest.approx(0, abs=1e-12)
     for axis, step in enumerate(1e-4 * np.eye(4)):
-        plus, minus = (exact(model(states + s * step))[0] for s in (1, -1))
+        plus, minus = (exact_operator(model(states + s * step))[0] for s in (1, -1))
         assert slopes[:, :, axis] == pytest.approx((plus - minus) / 2e-4, abs=2e-6)
 
 
@@ -126,16 +107,16 @@ def test_every_stamp_of_the_range_holds_its_light(operator, grid):
     assert stamps.sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
 
 
-def test_stamps_that_lose_light_or_alias_are_refused(config, model):
+def test_stamps_that_lose_light_or_alias_are_refused(scene3, model):
     corner = model(np.ones((1, 4)))
-    small = config.alignment.model_copy(update={"stamp_px": 8, "least_energy": 0.9})
-    telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": 0.25})
+    small = scene3.alignment.model_copy(update={"stamp_px": 8, "least_energy": 0.9})
+    telescope = scene3.telescope.model_copy(update={"pixel_scale_arcsec": 0.25})
     message = r"stamp \d+ holds 0\.\d+ of the light \(alignment\.least_energy = 0\.9\)"
     with pytest.raises(EnergyError, match=message):
-        AlignmentStamps(telescope, config.optics, small)(corner)
-    coarse = config.optics.model_copy(update={"pupil_samples": [64, 90]})
+        AlignmentStamps(telescope, scene3.optics, small)(corner)
+    coarse = scene3.optics.model_copy(update={"pupil_samples": [64, 90]})
     with pytest.raises(SamplingError, match=r"pupil_samples = \[64, 90\]: wavefront \d+ needs N"):
-        AlignmentStamps(config.telescope, coarse, config.alignment)(corner)
+        AlignmentStamps(scene3.telescope, coarse, scene3.alignment)(corner)
 
 
 def test_chosen_grids_have_two_samples_per_wave_of_the_maps(operator, grid):
@@ -150,12 +131,12 @@ def test_chosen_grids_have_two_samples_per_wave_of_the_maps(operator, grid):
             assert np.abs(np.diff(opd, axis=axis))[..., pairs].max() <= 0.5
 
 
-def test_settings_stay_within_the_error_budget(operator, exact, model, config):
+def test_settings_stay_within_the_error_budget(operator, exact_operator, model, scene3):
     """1 % of the smallest noise variance; within about 1e-3 of the peak as well."""
-    budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2
+    budget = 0.01 * (scene3.noise.kappa * min(scene3.noise.levels)) ** 2
     states = uniform_states(4, np.random.default_rng(7))
     (stamps, slopes), (truth, true_slopes) = (
-        o.derivatives(model(states), model.jacobian(states)) for o in (operator, exact)
+        o.derivatives(model(states), model.jacobian(states)) for o in (operator, exact_operator)
     )
     assert stamps.dtype == slopes.dtype == np.float32
     assert ((stamps - truth) ** 2).mean(axis=(2, 3)).max() < budget
@@ -196,9 +177,9 @@ def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
     return stamp / stamp.sum()
 
 
-def test_against_batoid_s_huygens_psf(tracer, operator, config):
+def test_against_batoid_s_huygens_psf(tracer, operator, scene3):
     """No pupil, no Zernikes, no Fourier transform: rays alone; 2 % of the peak at most."""
-    ours = operator(shown_zernikes(tracer))[0]
-    for stamp, (state, field) in zip(ours, SHOWN, strict=True):
-        theirs = huygens_stamp(tracer, state, field, config.telescope)
-        assert np.abs(stamp - theirs).max() < 0.02 * stamp.max(), (state, field)
+    stamps = operator(shown_zernikes(tracer))[0]
+    for stamp, (state, field) in zip(stamps, SHOWN, strict=True):
+        expected = huygens_stamp(tracer, state, field, scene3.telescope)
+        assert np.abs(stamp - expected).max() < 0.02 * stamp.max(), (state, field)

@@ -30,22 +30,17 @@ ARCSEC = np.pi / 180 / 3600
 
 
 @pytest.fixture(scope="module")
-def config():
-    return load(CHOICE)
-
-
-@pytest.fixture(scope="module")
 def fields_deg(tracer):
     return np.rad2deg(tracer.field_rad)
 
 
-def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
+def test_focal_ratio_and_spots_of_the_prescription(scene3, tracer):
     from batoid.analysis import drdth, spot
 
-    optic = build_optic(config.prescription, config.telescope)
-    wavelength = config.telescope.wavelength_m
+    optic = build_optic(scene3.prescription, scene3.telescope)
+    wavelength = scene3.telescope.wavelength_m
     focal = drdth(optic, 0.0, 0.0, wavelength)[0, 0]
-    assert focal / config.telescope.diameter_m == pytest.approx(5.99, abs=0.005)
+    assert focal / scene3.telescope.diameter_m == pytest.approx(5.99, abs=0.005)
     for field in tracer.field_rad:
         x, y = spot(optic, *field, wavelength, nx=32, reference="mean")
         assert np.sqrt(x.var() + y.var()) / focal < 0.05 * ARCSEC
@@ -88,12 +83,12 @@ def test_batoid_s_own_zernike_fit(tracer):
 
     state = np.array([0.7, -1.0, 0.4, 0.9])
     optic = misalign(tracer.optic, state * tracer.misalignment_range)
-    ours = tracer(state[None])[0]
+    zernikes = tracer(state[None])[0]
     for field in (0, 3, 6):
-        theirs = zernike(
+        expected = zernike(
             optic, *tracer.field_rad[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
         )
-        assert ours[field] == pytest.approx(theirs[4:], abs=2e-6)
+        assert zernikes[field] == pytest.approx(expected[4:], abs=2e-6)
 
 
 def test_weights_of_the_annulus_integrate_zernike_products():

@@ -131,27 +131,16 @@ def test_stage_overrides_reproduce_the_stage_s_configuration():
         assert load_stage(SIMULATION, pinned) == load_stage(SIMULATION, chosen)
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A copy of the configuration that a test may change."""
-    folder = tmp_path / "config"
-    shutil.copytree(config_dir(), folder)
-    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.clear_caches()
-    yield folder
-    compose.clear_caches()
-
-
 DATASET = (
     "# @package _global_\ndefaults:\n  - {base}\n  - _self_\nseed: {seed}\n"
     "dataset:\n  name: mine{seed}\nnoise:\n  levels: [{seed}.0e-4, 2e-3]\n"
 )
 
 
-def test_a_dataset_is_one_small_file(folder):
+def test_a_dataset_is_one_small_file(config_folder):
     for seed in (1, 2):
         text = DATASET.format(base=f"dataset{3 + seed % 2}", seed=seed)
-        (folder / f"dataset/mine{seed}.yaml").write_text(text)
+        (config_folder / f"dataset/mine{seed}.yaml").write_text(text)
         config = load([f"dataset=mine{seed}", "preset=fast"])
         assert (config.seed, config.dataset.name) == (seed, f"mine{seed}")
         assert config.noise.levels == [float(f"{seed}e-4"), 2e-3]

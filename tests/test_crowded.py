@@ -19,6 +19,7 @@ from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
 from psfdae.files import read_product
+from psfdae.image.camera import CameraValue
 from psfdae.image.image_input import ImageInput
 from psfdae.image.stamps import cut_image
 from psfdae.model import crowded
@@ -240,7 +241,7 @@ def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     """Variance grows with the light of a star by 1/gain; not in an image without photon noise."""
     folder, path, true = sky
     model, observation = load_model(path), ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
-    unknown = replace(observation, camera=observation.camera | {"gain": (None, "not known")})
+    unknown = replace(observation, camera=observation.camera | {"gain": CameraValue(None, "")})
     assert with_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
     assert with_measured_gain(model, observation) is observation
     place = np.stack([true["x"], true["y"]], axis=1)

@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 
 from command_line import refused as refusal
 from psfdae.files import ProductError
 from psfdae.reading import read_yaml
-from psfdae_paper.configuration.compose import clear_caches, config_dir
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A copy of the configuration that commands take instead."""
-    shutil.copytree(config_dir(), tmp_path / "config")
-    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
-    clear_caches()
-    yield tmp_path / "config"
-    clear_caches()
-
 
 GOOD = b"# One.\nepochs: 12\nbatch: 32"
 TRAIN = "train/onecycle.yaml"
@@ -37,8 +23,8 @@ TRAIN = "train/onecycle.yaml"
         ("gmm/default.yaml", b"- stars\n", ("gmm/default",)),
     ],
 )
-def test_a_mistake_is_one_short_line_with_its_place(folder, name, content, words):
-    (folder / name).write_bytes(content)
+def test_a_mistake_is_one_short_line_with_its_place(config_folder, name, content, words):
+    (config_folder / name).write_bytes(content)
     line = refusal("config")
     assert all(word in line for word in words), line
     assert len(line) < 500

@@ -16,7 +16,7 @@ from psfdae.metrics import (
     mse,
     ssim,
 )
-from psfdae_paper.evaluation.paper import as_markdown, paper_table
+from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
     assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
     assert set(table.source) == {"paper", "psfdae"}
-    assert "2.7568e-05" in as_markdown(table, "dataset3", "mse")
+    assert "2.7568e-05" in paper_table_markdown(table, "dataset3", "mse")
 
 
 def test_correlation_is_pearson_s_with_fisher_s_interval():

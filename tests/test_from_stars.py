@@ -21,7 +21,7 @@ from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
 from psfdae.commands import from_stars as stage
-from psfdae.commands.from_stars import _locked
+from psfdae.commands.from_stars import locked_folder
 from psfdae.files import read_product, write_product
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
@@ -270,7 +270,7 @@ def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert not made.exists() and page.exists()
-    assert f"{page}: exists already" in refused(*words)
+    assert f"{page}: exists already" in refused("from-stars", *words)
     done = run(*words, "--overwrite")
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == training.bundle.read_bytes()
@@ -290,8 +290,8 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.from_stars import _locked\n"
-        "with _locked(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+        "from psfdae.commands.from_stars import locked_folder\n"
+        "with locked_folder(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
@@ -300,7 +300,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         message = refused("from-stars", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
-    with _locked(out):
+    with locked_folder(out):
         assert list(out.iterdir()) == []
     assert not out.exists()
 

@@ -15,7 +15,7 @@ from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 from psfdae_paper.configuration.compose import load
 
-OWN = "dataset=_telescope"
+OWN_TELESCOPE = "dataset=_telescope"
 FIELD = np.deg2rad([0.0, 0.1, 0.2])
 F, M, B = 8.0, 8.0 / 3.0, 0.25
 FOCUS, ASTIGMATISM, COMA_Y, COMA_X = 0, 2, 3, 4
@@ -23,7 +23,7 @@ FOCUS, ASTIGMATISM, COMA_Y, COMA_X = 0, 2, 3, 4
 
 
 def telescope_of(name):
-    return load([OWN, f"telescope=example_{name}"]).telescope
+    return load([OWN_TELESCOPE, f"telescope=example_{name}"]).telescope
 
 
 @pytest.fixture(scope="module")
@@ -128,4 +128,4 @@ LENS = (
 )
 def test_mirrors_that_cannot_be_are_named(name, override, message):
     with pytest.raises(ConfigError, match=rf"prescription: .*{message}"):
-        load([OWN, f"telescope=example_{name}", override])
+        load([OWN_TELESCOPE, f"telescope=example_{name}", override])

@@ -1,8 +1,10 @@
-"""A method of one's own: a class, its settings, and a name in the list, and it is everywhere."""
+"""Additions of one's own: how many files a method, a stage or a dataset takes.
+
+A method is a class, its settings, and a name in the list, and it is everywhere.
+"""
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 
@@ -11,7 +13,7 @@ import pytest
 import yaml
 from astropy.io import fits
 
-from workflow_runs import ROOT, environment, snakemake
+from workflow_runs import copy_of_sources, environment, planned, snakemake
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -53,6 +55,40 @@ class Shrunk(Method):
     def predict(self, noisy):
         return self.mean + self.weight * (noisy - self.mean)
 '''
+STAGE = '''
+"""Stage `count-fields`."""
+
+from typing import Annotated
+
+from psfdae.files import write_text
+from psfdae.options import File
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
+
+
+@command("count-fields", reads=("grid",))
+def count_fields(config: Config, out: Annotated[File, "Text."]) -> None:
+    """Count the fields."""
+    write_text(out, str(config.grid.points**2))
+'''
+RULE = """
+rule count_fields:
+    output:
+        f"{RESULTS}/fields.txt",
+    params:
+        config=lambda w: settings("count-fields", "dataset=dataset3"),
+        source=source_hash("count-fields"),
+    shell:
+        "psfdae count-fields --config {params.config} --out {output}"
+"""
+DATASET = """# @package _global_
+defaults:
+  - dataset3
+  - _self_
+
+dataset:
+  name: mine
+"""
 REFERENCES = ("realisation", "template")
 SWEEP = {
     **{"kind": "grid", "model": "shrunk", "dataset": "dataset3"},
@@ -64,11 +100,7 @@ SWEEP = {
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
     """The sources with the toy in them."""
-    root = tmp_path_factory.mktemp("tree")
-    for name in ("src", "config", "workflow", "profiles"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, root / name, ignore=ignored)
-    shutil.copy(ROOT / "Snakefile", root)
+    root = copy_of_sources(tmp_path_factory.mktemp("tree"))
     (root / "src/psfdae_paper/methods/shrunk.py").write_text(CLASS)
     (root / "config/shrunk").mkdir()
     (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
@@ -132,3 +164,23 @@ def test_predict_takes_the_toy(run, tree):
         *("--model", bundle, "--pixel-scale", 0.1, "--out", out, "--quiet"),
     )
     assert fits.getdata(out).shape[1:] == (16, 16)
+
+
+def added(root, name, text):
+    """Append to a file."""
+    with (root / name).open("a") as file:
+        file.write(text)
+
+
+def test_a_stage_is_three(tree, tmp_path):
+    added(tree, "src/psfdae_paper/stages/count_fields.py", STAGE)
+    added(tree, "workflow/rules/count.smk", RULE)
+    added(tree, "workflow/Snakefile", '\n\ninclude: "rules/count.smk"\n')
+    snakemake(tmp_path, "results/fields.txt", root=tree, overrides="grid.points=3")
+    assert (tmp_path / "results/fields.txt").read_text() == "9"
+
+
+def test_a_dataset_is_one(tree, tmp_path):
+    added(tree, "config/dataset/mine.yaml", DATASET)
+    jobs = planned(tmp_path, "mine", root=tree)
+    assert {"templates", "stars", "train", "evaluate", "track"} <= set(jobs)

@@ -55,8 +55,8 @@ def test_page_from_the_telescope_s_file_to_restored_stars(workshop):
         result = psfdae(*step, *TINY[step[0]])
         assert result.exit_code == 0, (step, result.output)
     examples = [f"example_{kind}" for kind in ("seidel", "newtonian", "ritchey_chretien")]
-    drawn = [f"{folder}/psfs.png" for folder in (*examples, "mine", "hazy")]
-    for name in (*drawn, "mine/psfs.fits", "night/map.png"):
+    figures = [f"{folder}/psfs.png" for folder in (*examples, "mine", "hazy")]
+    for name in (*figures, "mine/psfs.fits", "night/map.png"):
         assert (workshop / name).stat().st_size > 5000
     with fits.open(workshop / "night/restored.fits") as restored:
         assert restored["PSF"].data.shape == (9, 16, 16)
@@ -66,6 +66,6 @@ def test_page_from_the_telescope_s_file_to_restored_stars(workshop):
 def test_page_s_dataset_is_a_target(workshop):
     assert words("snakemake") == [["mytarget"]]
     jobs = set(planned(workshop, "mytarget"))
-    made = {"telescope_templates", "telescope_stars", "figure_telescope", "train", "bundle"}
-    assert made | {"evaluate"} <= jobs
+    rules = {"telescope_templates", "telescope_stars", "figure_telescope", "train", "bundle"}
+    assert rules | {"evaluate"} <= jobs
     assert not {"templates", "stars"} & jobs

@@ -75,9 +75,9 @@ def test_parseval_light_is_conserved(backend):
 
 def test_offset_looks_at_that_place(pupil):
     opd = opd_of(0.2 * COMATIC, pupil)
-    wide = StampPropagator(pupil, 32, 0.7, extra=24)(opd)[0]
-    moved = StampPropagator(pupil, 8, 0.7, extra=24)(opd, np.array([[5, -3]]))[0]
-    assert moved == pytest.approx(wide[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
+    wide_stamp = StampPropagator(pupil, 32, 0.7, extra=24)(opd)[0]
+    offset_stamp = StampPropagator(pupil, 8, 0.7, extra=24)(opd, np.array([[5, -3]]))[0]
+    assert offset_stamp == pytest.approx(wide_stamp[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
 
 
 def test_backends_and_precisions_agree(pupil):
@@ -116,9 +116,9 @@ def test_against_the_transfer_function_method(samples, side, backend):
     """Even and odd grids and stamps, whose middle sample or pixel is its own mirror."""
     pupil = annular_pupil(samples, 0.3)
     opd = opd_of(0.4 * COMATIC, pupil)[0]
-    ours = StampPropagator(pupil, side, 0.88, extra=24, backend=backend)(opd[None])[0]
+    stamp = StampPropagator(pupil, side, 0.88, extra=24, backend=backend)(opd[None])[0]
     exact = autocorrelation_stamp(pupil, opd, side, 0.88)
-    assert np.abs(ours - exact).max() / exact.max() < 1e-12
+    assert np.abs(stamp - exact).max() / exact.max() < 1e-12
 
 
 def test_against_poppy():
@@ -142,9 +142,9 @@ def test_against_poppy():
     rotated = system.calc_psf(wavelength=550e-9)[0].data[::-1, ::-1]
     places = np.random.default_rng(0).integers(8, side - 8, (60, 2))
     places[0] = np.unravel_index(rotated.argmax(), rotated.shape)
-    ours = brightness(pupil, opd, (places - side // 2) * pixel)
-    theirs = rotated[tuple(places.T)]
-    assert np.abs(ours / ours[0] - theirs / theirs[0]).max() < 1e-6
+    profile = brightness(pupil, opd, (places - side // 2) * pixel)
+    expected = rotated[tuple(places.T)]
+    assert np.abs(profile / profile[0] - expected / expected[0]).max() < 1e-6
 
 
 def test_pupil_without_symmetry_and_unknown_backend_are_refused(pupil):

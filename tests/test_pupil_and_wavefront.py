@@ -58,8 +58,8 @@ def test_seidel_wavefront_equals_its_formula():
         + w311 * field**3 * rho * np.cos(phi)
     )
     images = monomial_images(rho * np.cos(angle), rho * np.sin(angle))
-    ours = monomial_coefficients(STATIC, np.array([hx, hy])) @ images
-    assert ours == pytest.approx(expected, abs=1e-12)
+    wavefront = monomial_coefficients(STATIC, np.array([hx, hy])) @ images
+    assert wavefront == pytest.approx(expected, abs=1e-12)
 
 
 def test_slopes_are_the_extremes_over_the_disc():
@@ -77,8 +77,8 @@ def test_templates_need_131_samples():
     small = np.array([[-1.0, 1.0], [-1.0, 1.0]])
     assert required_samples(corner.slopes(), small)[0] == pytest.approx(131, abs=1)
     # Replicas must stay off a distant stamp.
-    far = np.array([[100.0, 116.0], [-8.0, 8.0]])
-    assert required_samples(np.zeros((1, 2, 2)), far)[0] == 116
+    distant_stamp = np.array([[100.0, 116.0], [-8.0, 8.0]])
+    assert required_samples(np.zeros((1, 2, 2)), distant_stamp)[0] == 116
 
 
 def test_ladder_takes_the_first_rung_that_suffices():
@@ -94,8 +94,8 @@ def test_zernikes_against_poppy():
     r, theta = np.sqrt(rng.uniform(0, 1, 200)), rng.uniform(0, 2 * np.pi, 200)
     x, y = r * np.cos(theta), r * np.sin(theta)
     for j in range(1, 37):
-        theirs = np.asarray(poppy.zernike.zernike1(j, rho=r, theta=theta), float)
-        assert zernike(j, x, y) == pytest.approx(theirs, abs=1e-10)
+        expected = np.asarray(poppy.zernike.zernike1(j, rho=r, theta=theta), float)
+        assert zernike(j, x, y) == pytest.approx(expected, abs=1e-10)
 
 
 def test_zernikes_are_orthonormal():

@@ -14,7 +14,7 @@ from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle, track
 from psfdae_paper.stages.evaluate import Models
 from psfdae_paper.stages.fit import fit
-from psfdae_paper.tracking import Run
+from psfdae_paper.tracking import TrackedRun
 
 SIZES = [
     *("parts.train_stars=200", "parts.test_stars=80", "noise.levels=[1e-3,1e-2]"),
@@ -45,7 +45,9 @@ def test_a_registered_model_restores_as_its_bundle_does(
         bundle.bundle(config, stars, Models(dae=place), out=packed)
 
     files = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
-    run = Run("dae", "mine", "random", "realisation", "fit", "a fit", "trials", files, {}, stars)
+    run = TrackedRun(
+        "dae", "mine", "random", "realisation", "fit", "a fit", "trials", files, {}, stars
+    )
     run = replace(run, metrics={"test_mse": 1e-5}, data=stars, fit=(kind, place))
     database = tmp_path / "mlflow.db"
     database.write_bytes(empty_database.read_bytes())

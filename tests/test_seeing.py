@@ -17,7 +17,7 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import template_wavefronts
 
-OWN = "dataset=_telescope"
+OWN_TELESCOPE = "dataset=_telescope"
 PROFILES = [Profile(4.0), Profile(4.0, 2.5), Profile(4.0, 4.765)]
 
 
@@ -72,14 +72,14 @@ def test_without_blur_stamps_are_the_same(obscured, opd):
 def test_blur_is_a_convolution(obscured, opd, profile):
     """Against the image on fine pixels, convolved with the profile and binned."""
     side, pixel, fine = 12, 1.5, 12
-    step, wide = pixel / fine, 40
-    image = StampPropagator(obscured, wide * fine, step)(opd)[0]
-    place = step * np.arange(1 - wide * fine, wide * fine)
+    step, wide_px = pixel / fine, 40
+    image = StampPropagator(obscured, wide_px * fine, step)(opd)[0]
+    place = step * np.arange(1 - wide_px * fine, wide_px * fine)
     kernel = brightness(profile, np.hypot(place[:, None], place)) * step**2
     blurred = fftconvolve(image, kernel, mode="same")
-    binned = blurred.reshape(wide, fine, wide, fine).sum(axis=(1, 3))
-    inner = slice((wide - side) // 2, (wide + side) // 2)
-    expected = binned[inner, inner]
+    binned = blurred.reshape(wide_px, fine, wide_px, fine).sum(axis=(1, 3))
+    central = slice((wide_px - side) // 2, (wide_px + side) // 2)
+    expected = binned[central, central]
     stamp = BlurredPropagator(obscured, side, pixel, profile)(opd)[0]
     assert np.abs(stamp - expected).max() < 2e-3 * expected.max()
     sharp = StampPropagator(obscured, side, pixel)(opd)[0]
@@ -88,7 +88,11 @@ def test_blur_is_a_convolution(obscured, opd, profile):
 
 def words_of(**seeing):
     """Overrides of a seeing of the example telescope."""
-    return [OWN, "grid.points=3", *(f"++telescope.seeing.{k}={v}" for k, v in seeing.items())]
+    return [
+        OWN_TELESCOPE,
+        "grid.points=3",
+        *(f"++telescope.seeing.{k}={v}" for k, v in seeing.items()),
+    ]
 
 
 def propagation_of(config):
@@ -107,20 +111,20 @@ def test_seeing_of_the_configuration_is_in_arcsec():
 def test_repeated_wings_do_not_reach_the_stamps():
     """The grid that is chosen, against one whose period is much longer."""
     config = load(words_of(kind="moffat", fwhm_arcsec=2, beta=2.5))
-    chosen = propagation_of(config)
-    assert chosen.samples.max() < 446
+    propagation = propagation_of(config)
+    assert propagation.samples.max() < 446
     longer = propagation_of(
         config.model_copy(
             update={"optics": config.optics.model_copy(update={"pupil_samples": [638]})}
         )
     )
     fields, offsets = np.array([0, 4]), np.zeros((2, 2))
-    ours, theirs = (p.stamps(16, offsets, fields) for p in (chosen, longer))
-    assert np.abs(ours - theirs).max() < 3 * NEGLIGIBLE_WING * ours.max()
+    stamps, expected = (p.stamps(16, offsets, fields) for p in (propagation, longer))
+    assert np.abs(stamps - expected).max() < 3 * NEGLIGIBLE_WING * stamps.max()
 
 
 def test_framed_stars_are_wider_and_as_bright():
-    sharp, _ = propagation_of(load([OWN, "grid.points=3"])).framed(32)
+    sharp, _ = propagation_of(load([OWN_TELESCOPE, "grid.points=3"])).framed(32)
     blurred, peak = propagation_of(load(words_of(kind="gaussian", fwhm_arcsec=3))).framed(32)
     assert (blurred.max(axis=(1, 2)) < 0.6 * sharp.max(axis=(1, 2))).all()
     assert blurred.sum(axis=(1, 2)) == pytest.approx(sharp.sum(axis=(1, 2)), abs=0.02)

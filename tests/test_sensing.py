@@ -37,8 +37,8 @@ def three_terms():
     """The example with focus, astigmatism and coma alone."""
     telescope = example("zernike")
     terms = {name: telescope.aberrations.terms[name] for name in ("z4", "z6", "z8")}
-    few = telescope.aberrations.model_copy(update={"terms": terms})
-    return telescope.model_copy(update={"aberrations": few})
+    aberrations = telescope.aberrations.model_copy(update={"terms": terms})
+    return telescope.model_copy(update={"aberrations": aberrations})
 
 
 def field_of(telescope, count, rng):
@@ -113,16 +113,16 @@ def test_score_and_information_of_poisson_counts():
 
 def test_deviance_is_the_log_likelihood_that_is_missing():
     counts, mean = np.array([[3.0, 100.0, 7.0]]), np.array([[5.0, 90.0, 7.0]])
-    found = poisson_information(counts, mean, np.empty((1, 0, 3)))[0]
+    deviance = poisson_information(counts, mean, np.empty((1, 0, 3)))[0]
     expected = 2 * (counts * np.log(counts / mean) - counts + mean).sum()
-    assert found == pytest.approx(expected)
+    assert deviance == pytest.approx(expected)
 
 
 def quadratic(centre, curvature):
-    def evaluate(some, at):
-        gap = centre[some] - at
+    def evaluate(rows, at):
+        gap = centre[rows] - at
         slope = gap @ curvature
-        count = (len(some), 1, 1)
+        count = (len(rows), 1, 1)
         return -0.5 * (gap * slope).sum(axis=1), slope, np.tile(curvature, count)
 
     return evaluate
@@ -135,10 +135,10 @@ def test_climb_reaches_maxima_and_stays_within_its_limit():
     assert peaks.parameters == pytest.approx(centre, abs=1e-2)
     assert peaks.height == pytest.approx(0.0, abs=1e-2)
     assert peaks.converged.all()
-    held = climb(evaluate, np.zeros((2, 2)), 3.0, Steps(min_gain=1e-9))
-    assert held.parameters[0] == pytest.approx(centre[0], abs=1e-4)
+    limited = climb(evaluate, np.zeros((2, 2)), 3.0, Steps(min_gain=1e-9))
+    assert limited.parameters[0] == pytest.approx(centre[0], abs=1e-4)
     # At the limit the other parameter is at its own maximum: 1 + 0.3 (5 − 3).
-    assert held.parameters[1] == pytest.approx([3.0, 1.6], abs=1e-4)
+    assert limited.parameters[1] == pytest.approx([3.0, 1.6], abs=1e-4)
 
 
 # --- Draws
@@ -252,17 +252,17 @@ def test_noise_free_stars_come_back():
     truth = terms.mean + 0.7 * terms.sd * rng.standard_normal(terms.mean.shape)
     place = rng.uniform(-0.5, 0.5, (4, 2))
     counts, flux = imaged(telescope, angle, truth, place, 2000.0)
-    found = sensed(counts, telescope, angle)
-    best = found.summary["mean"][found.summary["probability"] > 0.5]
-    error = np.sqrt(np.einsum("mkk->mk", found.summary["covariance"]))
-    assert np.abs(best - truth).max() < 6 * error.max()
+    wavefronts = sensed(counts, telescope, angle)
+    mean = wavefronts.summary["mean"][wavefronts.summary["probability"] > 0.5]
+    error = np.sqrt(np.einsum("mkk->mk", wavefronts.summary["covariance"]))
+    assert np.abs(mean - truth).max() < 6 * error.max()
     assert error.max() < 0.2 * terms.sd.min()
-    measured = found.measured()
+    measured = wavefronts.measured()
     assert measured["x"] == pytest.approx(7.5 + place[:, 0], abs=0.02)
     assert measured["y"] == pytest.approx(7.5 + place[:, 1], abs=0.02)
     assert measured["flux"] == pytest.approx(flux, rel=5e-3)
     assert measured["sky"] == pytest.approx(SKY, abs=5 * measured["sky_error"].max())
-    assert found.explained.all()
+    assert wavefronts.explained.all()
 
 
 @pytest.mark.usefixtures("short_chains")
@@ -273,19 +273,19 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
     place = rng.uniform(-0.5, 0.5, (20, 2))
     counts, _ = imaged(telescope, angle, truth, place, 60.0, rng)
-    found = sensed(counts, telescope, angle)
-    for probability, least, most in ((0.6827, 0.56, 0.80), (0.9545, 0.87, 0.995)):
-        low, high = np.moveaxis(found.interval(probability), -1, 0)
-        assert least < np.mean((truth >= low) & (truth <= high)) < most
+    wavefronts = sensed(counts, telescope, angle)
+    for probability, lowest, highest in ((0.6827, 0.56, 0.80), (0.9545, 0.87, 0.995)):
+        low, high = np.moveaxis(wavefronts.interval(probability), -1, 0)
+        assert lowest < np.mean((truth >= low) & (truth <= high)) < highest
     centred, flux = imaged(telescope, angle, truth, np.zeros((20, 2)), 60.0)
-    psf, error = found.psf_and_error()
+    psf, error = wavefronts.psf_and_error()
     off = np.abs(psf - (centred - SKY) / flux[:, None, None])
     assert 0.56 < np.mean(off <= error) < 0.80
     assert np.mean(off <= 3 * error) > 0.95
     monkeypatch.setattr(engine, "STARS_AT_ONCE", 1)
-    again = sensed(counts[:2], telescope, angle[:2])
-    assert again.draws == pytest.approx(found.draws[:2], abs=1e-3)
-    assert found.chi2.mean() == pytest.approx(0.97, abs=0.05)
+    repeated = sensed(counts[:2], telescope, angle[:2])
+    assert repeated.draws == pytest.approx(wavefronts.draws[:2], abs=1e-3)
+    assert wavefronts.chi2.mean() == pytest.approx(0.97, abs=0.05)
 
 
 @pytest.mark.usefixtures("short_chains")
@@ -301,12 +301,12 @@ def test_bad_stars_stop_nobody_and_are_kept_as_rows():
     counts[4, :, 15] += 3000.0  # light of a star beside the stamp
     counts[5, 7:9, 7:9] += 50_000.0  # no image of this telescope
     counts[5, 3, 12] += 40_000.0
-    found = sensed(counts, telescope, angle)
-    assert found.star.tolist() == [0, 2, 3, 4, 5]
-    assert found.explained[[0, 2]].all() and not found.explained[[1, 5]].any()
-    assert found.chi2[-1] > 3.0
-    assert np.isnan(found.psf()[1]).all() and np.isfinite(found.draws).all()
-    assert np.isnan(found.table["z4"][found.table["id"] == 1]).all()
+    wavefronts = sensed(counts, telescope, angle)
+    assert wavefronts.star.tolist() == [0, 2, 3, 4, 5]
+    assert wavefronts.explained[[0, 2]].all() and not wavefronts.explained[[1, 5]].any()
+    assert wavefronts.chi2[-1] > 3.0
+    assert np.isnan(wavefronts.psf()[1]).all() and np.isfinite(wavefronts.draws).all()
+    assert np.isnan(wavefronts.table["z4"][wavefronts.table["id"] == 1]).all()
     with pytest.raises(SensingError, match="no star has enough"):
         sensed(counts[1:2], telescope, angle[1:2])
 
@@ -339,8 +339,8 @@ def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     place = rng.uniform(-0.5, 0.5, (count, 2))
     counts, _ = imaged(telescope, angle, model.coefficients(truth), place, 60.0, rng)
     counts[0] = np.roll(counts[0], 5, axis=1) + counts[1] - SKY  # two stars in one stamp
-    found = sensed(counts, telescope, angle, joint=True)
-    state = found.joint
+    wavefronts = sensed(counts, telescope, angle, joint=True)
+    state = wavefronts.joint
     pull = (state.value - truth) / state.error
     assert np.sqrt(np.mean(pull**2)) < 2.0
     assert np.abs(pull).max() > 0.05
@@ -356,15 +356,15 @@ def test_seeing_is_found_with_the_telescope():
     telescope, rng = three_terms(), np.random.default_rng(4)
     angle = field_of(telescope, 12, rng)
 
-    def seen(fwhm, prior):
+    def example_of(fwhm, prior):
         seeing = Seeing(kind="gaussian", fwhm_arcsec=fwhm)
         return telescope.model_copy(update={"seeing": seeing, "prior": Prior(seeing=prior)})
 
-    stated, there = seen(1.5, 0.15), seen(1.8, 0.0)
-    model = telescope_model(there, angle)
+    stated, true_telescope = example_of(1.5, 0.15), example_of(1.8, 0.0)
+    model = telescope_model(true_telescope, angle)
     truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
     place = rng.uniform(-0.5, 0.5, (12, 2))
-    counts, _ = imaged(there, angle, model.coefficients(truth), place, 100.0, rng)
+    counts, _ = imaged(true_telescope, angle, model.coefficients(truth), place, 100.0, rng)
     state = sensed(counts, stated, angle, joint=True).joint
     assert state.model.names[-1] == "seeing"
     assert abs(state.value[-1] - 1.8) < 3 * state.error[-1]
@@ -391,8 +391,8 @@ def test_slopes_of_the_field_s_numbers_are_differences():
 def test_command_finds_the_changed_coma(tmp_path):
     """The coma of an image is not that of the telescope's file."""
     words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
-    done = command("simulate", *words, "--image-snr", 80, "--out", tmp_path, "grid.points=3")
-    assert done.exit_code == 0, done.output
+    simulated = command("simulate", *words, "--image-snr", 80, "--out", tmp_path, "grid.points=3")
+    assert simulated.exit_code == 0, simulated.output
     telescope = config_dir() / "telescope" / "example_zernike.yaml"
     words = ["--catalogue", tmp_path / "stars.csv", "--telescope", telescope, "--joint"]
     out = tmp_path / "wavefront.fits"

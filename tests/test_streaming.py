@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+
 import h5py
 import numpy as np
 import pytest
 
 import speed
-from measure import alone, cost_of_command
+from command_line import psfdae
+from measure import cost_of_command, isolated
 from prediction import make_cube
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
 from psfdae_paper.configuration.compose import compose, load_stage
@@ -15,6 +19,7 @@ from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars
 from psfdae_paper.stars.framing import Propagation, brightest_pixel
 from psfdae_paper.stars.scenes import template_wavefronts
+from workflow_runs import captured, environment
 
 CHEAP = (
     *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.threads=1"),
@@ -103,12 +108,14 @@ def memory(cheap, tmp_path_factory):
     for count in (4000, 20_000):
         tree["stars"] = {**tree["stars"], "count": count}
         costs = {
-            "simulate": alone(1, cost_of_command, ["stars", "--templates", cheap[1]], stars, tree)
+            "simulate": isolated(
+                1, cost_of_command, ["stars", "--templates", cheap[1]], stars, tree
+            )
         }
         speed.untrained_bundle(tree, stars, bundle)
         make_cube(tree, stars, count, cube)
         words = ["predict", cube, "--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
-        costs["predict"] = alone(1, cost_of_command, words, folder / "psf.fits")
+        costs["predict"] = isolated(1, cost_of_command, words, folder / "psf.fits")
         for job, cost in costs.items():
             found[job].append((cost["peak_b"] - cost["resting_b"]) / 2**20)
     return found
@@ -120,3 +127,24 @@ def test_memory_does_not_grow_with_the_stars(memory, job):
     few, many = memory[job]
     # Images alone would need 16 000 × 3 kB = 48 MB more; the drawn numbers 100 bytes a star.
     assert many - few < 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    shutil.which("taskset") is None or os.cpu_count() < 2,
+    reason="needs two CPUs and a way to leave out one",
+)
+def test_number_of_cpus_does_not_change_a_product(tmp_path):
+    """Two threads of linear algebra, as configured, on two CPUs and on one."""
+    sizes = ["grid.points=3", "stars.count=48", "optics.threads=2"]
+    templates = tmp_path / "templates.h5"
+    assert psfdae("templates", "--out", templates, "scene=seidel", *sizes).exit_code == 0
+    products = []
+    for cpus, threads in (("0,1", "2"), ("0", "1")):
+        out = tmp_path / f"{threads}.h5"
+        line = ["taskset", "--cpu-list", cpus, "psfdae", "stars", "--templates", templates]
+        variables = environment(OMP_NUM_THREADS=threads)
+        run = captured([*line, "--out", out, *sizes], env=variables)
+        assert run.returncode == 0, run.stderr
+        products.append(out.read_bytes())
+    assert products[0] == products[1]

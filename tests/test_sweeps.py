@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration import compose
-from psfdae_paper.configuration.compose import config_dir, load
+from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
 from psfdae_paper.sweeps import adaptive
 from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep
@@ -31,20 +28,15 @@ SEARCH = {"seed": 3, "startup": 4, "metric": "validation_mse", "direction": "min
 
 
 @pytest.fixture
-def sweep(tmp_path, monkeypatch):
+def sweep(config_folder):
     """Writes a sweep into a copy of the configuration and plans it."""
-    folder = tmp_path / "config"
-    shutil.copytree(config_dir(), folder)
-    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.clear_caches()
 
     def plan(tree, *given, name="tried"):
         text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
-        (folder / f"sweep/{name}.yaml").write_text(text)
+        (config_folder / f"sweep/{name}.yaml").write_text(text)
         return plan_sweep(name, ("preset=smoke", *given))
 
-    yield plan
-    compose.clear_caches()
+    return plan
 
 
 @pytest.mark.parametrize("name", sweep_names())

@@ -26,7 +26,7 @@ from psfdae_paper.stars.fields import relative_field, square_grid
 from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
-OWN = "dataset=_telescope"
+OWN_TELESCOPE = "dataset=_telescope"
 Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)
 
 
@@ -56,7 +56,7 @@ def zernikes_of_scene_1(seidel):
 
 
 @pytest.fixture(scope="module")
-def both(scene1):
+def sources(scene1):
     """Scene 1's templates as Seidel's monomials and as Zernikes over the field."""
     field = relative_field(scene1.grid)
     seidel = scene1.wavefront.coefficients
@@ -68,20 +68,20 @@ def both(scene1):
     )
 
 
-def test_seidel_s_wavefront_in_zernikes(both):
+def test_seidel_s_wavefront_in_zernikes(sources):
     pupil = annular_pupil(64, 0.0)
     everyone = np.arange(121)
     lit = pupil.amplitude > 0.5
-    ours, expected = (
-        source.opd(everyone, pupil, np.dtype(np.float64))[:, lit] for source in both[::-1]
+    opd, expected = (
+        source.opd(everyone, pupil, np.dtype(np.float64))[:, lit] for source in sources[::-1]
     )
     assert np.ptp(expected) > 10
-    difference = ours - expected
+    difference = opd - expected
     assert np.ptp(difference, axis=1) == pytest.approx(0, abs=1e-9)
 
 
-def test_slopes_are_those_of_the_same_polynomials(both):
-    seidel, zernikes = both
+def test_slopes_are_those_of_the_same_polynomials(sources):
+    seidel, zernikes = sources
     assert zernikes.slopes() == pytest.approx(seidel.slopes(), abs=1e-5)
     focus = zernike_wavefronts((4,), np.array([[1.0]]))
     assert focus.slopes()[0] == pytest.approx(
@@ -93,20 +93,20 @@ def test_slopes_are_those_of_the_same_polynomials(both):
 def traced():
     """The ray-traced example on fields of which five are scene 3's."""
     edge = 0.5 / 2**0.5
-    names = [OWN, "telescope=example_raytraced", "grid.points=3"]
+    names = [OWN_TELESCOPE, "telescope=example_raytraced", "grid.points=3"]
     return load([*names, f"telescope.field_edge_deg={edge!r}"])
 
 
 def test_ray_trace_is_that_of_scene_3(traced):
     alignment = load(SCENE3)
     tracer = StateTracer(alignment.telescope, alignment.prescription, alignment.alignment)
-    noll, ours = static_zernikes(traced.telescope, angles_of(traced.grid))
-    theirs = -tracer(np.zeros((1, 4)))[0]
+    noll, zernikes = static_zernikes(traced.telescope, angles_of(traced.grid))
+    traced_zernikes = -tracer(np.zeros((1, 4)))[0]
     assert noll == tuple(range(4, 23))
     assert traced.telescope.aberrations.defocus_m == alignment.alignment.defocus_m
     # Scene 3's circle starts on the x axis; its odd points are the corners of the grid.
-    assert ours[[4, 8, 6, 0, 2]] == pytest.approx(theirs[[0, 2, 4, 6, 8]], abs=1e-9)
-    assert np.abs(theirs).max() > 0.3
+    assert zernikes[[4, 8, 6, 0, 2]] == pytest.approx(traced_zernikes[[0, 2, 4, 6, 8]], abs=1e-9)
+    assert np.abs(traced_zernikes).max() > 0.3
 
 
 def test_ray_traced_stamps_are_those_of_scene_3(traced):
@@ -124,13 +124,13 @@ def test_ray_traced_stamps_are_those_of_scene_3(traced):
     propagation = Propagation(source, traced.telescope, traced.optics, traced.framing, 24)
     stamps, _ = normalise_flux(propagation.stamps(16, centroid))
     assert np.abs(stamps - expected).max() < 2e-3 * expected.max()
-    for other in (expected[:, ::-1], expected[:, :, ::-1], expected.swapaxes(1, 2)):
-        assert np.abs(stamps - other).max(axis=(1, 2)).min() > 0.1 * expected.max()
+    for mirrored in (expected[:, ::-1], expected[:, :, ::-1], expected.swapaxes(1, 2)):
+        assert np.abs(stamps - mirrored).max(axis=(1, 2)).min() > 0.1 * expected.max()
 
 
 def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     small = ["grid.points=3", "stars.count=24", "stars.name=seidel_10pct"]
-    words = [OWN, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
+    words = [OWN_TELESCOPE, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
     words += ["framing=stamp16", "stars.search_px=24"]
     products = []
     for name, choice in (("paper", ["stars=seidel_10pct"]), ("telescope", words)):
@@ -138,25 +138,25 @@ def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
         stars.templates(load_stage(STATIC, [*choice, *small]), fields)
         stars.stars(load_stage(SIMULATION, [*choice, *small]), fields, out)
         products.append((read_product(fields, "templates"), read_product(out, "stars")))
-    for paper, mine in zip(*products, strict=True):
-        assert set(paper.arrays) == set(mine.arrays)
+    for paper, seidel in zip(*products, strict=True):
+        assert set(paper.arrays) == set(seidel.arrays)
         for column, values in paper.arrays.items():
-            assert values.tobytes() == mine[column].tobytes(), column
+            assert values.tobytes() == seidel[column].tobytes(), column
 
 
 def test_random_aberrations_have_both_spreads():
-    config = load([OWN, "stars.aberration_fraction=0.2", "grid.points=3"])
+    config = load([OWN_TELESCOPE, "stars.aberration_fraction=0.2", "grid.points=3"])
     field = np.full(20000, 8)
-    drawn = star_wavefronts(config, field)
+    wavefronts = star_wavefronts(config, field)
     _, static = static_zernikes(config.telescope, angles_of(config.grid))
-    assert drawn.coefficients.mean(axis=0) == pytest.approx(static[8], abs=0.005)
+    assert wavefronts.coefficients.mean(axis=0) == pytest.approx(static[8], abs=0.005)
     jitter = config.telescope.aberrations.jitter_waves
-    assert drawn.coefficients.std(axis=0) == pytest.approx(
+    assert wavefronts.coefficients.std(axis=0) == pytest.approx(
         np.hypot(0.2 * static[8], jitter), rel=0.03
     )
-    assert (drawn.star_columns["zernike"][0] == drawn.coefficients).all()
-    again = star_wavefronts(config, field)
-    assert (again.coefficients == drawn.coefficients).all()
+    assert (wavefronts.star_columns["zernike"][0] == wavefronts.coefficients).all()
+    repeated = star_wavefronts(config, field)
+    assert (repeated.coefficients == wavefronts.coefficients).all()
 
 
 TERMS = "telescope.aberrations.terms"
@@ -166,9 +166,12 @@ TERMS = "telescope.aberrations.terms"
     ("overrides", "message"),
     [
         (["telescope=example_zernike"], "brings its own aberrations, but scene = seidel"),
-        ([OWN, f"++{TERMS}.z1=1"], r"'z1': must be between z2 and z45"),
-        ([OWN, "++telescope.aberrations.seing=1"], r"^telescope\.aberrations\.seing: unknown key$"),
-        ([OWN, "stars.aberration_fraction=0"], "jitter_waves = 0.03"),
+        ([OWN_TELESCOPE, f"++{TERMS}.z1=1"], r"'z1': must be between z2 and z45"),
+        (
+            [OWN_TELESCOPE, "++telescope.aberrations.seing=1"],
+            r"^telescope\.aberrations\.seing: unknown key$",
+        ),
+        ([OWN_TELESCOPE, "stars.aberration_fraction=0"], "jitter_waves = 0.03"),
     ],
 )
 def test_every_mistake_is_named(overrides, message):
@@ -199,7 +202,7 @@ def test_simulate_writes_what_the_stage_writes(simulated, tmp_path):
     assert {path.name for path in first.iterdir()} == names
     for name in names:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
-    stars.templates(load_stage(STATIC, [OWN, *CHOICE]), tmp_path / "t.h5")
+    stars.templates(load_stage(STATIC, [OWN_TELESCOPE, *CHOICE]), tmp_path / "t.h5")
     assert (first / "templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
     table = np.genfromtxt(first / "fields.csv", delimiter=",", names=True)
     assert sorted(set(table["x_deg"])) == [-1, 0, 1]

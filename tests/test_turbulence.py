@@ -174,7 +174,7 @@ def test_planes_in_closed_form_agree_with_a_fit():
 
 def test_tilt_is_removed_on_every_grid(pupil):
     source = scene(points=4)
-    kept = scene(points=4, remove_tilt=False)
+    tilted = scene(points=4, remove_tilt=False)
     for size in (pupil, annular_pupil(201, 0.0)):
         x, y, lit = disc(size.axis)
         plane = np.linalg.pinv(np.stack([np.ones_like(x), x, y], axis=1))
@@ -182,16 +182,18 @@ def test_tilt_is_removed_on_every_grid(pupil):
         tilt = opd[:, lit] @ plane.T
         # The disc's pixels are not quite the disc: 0.01 waves of its 0.2 RMS.
         assert np.abs(tilt).max() < 0.02
-        full = kept.opd(np.arange(16), size, FLOAT64) - opd
+        full = tilted.opd(np.arange(16), size, FLOAT64) - opd
         assert np.abs((full[:, lit] @ plane.T)[:, 1:]).max() > 0.3
         assert np.abs(full - full[:, :1] - full[:, :, :1] + full[:, :1, :1]).max() < 1e-10
 
 
 def test_same_seed_same_bytes_and_another_seed_differs(pupil):
     index = np.arange(3)
-    first, again, other = (scene(seed=seed).opd(index, pupil, FLOAT64) for seed in (7, 7, 8))
-    assert first.tobytes() == again.tobytes()
-    assert np.abs(first - other).max() > 0.1
+    first, repeated, with_other_seed = (
+        scene(seed=seed).opd(index, pupil, FLOAT64) for seed in (7, 7, 8)
+    )
+    assert first.tobytes() == repeated.tobytes()
+    assert np.abs(first - with_other_seed).max() > 0.1
 
 
 def test_any_order_of_directions_and_single_precision(pupil):

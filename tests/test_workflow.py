@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from functools import partial
 
 import h5py
@@ -20,7 +19,7 @@ from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.evaluation.comparison import seed_scatter
-from workflow_runs import ROOT, captured, command, environment, planned, snakemake
+from workflow_runs import captured, command, copy_of_sources, environment, planned, snakemake
 
 pytestmark = pytest.mark.workflow
 nightly = partial(pytest.param, marks=pytest.mark.slow)
@@ -111,12 +110,7 @@ def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path
 
 @pytest.fixture
 def tree(tmp_path):
-    """A copy of everything that decides what runs."""
-    for name in ("profiles", "workflow", "config", "src"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
-    shutil.copy(ROOT / "Snakefile", tmp_path)
-    return tmp_path
+    return copy_of_sources(tmp_path)
 
 
 @pytest.fixture

@@ -37,6 +37,15 @@ def captured(args, **options):
     return subprocess.run(args, capture_output=True, text=True, check=False, **options)
 
 
+def copy_of_sources(folder):
+    """A copy in `folder` of everything that decides what runs."""
+    for name in ("src", "config", "workflow", "profiles"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+    shutil.copy(ROOT / "Snakefile", folder)
+    return folder
+
+
 def clone(folder):
     """A fresh copy of the source tree in `folder`, with the environment of this one."""
     environment_of_make = Path(sys.prefix)

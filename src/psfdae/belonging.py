@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.files import Product, ProductError, write_text
+from psfdae.files import Product, ProductError, as_yaml, write_text
 from psfdae.reading import read_yaml
 
 if TYPE_CHECKING:
@@ -125,9 +125,7 @@ def _difference(
 
 def write_origin(model: Path, stars: Product) -> None:
     """Write a note on the product that a model, a folder or a file, was trained on."""
-    import yaml
-
-    write_text(origin_path(model), yaml.safe_dump(stars.config, sort_keys=True))
+    write_text(origin_path(model), as_yaml(stars.config))
 
 
 def origin_path(model: Path) -> Path:

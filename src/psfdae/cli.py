@@ -222,10 +222,10 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
         for heading, commands in getattr(package, "SECTIONS", {}).items():
             headings.setdefault(heading, []).extend(commands)
         required |= getattr(package, "REQUIRED", {})
-    rest = {*words}.difference(*headings.values())
-    headings["The paper's stages"] = [word for word in words if word in rest]
+    paper_words = {*words}.difference(*headings.values())
+    headings["The paper's stages"] = [word for word in words if word in paper_words]
     # What is in no section belongs to the paper; the module "*" is that of all these commands.
-    required |= dict.fromkeys(rest, required.get("*", ""))
+    required |= dict.fromkeys(paper_words, required.get("*", ""))
     available: dict[str, list[str]] = {}
     for heading, commands in headings.items():
         for word in commands:

@@ -8,6 +8,7 @@ others. A product is an HDF5 file with arrays, their units and the configuration
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import os
@@ -337,6 +338,12 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
         raise ProductError(f"{path}: no such file") from None
     except (OSError, KeyError, ValueError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class OutputError(Error, ValueError):

@@ -97,7 +97,7 @@ def learnt(method: type[Method], reference: str) -> str:
     return reference if fits_each else "template"
 
 
-def require(
+def require_fit(
     method: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
     """Refuse a fit that does not belong to test stars.

@@ -99,13 +99,13 @@ def fixed_threads(threads: int) -> Iterator[None]:
 
     # torch is not imported for this: it takes seconds, and may be loaded within the block.
     torch = sys.modules.get("torch")
-    before = torch.get_num_threads() if torch else available_cores()
+    threads_before = torch.get_num_threads() if torch else available_cores()
     with threadpool_limits(threads):
         try:
             yield
         finally:
             if torch := sys.modules.get("torch"):
-                torch.set_num_threads(before)
+                torch.set_num_threads(threads_before)
 
 
 def limit_threads(threads: int) -> None:

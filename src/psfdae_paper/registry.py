@@ -15,7 +15,7 @@ from psfdae.model.bundle import SUFFIX, Bundle, write_bundle
 from psfdae.model.packing import uncalibrated
 from psfdae.model.star_sets import read_stars
 from psfdae_paper.configuration.compose import part
-from psfdae_paper.tracking import MODEL, Run
+from psfdae_paper.tracking import MODEL, TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -24,7 +24,7 @@ TEST_MSE = "test_mse"
 """Tag of a version, and metric of its run: the mean over all noise levels."""
 
 
-def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> str | None:
+def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRun) -> str | None:
     """Log the model of a run with all its files, and register one that restores single stamps.
 
     A model that is registered has a bundle among its files, which `psfdae.load_model` reads. It
@@ -35,7 +35,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> s
     client : MlflowClient
     experiment, run_id : str
         MLflow's ids of the experiment and of the run.
-    run : Run
+    run : TrackedRun
 
     Returns
     -------
@@ -72,7 +72,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: Run) -> s
     return model_id
 
 
-def bundle_of(run: Run) -> Bundle:
+def bundle_of(run: TrackedRun) -> Bundle:
     """Return the bundle, without errors, of a run that has a fit and the stars of its training.
 
     Raises
@@ -90,7 +90,7 @@ def bundle_of(run: Run) -> Bundle:
     return uncalibrated(fitted, product, run.reference, config, described, name, "not stated")[0]
 
 
-def registered_name(run: Run) -> str:
+def registered_name(run: TrackedRun) -> str:
     """Return the name of the models of a dataset and method."""
     return f"{run.dataset}-{run.kind}"
 

@@ -1,12 +1,11 @@
 """Runs as MLflow shows them, read from the files in the results folder.
 
-The results folder goes in, and `Run` come out, which name files, settings and metrics. Nothing
-here knows MLflow's database.
+The results folder goes in, and each `TrackedRun` that comes out names its files, settings and
+metrics. Nothing here knows MLflow's database.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
-from psfdae.files import ProductError, read_product
+from psfdae.files import ProductError, read_product, sha256_of
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
@@ -47,7 +46,7 @@ MODEL = "model/"
 
 
 @dataclass(frozen=True)
-class Run:
+class TrackedRun:
     """Run of a method, a network or a sweep.
 
     Attributes
@@ -108,6 +107,7 @@ class Run:
     fit: tuple[type[Method], Path] | None = None
 
     def __post_init__(self) -> None:
+        # A run is read as a whole or not at all.
         for path in (*self.files.values(), self.last_file):
             if path is not None and not path.is_file():
                 raise ProductError(f"{path}: no such file")
@@ -133,13 +133,14 @@ class Run:
     @property
     def start_ms(self) -> int:
         """Time of the start in ms since 1970, from the end and the duration."""
+        # The history counts seconds from the start of the training.
         seconds = self.seconds
         if seconds is None:
             seconds = max((row["seconds"] for row in self.epochs), default=0.0)
         return self.end_ms - int(1000 * seconds)
 
 
-def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
+def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
     """Read the finished runs of datasets.
 
     An evaluation is the last file of a run, so that models still in training have none. A method
@@ -162,6 +163,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
     runs = []
     for dataset, stars in datasets.items():
         folder = results / "evaluation" / dataset
+        # A table of errors for each split and reference.
         evaluations = sorted(folder.glob("*-*.csv"))
         if not evaluations:
             raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
@@ -179,7 +181,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
 
 def _run_of_fit(
     results: Path, kind: type[Method], key: tuple[str, str, str], stars: Path, evaluation: Path
-) -> Run:
+) -> TrackedRun:
     """Read a fit to the stars of a dataset, and its evaluation.
 
     Its config is that of the model together with that of its stars: a network trained on
@@ -199,10 +201,11 @@ def _run_of_fit(
     model = results / fits.place_of(kind, *key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
+    # The settings of the model are beside it, those of its stars in their product.
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
-    # Value and standard error at each noise level, then means over the levels.
+    # Value and standard error of each metric at each noise level λ, then means over the levels.
     table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
     rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
@@ -224,7 +227,7 @@ def _run_of_fit(
     storage = fits.storage_of(kind)
     history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
     run_kind = storage.run or kind.name
-    return Run(
+    return TrackedRun(
         kind=run_kind,
         dataset=dataset,
         split=split,
@@ -249,7 +252,7 @@ def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
 
-def runs_of_alignment(results: Path) -> list[Run]:
+def runs_of_alignment(results: Path) -> list[TrackedRun]:
     """Read the trained networks of scene 3.
 
     Raises
@@ -268,9 +271,10 @@ def runs_of_alignment(results: Path) -> list[Run]:
     runs = []
     for kind, weights in WEIGHTS.items():
         folder = results / "alignment" / kind
+        # As for datasets, the number of the start that succeeded is no setting.
         config = read_yaml(folder / CONFIG)
         config.pop("attempt", None)
-        # Errors of the state in units of the range.
+        # Errors of the state parameters in units of their range, by test set and noise level.
         rows = table[(table.method == kind) & (table.unit == "range")]
         if rows.empty:
             raise ProductError(f"{errors}: no rows of method {kind!r}")
@@ -282,7 +286,7 @@ def runs_of_alignment(results: Path) -> list[Run]:
         # The set of states on which it was trained.
         states = "grid" if kind == "dae" else ALIGNERS[kind].states
         runs.append(
-            Run(
+            TrackedRun(
                 kind=kind,
                 dataset="alignment",
                 split="uniform and grid",
@@ -307,7 +311,7 @@ def _network_files(folder: Path, weights: str) -> dict[str, Path]:
     return model | {HISTORY: folder / HISTORY}
 
 
-def runs_of_sweep(results: Path, name: str) -> list[Run]:
+def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
     """Read a sweep and the points in its summary, the parent first.
 
     Raises
@@ -319,7 +323,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
-    # A row of the summary for each point.
+    # A row of the summary for each point, and a run of its own.
     table = read_table(summary, "point", "status", dtype=str)
     points = [_run_of_point(results, name, point) for point in table.point]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
@@ -329,7 +333,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     metrics = {f"best_{key}": value for key, value in best_point.get("metrics", {}).items()}
     for status in ("finished", "stopped", "failed"):
         metrics[f"points_{status}"] = float((table.status == status).sum())
-    parent = Run(
+    parent = TrackedRun(
         kind="sweep",
         **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}",
@@ -345,7 +349,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     return [parent, *points]
 
 
-def _run_of_point(results: Path, name: str, point: str) -> Run:
+def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
     from psfdae_paper.sweeps.measured import fit_in, read_cost
 
@@ -361,12 +365,13 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
         model_files = _model_files(method(model), fit_in(method(model), folder))
         with suppress(KeyError):
             data = results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
+    # A point that was stopped or failed lacks some of these.
     tables = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
     files = {file: folder / file for file in tables} | model_files
     history = folder / HISTORY
     # The run is named by the values of the point on the axes of the sweep.
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
-    return Run(
+    return TrackedRun(
         kind=model,
         **{key: result[key] for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}/points/{point}",
@@ -385,12 +390,13 @@ def _run_of_point(results: Path, name: str, point: str) -> Run:
     )
 
 
-def settings_of(run: Run, preset: str) -> dict[str, str]:
+def settings_of(run: TrackedRun, preset: str) -> dict[str, str]:
     """Return the settings that distinguish a run from others, by their dotted names.
 
     These are its method, those by which datasets differ, and those that are not the
     configuration's for this dataset and preset. The choice does not depend on other runs.
     """
+    # Always shown: what tells the paper's datasets from each other.
     dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
     defaults = {}
     # Stars that are none of the datasets, such as those of a user, have no defaults.
@@ -409,14 +415,8 @@ def flatten(tree: Mapping[str, Any]) -> dict[str, str]:
     return {key: v if isinstance(v, str) else json.dumps(v) for key, v in leaves(tree)}
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _epochs(history: Path) -> list[dict[str, float]]:
-    """Read the rows of a training history."""
+    """Read the rows of a training history, whose columns are all numbers."""
     rows = read_table(history, "epoch", "seconds", dtype=float).to_dict("records")
     return [{str(name): value for name, value in row.items()} for row in rows]
 
@@ -438,6 +438,6 @@ def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[
     # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
     errors = [m for m in metrics if m.key == "validation_mse" and math.isfinite(m.value)]
     if errors:
-        best = min(errors, key=lambda m: m.value)
-        metrics.append(Metric("best_validation_mse", best.value, best.timestamp, best.step))
+        stored = min(errors, key=lambda m: m.value)
+        metrics.append(Metric("best_validation_mse", stored.value, stored.timestamp, stored.step))
     return metrics

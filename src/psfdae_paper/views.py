@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from psfdae_paper.tracking import AVERAGED, MODEL, Run
+from psfdae_paper.tracking import AVERAGED, MODEL, TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -21,7 +21,7 @@ VIEW = "mlflow.sharedViewState."
 """Prefix of the names of tags that are views."""
 
 
-def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
+def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -> None:
     """Set the views of the records of an experiment, and its description if no user wrote one.
 
     Parameters
@@ -29,7 +29,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
     client : MlflowClient
     experiment : str
         Id of the experiment.
-    records : sequence of Run
+    records : sequence of TrackedRun
         Runs that were imported now; views of other datasets stay.
     """
     description = "mlflow.note.content"  # MLflow's tag
@@ -43,7 +43,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
             client.set_experiment_tag(experiment, key, value)
 
 
-def views(records: Sequence[Run]) -> dict[str, str]:
+def views(records: Sequence[TrackedRun]) -> dict[str, str]:
     """Return the views of all runs with a model, and of those of each dataset by its name."""
     # A sweep itself has no model, and its points are in no view of a dataset.
     with_model = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
@@ -59,6 +59,7 @@ def note(experiment: str, tags: set[str]) -> str:
 
     `tags` are the names of all tags of the experiment.
     """
+    # Addresses of MLflow's pages begin with # and are relative to its server.
     links = []
     for name in sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW)):
         # The workflow type hides pages that are for language models.
@@ -67,7 +68,7 @@ def note(experiment: str, tags: set[str]) -> str:
     return f"Runs of {', '.join(links)}; docs/compare.md says what the columns mean."
 
 
-def _view(records: Sequence[Run], condition: str) -> str:
+def _view(records: Sequence[TrackedRun], condition: str) -> str:
     """Return a view as MLflow reads it: runs that are not superseded, the smallest error first.
 
     `condition` limits the runs further, in the language of MLflow's search.

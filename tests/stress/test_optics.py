@@ -14,7 +14,7 @@ FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the c
 FINEST = 2700  # largest N of a converged reference; beyond it a stamp needs GBs
 # Relative field of the test stars: axis, edge, corner; and stamps about their chief rays.
 FIELDS, CENTRED = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.zeros((3, 2), int)
-WHAT = "MSE of normalised stamps"
+QUANTITY = "MSE of normalised stamps"
 
 
 @pytest.mark.slow
@@ -27,8 +27,8 @@ def test_stronger_aberrations(bench, record, factor):
     offset = np.rint(peak * factor / 3).astype(int)
     reach = max(config.stars.search_px, int(np.abs(offset).max()) + 8)
     truth = reference(config, source, offset, reach)
-    case, how = f"aberrations × {factor}", (config, source, offset, reach, truth, budget)
-    record.point("aberrations", factor, agreement(record, case, *how), budget)
+    case, setup = f"aberrations × {factor}", (config, source, offset, reach, truth, budget)
+    record.point("aberrations", factor, agreement(record, case, *setup), budget)
     if truth is not None:
         # The largest configured grid, whatever the wavefront needs.
         pupil = annular_pupil(grids[-1], config.telescope.obscuration)
@@ -38,7 +38,7 @@ def test_stronger_aberrations(bench, record, factor):
         record.point("aberrations, guard ignored", factor, ignored, budget)
         if factor == 10:
             # A guard that refuses what would have been right would be of no use.
-            record.within(case, f"{WHAT} if the guard is ignored", ignored, budget, np.inf)
+            record.within(case, f"{QUANTITY} if the guard is ignored", ignored, budget, np.inf)
 
 
 @pytest.mark.slow
@@ -54,8 +54,8 @@ def test_stronger_turbulence(bench, record, factor):
         record.equal(f"turbulence, {case}", "outcome", "SamplingError", "SamplingError")
         record.point("turbulence", factor, None, budget)
         return
-    how = (config, source, np.zeros((len(source), 2), int), config.framing.search_px)
-    error = agreement(record, f"turbulence, {case}", *how, reference(*how), budget)
+    setup = (config, source, np.zeros((len(source), 2), int), config.framing.search_px)
+    error = agreement(record, f"turbulence, {case}", *setup, reference(*setup), budget)
     record.point("turbulence", factor, error, budget)
 
 
@@ -89,8 +89,8 @@ def test_pixel_scale(bench, record, scale):
     peak = stamper(config, source).brightest()
     offset = np.rint(peak * config.telescope.pixel_scale_arcsec / scale).astype(int)
     rescaled = changed(config, telescope={"pixel_scale_arcsec": scale})
-    how = (rescaled, source, offset, config.stars.search_px)
-    error = agreement(record, f"pixel of {scale:g} arcsec", *how, reference(*how), budget)
+    setup = (rescaled, source, offset, config.stars.search_px)
+    error = agreement(record, f"pixel of {scale:g} arcsec", *setup, reference(*setup), budget)
     record.point("pixel scale", scale, error, budget)
 
 
@@ -100,16 +100,16 @@ def agreement(record, case, config, source, offset, reach, truth, budget, **opti
     try:
         stamps = stamper(config, source, reach, **optics).stamps(config.framing.stamp_px, offset)
         error = np.inf if truth is None else stamp_mse(stamps, truth)
-        record.row(case, WHAT, expected, f"{error:.3g}", error <= budget)
+        record.row(case, QUANTITY, expected, f"{error:.3g}", error <= budget)
     except SamplingError:
-        record.row(case, WHAT, expected, "SamplingError", True)
+        record.row(case, QUANTITY, expected, "SamplingError", True)
     return error
 
 
 def reference(config, source, offset, reach):
     """Stamps at twice the samples that the guard asks for; None if that is too many."""
     try:
-        guarded = stamper(config, source, reach, more=[FINEST]).samples.max()
+        guarded = stamper(config, source, reach, extra_grids=[FINEST]).samples.max()
     except SamplingError:
         return None
     samples = min(2 * int(guarded), FINEST)
@@ -122,10 +122,10 @@ def reference(config, source, offset, reach):
     return np.concatenate([kernel(*star) for star in zip(opds, offset[:, None], strict=True)])
 
 
-def stamper(config, source, search_px=None, more=(), **optics):
+def stamper(config, source, search_px=None, extra_grids=(), **optics):
     """Propagation star by star, on the configured grids, continued, by default."""
     configured = config.optics.pupil_samples
-    grids = [*configured, *(n for n in FINER if n > configured[-1]), *more]
+    grids = [*configured, *(n for n in FINER if n > configured[-1]), *extra_grids]
     return propagation(config, source, search_px, **{"pupil_samples": grids, "batch": 1} | optics)
 
 

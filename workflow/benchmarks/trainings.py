@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from measure import alone, pareto, write, yes
+from measure import isolated, pareto, write, yes
 from psfdae import fits
 from psfdae.belonging import STARS, require
 from psfdae.cli import program
@@ -164,7 +164,7 @@ def baseline(
 ) -> None:
     """Time PCA+SOM over components, map and epochs, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    rows = alone(config.baseline.threads, time_points, config.model_dump(), stars)
+    rows = isolated(config.baseline.threads, time_points, config.model_dump(), stars)
     write(out, [{**row, "threads": config.baseline.threads} for row in rows])
 
 
@@ -240,7 +240,7 @@ def methods(
 ) -> None:
     """Time fit and inference of all methods on one thread, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    write(out, alone(1, time_methods, config.model_dump(), stars))
+    write(out, isolated(1, time_methods, config.model_dump(), stars))
 
 
 def time_methods(tree, stars):

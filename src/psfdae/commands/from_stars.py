@@ -144,15 +144,15 @@ def from_stars(
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
-    # The three options of the selection are settings of the configuration by shorter names.
     job = dict(locals())
+    # The three options of the selection are settings of the configuration by shorter names.
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
     settings = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
-    stem, sentence = _model_name(image, name), ""
+    stem, sentence = model_name(image, name), ""
     if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
     if all_extensions:
@@ -172,22 +172,23 @@ def from_stars(
         }
         run_for_images(from_stars, jobs, image[0])
     else:
+        # One image, or exposures that share a model; the same is stated of all.
         sources = ImageInput(image[0], **vars(options)).of_each(image)
-        exposures = [_model_name((path,), None) for path in image] if len(image) > 1 else []
+        exposures = [model_name((path,), None) for path in image] if len(image) > 1 else []
         if exposures and method_name is None and "field" in settings.methods:
             # Validation stars would judge the field of all exposures, but each gets its own.
             method_name = "field"
-        settings, methods, candidates = _methods(settings, method_name)
+        settings, methods, candidates = compared_methods(settings, method_name)
         files = ModelFiles(out, stem, methods, exposures)
-        with _folder(files, sources, page, overwrite):
-            sentence = _write_model(settings, sources, files, licence, candidates, page)
+        with reserved_folder(files, sources, page, overwrite):
+            sentence = write_model(settings, sources, files, licence, candidates, page)
         print(sentence)
     # The command that applies the model to all stars of the image, or of the first exposure. A
     # list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
     if several and options.catalogue:
         options = replace(options, on_image=True)
-    stem = _model_name(image[:1], None if several else name)
+    stem = model_name(image[:1], None if several else name)
     model = out if several or all_extensions else ModelFiles(out, stem, ()).bundle
     words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
     words += ["--all-extensions"] * all_extensions
@@ -196,7 +197,7 @@ def from_stars(
     return sentence
 
 
-def _methods(
+def compared_methods(
     settings: Settings, method_name: str | None
 ) -> tuple[Settings, tuple[type[Method], ...], list[type[Method]]]:
     """Choose the methods that are compared, that are fitted, and that may become the model.
@@ -220,9 +221,11 @@ def _methods(
     """
     # Methods that need the field position on the grid of a simulation cannot use an image.
     names = [n for n in settings.methods if method(n).packing or not method(n).needs.position]
+    # A method that the user names replaces all others that are fitted.
     if method_name is not None:
         names = [n for n in names if method(n).storage is None and n != method_name]
         names.append(method(method_name).name)
+    # Some methods with a fit make no models: they are only compared.
     fitted = tuple(m for m in map(method, names) if m.storage is not None)
     candidates = [m for m in fitted if makes_models(m.name)]
     if not candidates:
@@ -231,7 +234,7 @@ def _methods(
     return settings.model_copy(update={"methods": names}), fitted, candidates
 
 
-def _model_name(image: tuple[Path, ...], name: str | None) -> str:
+def model_name(image: tuple[Path, ...], name: str | None) -> str:
     """Return the name of a model, with which the names of its files begin.
 
     Raises
@@ -251,7 +254,7 @@ def _model_name(image: tuple[Path, ...], name: str | None) -> str:
 
 
 @contextmanager
-def _folder(
+def reserved_folder(
     files: ModelFiles, sources: Sequence[ImageInput], page: Path | None, overwrite: bool
 ) -> Iterator[None]:
     """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
@@ -263,12 +266,13 @@ def _folder(
     """
     if files.name in files.exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
+    # No output may be an input, such as the star list of an earlier run.
     lists = [files.star_list(source.name) for source in sources if source.detect]
     inputs = [path for source in sources for path in source.files()]
     check_outputs([*files.paths(), *lists, page], inputs)
     if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
-    with _locked(files.path):
+    with locked_folder(files.path):
         bundles = sorted(files.path.glob(f"*{SUFFIX}"))
         if bundles and not overwrite:
             raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
@@ -276,7 +280,7 @@ def _folder(
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Refuse a folder in which another process works; the lock ends with the process.
 
     A folder that is left empty is removed again.
@@ -289,6 +293,7 @@ def _locked(folder: Path) -> Iterator[None]:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
+    # The lock is that of the folder itself, so that no file is left of it.
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
@@ -302,7 +307,7 @@ def _locked(folder: Path) -> Iterator[None]:
             folder.rmdir()
 
 
-def _write_model(
+def write_model(
     settings: Settings,
     sources: list[ImageInput],
     files: ModelFiles,
@@ -320,6 +325,7 @@ def _write_model(
     # Choose bright stars without neighbours, and cut them out.
     stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
+    # What the stars are, and why others are not used: lists, and the product of all later steps.
     for image_stars in stars.images:
         if image_stars.observation.detections is not None:
             write_list(image_stars.observation, files.star_list(image_stars.name))
@@ -331,7 +337,7 @@ def _write_model(
     # Fit the candidates, and the other methods that the report compares with them. With few
     # stars only one candidate is tried.
     tried_methods = worth_trying(stars, candidates)
-    fitted = _fit_methods(
+    fitted = fit_methods(
         stars, files, [m for m in files.methods if m in tried_methods or m not in candidates]
     )
     # The method with the smallest MSE on validation stars becomes the model.
@@ -341,6 +347,7 @@ def _write_model(
         model_method = method(best_name)
         for name, error in errors.items():
             print(f"{method(name).look.label}: MSE {error:.3g} on validation stars")
+    # The fit with all that predictions need: photometry, and errors from stars held out.
     print(f"packing {model_method.look.label}")
     model = pack_model(stars, fitted[model_method.name], files.name, licence)
     for fact in facts_of(fitted[model_method.name]):
@@ -351,6 +358,7 @@ def _write_model(
     # means that everything is done.
     with ExitStack() as stack:
         model.save(stack.enter_context(atomic_path(files.bundle)))
+        # The field of each exposure, by its own stars.
         exposure_models = for_exposures(model, stars)
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]
@@ -371,7 +379,7 @@ def _write_model(
     return str(report)
 
 
-def _fit_methods(
+def fit_methods(
     stars: Stars, files: ModelFiles, methods: Sequence[type[Method]]
 ) -> dict[str, Method]:
     """Fit methods to the training stars, write each fit to its file, and return them by name."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
@@ -46,8 +46,10 @@ def options_by_image(path: Path, options: ImageStatements) -> dict[str, ImageSta
     excluded = [f"--{name}" for name in one_image_options if getattr(options, name) is not None]
     if excluded:
         raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
+    # Pixels of a list are those of one image.
     if options.catalogue is not None:
         require_sky(options.catalogue, "--all-extensions")
+    # An image is named by its number, since names of extensions may repeat.
     one_image = replace(options, on_image=options.catalogue is not None)
     return {name: replace(one_image, extension=n) for name, n in science_images(path).items()}
 
@@ -76,33 +78,26 @@ def run_for_images(
     MosaicError
         At the end, if some images failed; the others are done.
     """
-    failed = []
     print(f"{path}: {len(jobs)} images: {', '.join(jobs)}")
-    with _process_pool(min(len(jobs), available_cores())) as pool:
-        futures = {name: pool.submit(_run_quietly, work, job) for name, job in jobs.items()}
-        for name, future in futures.items():
+
+    def run(job: Mapping[str, Any]) -> tuple[bool, str]:
+        # "spawn": a copy of a process that has threads, as numpy's and torch's, may hang.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
             try:
-                succeeded, message = future.result()
+                return process.submit(_run_quietly, work, job).result()
             except BrokenProcessPool:
-                # A process that is killed takes all unfinished ones with it. Repeat each
-                # in one process, which then has the whole memory.
-                with _process_pool(1) as single:
-                    try:
-                        succeeded, message = single.submit(_run_quietly, work, jobs[name]).result()
-                    except BrokenProcessPool:
-                        succeeded = False
-                        message = "its process was killed, perhaps for lack of memory"
+                return False, "its process was killed, perhaps for lack of memory"
+
+    # A thread waits for each process; one that is killed stops no other.
+    failed = []
+    with ThreadPoolExecutor(min(len(jobs), available_cores())) as threads:
+        for name, (succeeded, message) in zip(jobs, threads.map(run, jobs.values()), strict=True):
             failed += [] if succeeded else [name]
             print(f"{name}: {message}", flush=True)
     if failed:
         raise MosaicError(
             f"{path}: {len(failed)} of {len(jobs)} images failed: {', '.join(failed)}"
         )
-
-
-def _process_pool(processes: int) -> ProcessPoolExecutor:
-    # "spawn": a copy of a process that has threads, as numpy's and torch's, may hang.
-    return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
 
 
 def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:

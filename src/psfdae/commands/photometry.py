@@ -86,9 +86,9 @@ def photometry(
     from psfdae.model.photon_noise import with_measured_gain
 
     observation = with_measured_gain(loaded, observation)
-    measured, list_note = _measure(loaded, observation, options.threshold)
+    measured, list_note = measure_stars(loaded, observation, options.threshold)
     if magnitudes is not None:
-        zero_point, zero_point_note = _zero_point(measured, *magnitudes, reference)
+        zero_point, zero_point_note = measure_zero_point(measured, *magnitudes, reference)
         print(zero_point_note)
     # Write the table with its header, and the residual image.
     table = photometry_table(measured, observation, zero_point)
@@ -105,11 +105,11 @@ def photometry(
         from astropy.io import fits
 
         write_fits(residual, fits.PrimaryHDU(measured.residual.astype(np.float32)))
-    summary = _summary(measured, out, bool(options.detect))
+    summary = summary_lines(measured, out, bool(options.detect))
     print(*filter(None, [observation.summary(), list_note, *summary]), sep="\n")
 
 
-def _measure(
+def measure_stars(
     model: FieldPsfs, observation: Observation, threshold: float
 ) -> tuple[CrowdedPhotometry, str | None]:
     """Measure the stars that can be measured, and return a row for every star of the list.
@@ -129,7 +129,9 @@ def _measure(
     usable = observation.select(~unusable) if unusable.any() else observation
     measured = crowded_photometry(model, usable, threshold)
     if unusable.any():
-        measured = replace(measured, stars=_with_rows(measured.stars, observation, unusable))
+        measured = replace(
+            measured, stars=with_unmeasured_rows(measured.stars, observation, unusable)
+        )
     if observation.catalogue is None or len(measured.stars) != observation.count:
         return measured, None
     # The stars are fitted where they are, whatever the list says.
@@ -137,7 +139,7 @@ def _measure(
     return measured, list_offset(observation.catalogue, offset, accept=True)
 
 
-def _summary(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str]:
+def summary_lines(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str]:
     """Return lines on the number of stars, the light that fluxes contain, and their bias."""
     # Stars with a flux, and how much of it the model of the PSF does not have.
     measured_count = int(np.isfinite(measured.stars["flux"]).sum())
@@ -159,7 +161,7 @@ def _summary(measured: CrowdedPhotometry, out: Path, detected: bool) -> list[str
     return lines
 
 
-def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
+def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
     """Return a row for every star of the list; those that were not measured have NaN and flags.
 
     Parameters
@@ -191,7 +193,7 @@ def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> 
     return rows
 
 
-def _zero_point(
+def measure_zero_point(
     measured: CrowdedPhotometry,
     positions: np.ndarray,
     magnitude: np.ndarray,

@@ -82,7 +82,7 @@ def predict(
                 **job,
                 "options": image_options,
                 "all_extensions": False,
-                "model": _bundle_of_image(model, name),
+                "model": bundle_of_image(model, name),
                 "plot": path_of_image(plot, name),
                 "threads": 1,
                 "quiet": True,
@@ -92,15 +92,16 @@ def predict(
         }
         run_for_images(predict, jobs, stars)
         return ""
-    # Check all that can be checked without reading pixels.
+    # Check all that can be checked without reading pixels: inputs, outputs, and the model.
     source = ImageInput(
         stars, **vars(options), flux_column=flux_column, background_column=background_column
     )
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
-    bundle = _bundle_of_image(model, source.name)
+    bundle = bundle_of_image(model, source.name)
     check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
     loaded = load_model(bundle)
-    observation = _open_for(loaded, source)
+    observation = open_for_model(loaded, source)
+    # Options that only some images and models have.
     measures_centres = isinstance(loaded.method, MeasuresStars)
     if fixed_positions and not (measures_centres and observation.shape):
         raise PredictionError(
@@ -112,7 +113,7 @@ def predict(
     try:
         # The FITS file gets its name last: if it exists, everything is done.
         with atomic_path(out) as unfinished, silence() if quiet else nullcontext():
-            flag_counts, unflagged, list_note = _write_prediction(
+            flag_counts, unflagged, list_note = write_prediction(
                 loaded, source, observation, unfinished, threads, fixed_positions
             )
             if list_path is not None:
@@ -135,6 +136,7 @@ def predict(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{loaded.stamp_px} px; flux is the light in the stamp"
         )
+    # Stars are flagged, never dropped.
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
@@ -144,7 +146,7 @@ def predict(
     return summary
 
 
-def _bundle_of_image(model: Path | None, name: str) -> Path | None:
+def bundle_of_image(model: Path | None, name: str) -> Path | None:
     """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
 
     `from-stars` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
@@ -165,7 +167,7 @@ def _bundle_of_image(model: Path | None, name: str) -> Path | None:
     return bundles[0]
 
 
-def _open_for(model: PsfModel, source: ImageInput) -> Observation:
+def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
     """Open an image whose pixels must be those of a model.
 
     Raises
@@ -213,7 +215,7 @@ def check_targets(
             raise PredictionError(f"{target}: two outputs have this name")
 
 
-def _write_prediction(
+def write_prediction(
     model: PsfModel,
     source: ImageInput,
     observation: Observation,
@@ -249,6 +251,7 @@ def _write_prediction(
         ("INFILE", source.path.name, "stars"),
         ("PIXSCALE", scale, f"[arcsec] width of a pixel{assumed}"),
     ]
+    # What is not known has no card.
     if observation.catalogue is not None:
         cards.append(("CATALOG", observation.catalogue.name, "star list"))
     if observation.gain is not None:
@@ -264,13 +267,13 @@ def _write_prediction(
             file.write(star_index, prediction)
             flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
             unflagged += int((prediction.flags == 0).sum())
-            offsets.append(_list_offsets(stamps, prediction))
+            offsets.append(offsets_from_list(stamps, prediction))
             star_index += len(prediction)
         note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     return flag_counts, unflagged, note if observation.shape else None
 
 
-def _list_offsets(stamps: Stamps, prediction: Prediction) -> np.ndarray:
+def offsets_from_list(stamps: Stamps, prediction: Prediction) -> np.ndarray:
     """Return the offsets of stars from their listed positions.
 
     Returns

@@ -52,13 +52,6 @@ class CameraValue(NamedTuple):
     origin: str
 
 
-class CheckedCamera(NamedTuple):
-    """Camera values that fit the pixels, and a sentence on each that does not."""
-
-    values: dict[str, CameraValue]
-    remarks: list[str]
-
-
 @dataclass(frozen=True)
 class SkySample:
     """Sky of an image from squares spread over it, in the image's unit.
@@ -99,6 +92,7 @@ def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[
 
 def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
     """Return the first finite number above 0 under one of the keys, in the order of the keys."""
+    # Its own header goes before that of the file; a truth value is no number.
     for key in keys:
         for header in image.headers:
             value = card_value(header, key)
@@ -137,6 +131,7 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
     per second, or of a calibrated brightness, the gain of the camera is not that of the pixels.
     """
+    # By the unit of the pixels, whose writing differs.
     unit = image.unit.lower().replace(" ", "")
     if unit in {"electron", "electrons", "e-", "e"}:
         return CameraValue(1.0, "BUNIT")
@@ -205,6 +200,7 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
         for start in range(0, image.shape[0], 8 * BLOCK_PX):
             band = pixels[start : start + 8 * BLOCK_PX]
+            # The largest value so far; a larger one starts the count anew.
             top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
             if top > largest:
                 largest, count, pairs = top, 0, 0
@@ -219,7 +215,9 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     return (largest, count) if clipped else None
 
 
-def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> CheckedCamera:
+def checked_camera(
+    image: ImageFile, camera: Mapping[str, CameraValue]
+) -> tuple[dict[str, CameraValue], list[str]]:
     """Leave out header values that the pixels contradict; those that are given stay, with a word.
 
     Parameters
@@ -229,6 +227,13 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     camera : mapping
         Values by the names of `HEADER_KEYS`.
 
+    Returns
+    -------
+    values : dict of str to CameraValue
+        Those that fit the pixels.
+    remarks : list of str
+        A sentence on each that does not.
+
     Raises
     ------
     ObservationError
@@ -236,15 +241,15 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     """
     sky, values = sky_sample(image), dict(camera)
     if sky is None:
-        return CheckedCamera(values, [])
+        return values, []
     values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
-        return CheckedCamera(values, remarks)
+        return values, remarks
     origin = camera["gain"].origin
     if origin == "given":
-        return CheckedCamera(values, [*remarks, f"{image.path}: {problem}: used as stated"])
+        return values, [*remarks, f"{image.path}: {problem}: used as stated"]
     values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
     remarks.append(
         f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
@@ -254,7 +259,7 @@ def checked_camera(image: ImageFile, camera: Mapping[str, CameraValue]) -> Check
     level, origin = values["saturation"]
     if level is not None and origin != "given" and sky.highest <= 1.0 < level:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
-    return CheckedCamera(values, remarks)
+    return values, remarks
 
 
 def checked_saturation(
@@ -295,6 +300,7 @@ def gain_contradiction(
         return None
     photons = np.sqrt(max(sky.level, 0.0) / gain.value)
     electronics = read_noise.value / gain.value if read_noise.value else 0.0
+    # The larger of the two alone is a lower limit of the noise.
     least_sigma = max(photons, electronics)
     cause = f"{gain.origin} = {gain.value:g}"
     # A mean of two frames has 0.71 of the noise of one; resampling leaves about 0.8.
@@ -319,6 +325,7 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
             f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
             "coordinates, and the pixel scale is that of other keys"
         ]
+    # astropy applies a polynomial that the projection does not announce.
     distorted = image.wcs is not None and image.wcs.sip is not None
     if distorted and not projection.endswith("-SIP"):
         return [

@@ -80,6 +80,7 @@ def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
     """
     if isinstance(values, np.ma.MaskedArray):
         return np.asarray(values.data), np.ma.getmaskarray(values), ""
+    # Quantities, perhaps with a mask.
     unit = getattr(values, "unit", None)
     mask = getattr(values, "mask", None)
     plain = getattr(values, "unmasked", values)  # of astropy's Masked
@@ -178,6 +179,7 @@ def _hdus(
     # FITS has no half precision and no truth values.
     narrow = data.dtype.kind == "b" or data.dtype == np.float16
     hdus = fits.HDUList([fits.PrimaryHDU(data.astype(np.float32) if narrow else data, header)])
+    # A mask of truth values, or of bits; one for all stamps of a cube is repeated.
     if mask is not None:
         bits = np.broadcast_to(np.asarray(mask), data.shape)
         bits = bits.astype(np.uint8) if bits.dtype.kind == "b" else np.array(bits)

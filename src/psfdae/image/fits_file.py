@@ -295,10 +295,15 @@ def find_image(
         index, header = hdus.index(hdu), hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
         shape = tuple(int(n) for n in hdu.shape)
-        # Pixels of a plain image end where shape and type say; tiles are a table of the file.
-        is_tiled = isinstance(hdu, fits.CompImageHDU)
-        data_bytes = hdu._bintable.size if is_tiled else hdu.size
-        missing = hdu.fileinfo()["datLoc"] + data_bytes - file.path.stat().st_size
+        # Pixels are in the file as shape and type say; tiles are a table, to which astropy has no
+        # public way.
+        stored = hdu._bintable if isinstance(hdu, fits.CompImageHDU) else hdu
+        # The decoders of two codings (astropy 8.0) take lengths and sizes from the tiles: a wrong
+        # byte makes them write outside of their memory.
+        coding = stored.header.get("ZCMPTYPE")
+        if coding in ("HCOMPRESS_1", "PLIO_1"):
+            raise ObservationError(path, f"tiles compressed with {coding}; decompress the file")
+        missing = hdu.fileinfo()["datLoc"] + stored.size - file.path.stat().st_size
         if missing > 0:
             raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
         # values = BSCALE · stored + BZERO

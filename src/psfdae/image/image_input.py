@@ -125,6 +125,7 @@ class ImageInput(ImageStatements):
         ObservationError
             If the list of several images has no sky coordinates.
         """
+        # A list of several images has stars of all of them.
         on_image = self.on_image
         if self.catalogue is not None and len(images) > 1:
             require_sky(self.catalogue, "a training on several images")
@@ -150,6 +151,7 @@ class ImageInput(ImageStatements):
         ObservationError
             If a value has another unit, or is no number above 0; likewise the threshold.
         """
+        # Values with the units that they may have; the first is that of the number.
         stated: dict[str, tuple[Number | None, str]] = {
             "pixel scale": (self.pixel_scale_arcsec, "arcsec/pix arcsec"),
             "gain": (self.gain, "electron/adu electron/ct electron/DN"),
@@ -159,6 +161,7 @@ class ImageInput(ImageStatements):
         numbers = {
             name: in_unit(value, units, name, self.path) for name, (value, units) in stated.items()
         }
+        # A count, a scale or a threshold of 0 has no meaning.
         for name, number in {**numbers, "threshold": self.detection_sigma}.items():
             if number is not None and not (math.isfinite(number) and number > 0):
                 raise ObservationError(self.path, f"{name} {number!r}, expected a number above 0")
@@ -183,6 +186,7 @@ class ImageInput(ImageStatements):
         """
         from psfdae.image.observation import open_observation
 
+        # Ranges of whole numbers.
         if stamp_px < 1:
             raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
         if margin < 0:

@@ -139,7 +139,8 @@ def fits_values(column: Column) -> np.ndarray:
     if values.dtype.kind in "US":
         width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
         texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
-        return np.array([ascii_bytes(text) for text in texts], dtype=f"S{width}")
+        encoded = [v if isinstance(v, bytes) else v.encode("ascii", "replace") for v in texts]
+        return np.array(encoded, dtype=f"S{width}")
     # FITS has 16, 32 and 64 bits of whole numbers with a sign, 32 and 64 of real ones.
     if values.dtype.kind == "u" or values.dtype == np.int8:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
@@ -155,11 +156,6 @@ def _missing(dtype: np.dtype) -> Any:
     if dtype.kind == "f":
         return np.nan
     return np.iinfo(dtype).min if dtype.kind == "i" else False
-
-
-def ascii_bytes(text: str | bytes) -> bytes:
-    """Return a text as FITS holds it, question marks in place of characters that it has not."""
-    return text if isinstance(text, bytes) else text.encode("ascii", "replace")
 
 
 def as_fits(table: QTable, name: str) -> BinTableHDU:

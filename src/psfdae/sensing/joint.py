@@ -147,10 +147,21 @@ class TelescopePosterior:
         return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.stars])
 
     def evaluate(self, _: np.ndarray, parameters: np.ndarray) -> Evaluation:
-        """Evaluate the posterior as `psfdae.sensing.climbing.Evaluate`, at parameters (a, K).
+        """Evaluate the posterior as `psfdae.sensing.climbing.Evaluate` does.
 
         A telescope through which no rays pass, or whose wavefronts no grid can sample, is
         impossible.
+
+        Parameters
+        ----------
+        parameters : ndarray, shape (a, K)
+            K = Q + 4 m: the numbers of the telescope, then four for each star.
+
+        Returns
+        -------
+        height, score, information : ndarray, shapes (a,), (a, K) and (a, K, K)
+            Logarithm of the posterior, its slope, and the expected information with that of the
+            prior.
         """
         q, (count, size) = self.number_count, parameters.shape
         # Parameters without an image keep a height of −∞.
@@ -250,7 +261,14 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
 
 
 def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
-    """Return the most probable state with its errors, and its twin if there is another peak."""
+    """Return the most probable state with its errors, and its twin if there is another peak.
+
+    Parameters
+    ----------
+    posterior : TelescopePosterior
+    peaks : Peaks
+        Where the climbs from both starts have come to; they may be the same place.
+    """
     model, stars = posterior.model, posterior.stars
     t = peaks.parameters[:, : posterior.number_count]
     covariance, evidence = peaks.laplace()
@@ -279,6 +297,19 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
 
     In each round every star chooses the mode nearest to the telescope, and the numbers are fitted
     to the chosen modes, each weighed by its covariance.
+
+    Parameters
+    ----------
+    posterior : TelescopePosterior
+    modes : StarModes
+        Modes of the stars of the posterior, all of them.
+    t : ndarray, shape (Q,)
+        Standardised numbers of the first telescope.
+
+    Returns
+    -------
+    ndarray, shape (Q + 4 m,)
+        Numbers of the telescope, then place, flux and sky of the chosen mode of each star.
     """
     # Coefficients of all modes in waves, with their covariance; a little is added to it, for
     # coefficients that the prior fixes.

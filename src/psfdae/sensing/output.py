@@ -22,8 +22,18 @@ if TYPE_CHECKING:
 def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     """Return the FITS file with all results.
 
-    Its extensions are WAVEFRONT (table), PSF, UNCERT, MODEL, RESIDUAL (cubes), COVAR and, with
-    a joint fit, JOINT (table).
+    Parameters
+    ----------
+    wavefronts : Wavefronts
+    image : str
+        Name of the image, for the header.
+
+    Returns
+    -------
+    HDUList
+        WAVEFRONT, a table with a row for each star and mode; PSF, UNCERT, MODEL and RESIDUAL,
+        cubes with a stamp for each star; COVAR, the covariance of the coefficients for each row
+        of the table; with a joint fit, JOINT, a table with a row for each number of the telescope.
     """
     from astropy.io import fits
 
@@ -43,6 +53,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     )
     # A row for each mode of a star, that is, each wavefront that its image does not exclude.
     modes = wavefronts.table
+    # Names of stars are ASCII in FITS.
     if modes["id"].dtype.kind == "U":
         modes["id"] = fits_values(modes["id"])
     table = fits.table_to_hdu(modes)
@@ -86,6 +97,11 @@ def report_lines(wavefronts: Wavefronts) -> list[str]:
     """Return a table of the errors of one star, and sentences on the modes and the telescope.
 
     Errors are medians over the stars, in waves and in nanometres.
+
+    Returns
+    -------
+    list of str
+        Lines for a terminal.
     """
     terms, summary = wavefronts.terms, wavefronts.summary
     # Modes stand star by star, the most probable one first: the first row of each star.
@@ -98,12 +114,14 @@ def report_lines(wavefronts: Wavefronts) -> list[str]:
         f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   of one star, median of {len(first)}",
         f"{'':12}{'(waves)':>10}{'(waves)':>10}{'(nm)':>10}",
     ]
+    # A line for each coefficient. The prior may differ from star to star, as aberrations do.
     for k, name in enumerate(terms.names):
         prior = np.median(terms.sd[summary["star"][first], k])
         term_error = np.median(error[:, k])
         lines.append(f"{name:12}{prior:10.4f}{term_error:10.4f}{wavelength_nm * term_error:10.2f}")
     # One wave of OPD is a wavelength.
     rms_nm = wavelength_nm * np.nanmedian(wavefronts.rms[0])
+    # Stars whose best mode has less than 95 % have another one that their image does not exclude.
     ambiguous = np.mean(summary["probability"][first] < 0.95)
     lines.append(
         f"RMS of the wavefronts {rms_nm:.3g} nm in the median; {ambiguous:.0%} of the stars have a "
@@ -116,6 +134,11 @@ def joint_report_lines(joint: Joint) -> list[str]:
     """Return a table of the telescope's state, and sentences on how well stars determine it.
 
     The table has the prior of each number and its fitted value, both with standard deviations.
+
+    Returns
+    -------
+    list of str
+        Lines for a terminal.
     """
     lines = [
         f"the telescope, from {joint.star.size} stars together:",
@@ -135,6 +158,7 @@ def joint_report_lines(joint: Joint) -> list[str]:
             for i, j in correlated
         ]
         lines.append(f"correlations of errors: {'; '.join(pairs)}")
+    # A pupil that is the same at opposite points hides the sign of the even aberrations.
     if joint.twin is not None:
         lines.append(
             f"its probability is {joint.probability:.3f}; the twin, of the other sign of focus, "

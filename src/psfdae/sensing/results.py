@@ -253,6 +253,7 @@ class Wavefronts:
 
         `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
         """
+        # Draws belong to the mode that is nearest; a mode without draws is left out.
         k = len(self.terms.names)
         rows: list[tuple[Any, ...]] = []
         for row, star in enumerate(self.star):
@@ -463,6 +464,7 @@ class Wavefronts:
             error = np.sqrt(summary["covariance"][:, k, k])
             columns.append((name, completed(summary["mean"][:, k]), "wave"))
             columns.append((f"{name}_error", completed(error), "wave"))
+        # The RMS is that of the whole posterior, the same for all modes of a star.
         for name, waves in zip(("rms", "rms_error"), self.rms, strict=True):
             columns.append((name, self.wavelength_nm * waves[star], "nm"))
         for name, values in self.measured().items():

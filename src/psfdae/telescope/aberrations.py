@@ -57,6 +57,7 @@ class OmitsLateKeys(Group):
     @model_serializer(mode="wrap")
     def omit_late_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the group as a tree, without late keys that have their default."""
+        # A key that has its default says nothing that readers would not assume.
         fields = type(self).model_fields
         return {
             key: value
@@ -77,13 +78,19 @@ class Mirror(Group):
 
 
 class Secondary(Mirror):
-    """Secondary mirror, the one that may be misaligned."""
+    """Secondary mirror, the one that may be misaligned.
+
+    Its misalignment is a decentre and a tilt about its vertex (`Raytraced`).
+    """
 
     clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
 
 
 class Lens(Group):
-    """Lens with two spherical surfaces; light meets the front first."""
+    """Lens with two spherical surfaces; light meets the front first.
+
+    It is centred on the axis, in the vacuum, and of the prescription's glass.
+    """
 
     front_radius_m: Radius = Field(description="Radius of the front, > 0: centre above vertex")
     back_radius_m: Radius = Field(description="Radius of the back, > 0: centre above vertex")
@@ -94,6 +101,7 @@ class Lens(Group):
     @model_validator(mode="after")
     def check_thickness(self) -> Lens:
         """Refuse a lens whose back is not below its front."""
+        # z points to the sky, and light comes down: it meets the front above the back.
         thickness = self.front_vertex_m - self.back_vertex_m
         if not thickness > 0:
             raise ValueError(
@@ -131,7 +139,10 @@ class Prescription(Group):
 
     @property
     def ordered_lenses(self) -> list[tuple[str, Lens]]:
-        """Names and lenses in the order in which light meets them, from the highest down."""
+        """Names and lenses in the order in which light meets them, from the highest down.
+
+        The order of a mapping in a file, or of overrides, does not matter.
+        """
         return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
 
     @model_validator(mode="after")
@@ -196,6 +207,7 @@ def check_powers(term: dict[str, float]) -> dict[str, float]:
     ValueError
         For a key that is no such product; `constant` is the product of no factors.
     """
+    # x*y* alone would match the empty text, hence the look-ahead.
     for name in term:
         if name != "constant" and not re.fullmatch(r"(?=.)x*y*", name):
             raise ValueError(f"{name!r}: must be constant or a product such as x, yy or xxy")
@@ -213,6 +225,7 @@ def check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]
         For another name; z1 is piston, which no image shows.
     """
     for name in terms:
+        # One or two digits, without a leading zero: a term has one name only.
         number = re.fullmatch(r"z([1-9]\d?)", name)
         if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
             raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
@@ -289,6 +302,7 @@ class Raytraced(OmitsLateKeys):
     @model_validator(mode="after")
     def check_secondary(self) -> Raytraced:
         """Refuse a misalignment of a secondary that is not there."""
+        # The primary, with the detector, is the frame of all coordinates: it stays.
         if self.prescription.secondary is None and self.misalignment.any():
             raise ValueError(
                 f"decentre_m = {list(self.decentre_m)}, tilt_deg = {list(self.tilt_deg)}: "

@@ -64,6 +64,7 @@ class Terms:
 
 def relative_field(telescope: OwnTelescope, angle_deg: np.ndarray) -> np.ndarray:
     """Return field angles in degrees as field vectors, 1 at the telescope's `field_edge_deg`."""
+    # |h| = 1 at the edge on an axis, √2 in a corner of a square field.
     return np.asarray(angle_deg, float) / telescope.field_edge_deg
 
 
@@ -258,7 +259,8 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
         model = _linear_model(names, mean, basis, prior.fraction, waves)
     else:
         model = _ray_traced_model(telescope, aberrations, angle_deg)
-    # The FWHM of the seeing is added if the prior leaves it free.
+    # The FWHM of the seeing is added if the prior leaves it free. It moves no coefficient: stamps
+    # depend on it by another way (`psfdae.sensing.joint`).
     if seeing is None or not prior.seeing:
         return model
     return TelescopeModel(

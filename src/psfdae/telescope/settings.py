@@ -21,7 +21,10 @@ from psfdae.telescope.aberrations import Jitter, OmitsLateKeys, Raytraced, Seide
 
 
 class Telescope(Group):
-    """Telescope by its aperture, band and detector."""
+    """Telescope by its aperture, band and detector.
+
+    The pupil is an annulus; the image is that of one wavelength.
+    """
 
     name: Name = Field(description="For titles, files and messages")
     diameter_m: Positive = Field(description="Outer diameter of the aperture")
@@ -38,7 +41,10 @@ class Telescope(Group):
 
 
 class Seeing(Group):
-    """Long-exposure blur by the atmosphere, the same for all stars."""
+    """Long-exposure blur by the atmosphere, the same for all stars.
+
+    The image is the telescope's, convolved with a round profile (`psfdae.optics.seeing.Profile`).
+    """
 
     kind: Literal["gaussian", "moffat"] = Field(description="Profile")
     fwhm_arcsec: Positive = Field(description="Full width at half maximum of the seeing alone")
@@ -49,6 +55,7 @@ class Seeing(Group):
     @model_validator(mode="after")
     def check_beta(self) -> Seeing:
         """Require the exponent of a Moffat profile, and refuse one of a Gaussian."""
+        # Wings fall as r^−2β: a Gaussian has none.
         if (self.kind == "moffat") != (self.beta is not None):
             raise ValueError(
                 f"beta = {self.beta}: must be between 1.5 and 20 for kind = moffat, "
@@ -79,6 +86,7 @@ def aberrations_by_kind(tree: Any) -> Any:
 
     The class is chosen beforehand, so that messages name no member of a union.
     """
+    # A value that is no mapping, or of no class, is refused with the kinds that there are.
     classes: dict[str, type[Group]]
     classes = {"seidel": Seidel, "zernike": Zernike, "raytraced": Raytraced}
     if not isinstance(tree, Mapping):
@@ -114,12 +122,16 @@ class OwnTelescope(OmitsLateKeys, Telescope):
 
 def has_own_aberrations(tree: object) -> bool:
     """Return True if a telescope, checked or not yet, brings aberrations of its own."""
+    # Any of these keys makes it one: those that are missing are then named.
     keys = {"aberrations", "field_edge_deg", "seeing", "prior"}
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(keys & set(tree)))
 
 
 def telescope_by_keys(tree: Any) -> Any:
-    """Check a telescope by its class: with aberrations of its own, or without."""
+    """Check a telescope by its class: with aberrations of its own, or without.
+
+    As for aberrations, the class is chosen beforehand for the sake of the messages.
+    """
     if not isinstance(tree, Mapping):
         return tree
     return (OwnTelescope if has_own_aberrations(tree) else Telescope).model_validate(tree)
@@ -145,6 +157,7 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     >>> f"{telescope.name}: a pixel is {telescope.pixel:.2f} λ/D wide"
     'refractor: a pixel is 1.76 λ/D wide'
     """
+    # Errors of files that it includes name those.
     tree = composed_tree(Path(path))
     try:
         return validate(OwnTelescope, tree)
@@ -199,7 +212,11 @@ def composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two trees, key by key; where both have a value, that of the second one counts."""
+    """Merge two trees, key by key; where both have a value, that of the second one counts.
+
+    Lists are values: they are not joined. Neither tree is changed.
+    """
+    # Groups that both trees have are merged in turn.
     subtrees = {
         key: merged(first[key], value)
         for key, value in second.items()

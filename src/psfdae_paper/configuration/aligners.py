@@ -1,4 +1,7 @@
-"""The methods of scene 3, in the order of its tables."""
+"""The methods of scene 3, in the order of its tables.
+
+One entry says what a method estimates states from; products, rules, tables and figures follow it.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,9 @@ class Aligner:
 
 
 _ALIGNERS = [
+    # The aligned telescope, whatever the stamps: the error that a method must beat.
     Aligner("constant", Look("always the middle", "black")),
+    # The paper's network: it learns noise-free stamps of the grid, and estimates from noisy ones.
     Aligner(
         "original",
         Look("CNN, noisy stamps", "#4d4d4d", paper=("original", "Original data")),
@@ -65,6 +70,7 @@ _ALIGNERS = [
         states="grid",
         swept=("cnn", "train_original"),
     ),
+    # The same network behind the DAE, which takes the noise from the stamps.
     Aligner(
         "dae",
         Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
@@ -72,6 +78,8 @@ _ALIGNERS = [
         denoised=True,
         borrowed_network="original",
     ),
+    # Not in the paper: a network that has seen noise needs no DAE, and one that is trained on the
+    # DAE's output knows its errors.
     Aligner(
         "noise_trained",
         Look("network trained on noisy stamps", "#d55e00"),
@@ -88,6 +96,7 @@ _ALIGNERS = [
         noisy=True,
         denoised=True,
     ),
+    # Fits of single states, which start at the estimate of a network.
     Aligner(
         "max_likelihood",
         Look("maximum likelihood", "#009e73"),
@@ -102,6 +111,8 @@ _ALIGNERS = [
         fitted=True,
         unknown_flux=True,
     ),
+    # Bounds of unbiased estimates: of each state, of the errors of all states together, and with
+    # unknown flux and position.
     Aligner("cramer_rao", Look("Cramér–Rao bound", "black")),
     Aligner("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
     Aligner(

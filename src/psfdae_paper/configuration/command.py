@@ -53,6 +53,7 @@ class Groups:
 
     def with_choice(self, words: Sequence[str]) -> tuple[str, ...]:
         """Return the command's choice, then overrides; ConfigError if one changes the choice."""
+        # A command of scene 3 has its dataset; another one would have other groups.
         for word in words if self.choice else ():
             if word.startswith("dataset="):
                 raise ConfigError(f"{word}: this command is for {', '.join(self.choice)} only")

@@ -1,4 +1,4 @@
-"""From YAML to settings: Hydra composes the files of `config/`, pydantic checks the result.
+"""Composition and check of settings: Hydra composes files of `config/`, pydantic checks them.
 
 In goes a list of overrides such as `dataset=dataset3 preset=smoke noise.levels=[0.002]`; out comes
 a configuration in three forms, each made from the one before:
@@ -156,6 +156,7 @@ def load(overrides: Sequence[str] = ()) -> Config:
 
 def validate_tree(tree: Mapping[str, Any]) -> Config:
     """Check a composed configuration; raises ConfigError like `load`."""
+    # A dataset has all groups; scene 3 reads only some, and none of stars.
     if not _is_alignment(tree):
         return validate(whole_config(), tree)
     _require_known_groups(tree)
@@ -223,6 +224,7 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     ConfigError
         Names each wrong key with its value and the allowed range, and unknown groups.
     """
+    # A misspelt group is refused, even though the stage would not read it.
     tree = compose(overrides)
     _require_known_groups(tree)
     return part(reads, stage_tree(reads, tree))
@@ -278,6 +280,7 @@ def write_settings(
     serialised = json.dumps(decisive_settings(settings), sort_keys=True)
     digest = hashlib.sha256(serialised.encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
+    # A dry run writes nothing; jobs on other machines read the same file.
     if not dry:
         text = yaml.safe_dump(settings, sort_keys=True, allow_unicode=True)
         # A file that is damaged, or has other neutral settings, is written again.
@@ -319,6 +322,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
         tree = with_derived_values(tree)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    # Scene 3 has no stars, and other datasets no states: a stage of the other kind is told so.
     missing = [key for key in reads if key not in tree]
     if missing and _is_alignment(tree):
         raise ConfigError(

@@ -60,6 +60,7 @@ class Consistent(Group):
     def check_scene_groups(self) -> Consistent:
         """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
+        # Groups that a stage does not read are absent, and are not checked.
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
             if prescription is not None and prescription.secondary is None:
                 raise ValueError("prescription: secondary: missing, it is what is misaligned")
@@ -111,6 +112,7 @@ def _check_scene(tree: Mapping[str, Any]) -> None:
 
     The aberrations are settings of the scene or of the telescope: exactly one of them has some.
     """
+    # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
     scene, telescope = tree.get("scene"), tree.get("telescope")
     if scene is None and "alignment" in tree:
         scene = {"name": "alignment"}

@@ -65,6 +65,7 @@ class Axis(Group):
     @classmethod
     def expand_short_forms(cls, tree: object) -> object:
         """Accept a bare list as values, and names of choices that YAML reads as numbers."""
+        # YAML reads a name such as 3 as a number; names of choices are text.
         if isinstance(tree, list):
             return {"values": tree}
         if isinstance(tree, Mapping) and isinstance(tree.get("choices"), Mapping):
@@ -121,6 +122,7 @@ class Axis(Group):
 class Sweep(Group):
     """Points of one model that are trained alike and compared by one metric."""
 
+    # What is trained, and on which data.
     kind: Literal["grid", "random", "adaptive"] = Field(
         description="Every combination, random draws, or draws that learn from earlier ones"
     )
@@ -128,14 +130,17 @@ class Sweep(Group):
     dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
     split: SplitKind = Field(default="random", description="Split of the stars")
     reference: Reference = Field(default="realisation", description="What the DAE is to restore")
+    # How the best point is chosen; errors on the test part choose nothing.
     metric: Metric = Field(description="Chooses the best point: over all noise levels")
     direction: Literal["minimize", "maximize"] = Field(description="Which metric is better")
+    # What all points share, and what is varied.
     overrides: dict[AxisName, Value] = Field(
         default={}, description="Configuration keys that all points share"
     )
     space: Annotated[dict[AxisName, Axis], Field(min_length=1)] = Field(
         description="What is varied, by name"
     )
+    # Of random and adaptive sweeps.
     trials: Count | None = Field(default=None, description="Number of draws; a grid has none")
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Seed of the draws")
     startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
@@ -163,6 +168,7 @@ class Sweep(Group):
     @model_validator(mode="after")
     def check_model(self) -> Sweep:
         """Require a dataset and a metric that the model has, and trials for random draws."""
+        # A grid has as many points as combinations.
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         if (self.model in SWEPT) != (self.dataset is None):
@@ -200,6 +206,7 @@ class Sweep(Group):
         for name, axis in self.space.items():
             options = axis.options or [0]
             keys += {key for option in options for key in axis.changes(name, option)}
+        # The key itself, or the group that it is in, must be one that may differ between points.
         for key in keys:
             if not any(key == prefix or key.startswith(f"{prefix}.") for prefix in self.varied):
                 raise ValueError(

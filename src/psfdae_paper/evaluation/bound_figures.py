@@ -231,7 +231,7 @@ def headline(
     """
     figure = new_figure(3.7)
     # Stamps: left edge and sizes of the cells in fractions of the figure, then in inches.
-    left, bottom, top = 0.115, 0.13, 0.86
+    left_edge, bottom, top = 0.115, 0.13, 0.86
     columns = len(rows[0].images)
     cell_width, cell_height = 0.395 / columns, (top - bottom) / len(rows)
     # Rows of stamps from the top; each is on the colour scale of the truth below it.
@@ -239,8 +239,8 @@ def headline(
     peak, stamps = rows[-1].images.max(axis=(1, 2)), in_inches(figure)
     for number, row in enumerate(rows, 1):
         row_bottom = top * figure.get_figheight() - number * cell[1]
-        draw_row(stamps, row, (left * WIDTH_IN, row_bottom), cell, peak)
-    figure.text(left + 0.5 * columns * cell_width, 0.92, titles[0], ha="center", fontsize=10)
+        draw_row(stamps, row, (left_edge * WIDTH_IN, row_bottom), cell, peak)
+    figure.text(left_edge + 0.5 * columns * cell_width, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _draw_errors(panel, methods, efficiency, bounds)
     figure.text(0.66 + 0.5 * 0.325, 0.92, titles[1], ha="center", fontsize=10)

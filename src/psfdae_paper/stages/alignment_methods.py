@@ -113,6 +113,7 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     kind : str
         Name of the network; empty for all.
     """
+    # Noise, and the settings of a DAE that is applied, only where some network needs them.
     kinds = [kind] if kind else TRAINED
     noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
     dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
@@ -249,6 +250,7 @@ def noisy_test_states(
     """
     if level == 0.0:
         return stamps
+    # A stream of its own for each set and level.
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
     return noise_model(config).draw(stamps, level, rng)
 
@@ -333,6 +335,7 @@ def estimate(
             estimates[row, column] = predict[method.network](stamps)
             seconds = time.perf_counter() - started
             rows.append((test_set, level, method.name, seconds, len(stamps)))
+    # True states go along: products of one test are compared by them.
     columns = {
         "states": Column(product["states"], "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
@@ -466,6 +469,7 @@ def bound(
     from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
 
     limit_threads(1)
+    # States, the model of their wavefronts, and the noise.
     product = read_states(states, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]

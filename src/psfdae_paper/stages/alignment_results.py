@@ -43,13 +43,6 @@ from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import alignment_figures, alignment_tables
-from psfdae_paper.evaluation.alignment_figures import (
-    correlation_matrices,
-    errors_against_size,
-    predicted_against_true,
-    size_of,
-    twin_ambiguity,
-)
 from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.alignment import StatesFile, read_states
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
@@ -262,6 +255,7 @@ def time_table(
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
+    # An estimate's time, and that of the trainings on which it rests.
     for method in ESTIMATORS:
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
@@ -278,6 +272,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
 
     The first two states of the set are shown, without noise and at every noise level.
     """
+    # The DAE must be that of these stamps.
     product = read_states(states)
     require_origin(dae, STAMP_KEYS, product)
     # The first two states, with the noise that they have in the test set.
@@ -306,7 +301,7 @@ def predicted(
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
-    write_png(predicted_against_true(truth, by_method), out)
+    write_png(alignment_figures.predicted_against_true(truth, by_method), out)
 
 
 @command("alignment figure errors")
@@ -320,9 +315,12 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         if key["noise_level"] > 0 and key["method"] in (*FIGURE_METHODS, "cramer_rao"):
             error = expected_abs_error(values) if is_bound else np.abs(values - truth)
-            curves[key["noise_level"]][key["method"]] = (size_of(truth), error.mean(axis=1))
+            curves[key["noise_level"]][key["method"]] = (
+                alignment_figures.size_of(truth),
+                error.mean(axis=1),
+            )
     title = f"Errors against misalignment, {len(truth)} uniform states"
-    write_png(errors_against_size(curves, title), out)
+    write_png(alignment_figures.errors_against_size(curves, title), out)
 
 
 @command(
@@ -363,7 +361,7 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(twin_ambiguity(curves, stamp_groups, state), out)
+    write_png(alignment_figures.twin_ambiguity(curves, stamp_groups, state), out)
 
 
 def _stamps_of_multiples(
@@ -409,6 +407,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
     measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)
     methods = [method for method in ALIGNERS.values() if method.short]
+    # Methods with a short name have a panel; those of the paper have its values beside them.
     in_paper = [method for method in methods if method.look.paper]
     not_in_paper = [method for method in methods if not method.look.paper]
     panels = []
@@ -419,4 +418,4 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
         upper = [panel(method, paper_rows, "paper, ") for method in in_paper]
         upper += [panel(method, rows) for method in in_paper]
         panels += [upper, [panel(method, rows) for method in not_in_paper]]
-    write_png(correlation_matrices(panels), out)
+    write_png(alignment_figures.correlation_matrices(panels), out)

@@ -48,7 +48,11 @@ def bank(
     config: Config,
     out: Annotated[File, "HDF5 product with fresh stars, framed so that they can be mirrored."],
 ) -> None:
-    """Simulate the bank of fresh stars behind the posterior mean."""
+    """Simulate the bank of fresh stars behind the posterior mean.
+
+    They are other draws of the simulator that made the test stars, with a margin, so that one
+    propagated star stands for all eight of its mirror images and rotations.
+    """
     limit_threads(1)  # batches run in parallel
     # Two draws of the simulator, one after the other: the second has its own random streams.
     parts = [
@@ -78,7 +82,11 @@ def bounds(
         File | None, "Product of the stage bank; needed where stars have random aberrations."
     ] = None,
 ) -> None:
-    """Bound the error that any estimator can reach on the test stars."""
+    """Bound the error that any estimator can reach on the test stars.
+
+    The posterior mean over the simulator's stars has the least mean squared error; its tables say
+    where the bank suffices for it. The local floor is the error if field and centring are known.
+    """
     # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
@@ -122,7 +130,10 @@ def optics(
     per_star: Annotated[File, "Parquet with every star."],
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure the methods that are given the telescope, on the test stars that are bounded."""
+    """Measure the methods that are given the telescope, on the test stars that are bounded.
+
+    They estimate the wavefront of each star; one of them is given its position, too.
+    """
     limit_threads(1)
     product = read_product(stars, "stars")
     require(stars, product.config, STARS, config)
@@ -159,7 +170,7 @@ def optics(
 def collect_bounds(
     out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
 ) -> None:
-    """Join the tables of several datasets' bounds."""
+    """Join the tables of several datasets' bounds; all must have the columns of the first."""
     write_csv(out, read_tables(parts))
 
 

@@ -150,7 +150,11 @@ def calibrate(
     stars: Annotated[tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."],
     out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
 ) -> None:
-    """Fit noise, dynamic range and pixel scales to the scans."""
+    """Fit noise, dynamic range and pixel scales to the scans.
+
+    The noise constant κ is that of the columns' MSE, each weighted alike in its logarithm; one
+    dynamic range and one pixel scale for each scene follow from the SSIM by least squares.
+    """
     # Each of the paper's columns beside simulated stars with the configured parameters.
     products = dict(stars)
     configured = _configured(products)

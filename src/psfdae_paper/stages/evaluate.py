@@ -26,7 +26,7 @@ from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import as_markdown, paper_table
+from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -71,7 +71,11 @@ def evaluate(
     per_star: Annotated[File, "Parquet with every star."],
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure every method on the test stars at each noise level."""
+    """Measure every method on the test stars at each noise level.
+
+    Metrics are the MSE per pixel and the SSIM against the reference. All methods restore the same
+    noisy images; standard errors are clustered by field, whose stars have a PSF in common.
+    """
     # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
@@ -137,7 +141,7 @@ def estimators(
             place = models.get(name)
             if place is None:
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
-            fits.require(method_class, place, stars, config, split, reference)
+            fits.require_fit(method_class, place, stars, config, split, reference)
             places[name] = place
     # Methods without a file are fitted here.
     fitted: dict[str, Method] = {}
@@ -157,7 +161,10 @@ Metric = Literal["mse", "ssim"]
 
 @command("collect")
 def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
-    """Join evaluations into one tidy table, with the scatter of each method between seeds."""
+    """Join evaluations into one tidy table, with the scatter of each method between seeds.
+
+    The scatter, where it was measured, is that of a repeated fit with other random numbers.
+    """
     table = comparison.with_seed_stderr(
         read_tables(evaluations, COLUMNS), comparison.seed_scatter()
     )
@@ -186,10 +193,13 @@ def paper_tables(
         tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
     ],
 ) -> None:
-    """Write the paper's tables, with measured errors beside the published ones."""
+    """Write the paper's tables, with measured errors beside the published ones.
+
+    Rows are methods, columns noise levels; measured errors are given for each reference.
+    """
     # Each table as CSV, and beside it as Markdown.
     measured = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)
-        write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
+        write_text(path.with_suffix(".md"), paper_table_markdown(table, dataset, metric))

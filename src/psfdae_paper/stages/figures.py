@@ -55,7 +55,7 @@ Efficiency = Annotated[File, "CSV of the stage efficiency."]
 
 @command("figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
-    """Draw the static PSFs at their field positions."""
+    """Draw the static PSFs at their field positions, without the margin for centring errors."""
     product = read_product(templates, "templates", ("psf", "grid", "field"))
     psf = without_margin(product)
     title = (
@@ -89,15 +89,15 @@ def figure_strip(
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
-    drawn = drawn_stars(config, stars, models, reference, 8)
+    strip_stars = drawn_stars(config, stars, models, reference, 8)
     # Field angles of the stars as titles of the columns.
-    angle, unit = in_field_unit(drawn.field)
-    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[drawn.selected]]
+    angle, unit = in_field_unit(strip_stars.field)
+    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[strip_stars.selected]]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
         f"restored and measured {REFERENCES[reference]}"
     )
-    write_png(restoration_strip(drawn.rows(config, levels), columns, title), out)
+    write_png(restoration_strip(strip_stars.rows(config, levels), columns, title), out)
 
 
 @command("figure headline", reads=READS)
@@ -112,10 +112,10 @@ def figure_headline(
     out: Png,
 ) -> None:
     """Draw restored stars beside the errors and their bounds."""
-    drawn = drawn_stars(config, stars, models, "realisation", 5)
+    strip_stars = drawn_stars(config, stars, models, "realisation", 5)
     # Rows of restored stars, one for each method, and below them the truth.
-    truth, *restored = drawn.rows(config, [level])
-    looks = [estimator.look for estimator in drawn.methods.values()]
+    truth, *restored = strip_stars.rows(config, [level])
+    looks = [estimator.look for estimator in strip_stars.methods.values()]
     rows = [
         replace(row, label=look.label if look.restores else f"{look.label} star")
         for row, look in zip(restored, looks, strict=True)
@@ -124,7 +124,7 @@ def figure_headline(
     errors, limits = (rows_of(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    methods = list(drawn.methods.values())
+    methods = list(strip_stars.methods.values())
     write_png(bound_figures.headline(rows, methods, errors, limits, titles), out)
 
 
@@ -211,7 +211,7 @@ def figure_curves(
     histories: Annotated[tuple[File, ...], {"argument": True}],
     out: Png,
 ) -> None:
-    """Draw training and validation error of networks."""
+    """Draw training and validation error of networks against the optimiser's steps."""
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
@@ -248,7 +248,7 @@ def without_margin(templates: Product) -> np.ndarray:
 
 @command("figure bounds")
 def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
-    """Draw the methods' errors above the bounds."""
+    """Draw the methods' errors above the bounds, against the noise level."""
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
     write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
 

@@ -45,7 +45,11 @@ def fit(
     *,
     out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
 ) -> None:
-    """Fit METHOD, a name of the list `methods` in config.yaml."""
+    """Fit METHOD, a name of the list `methods` in config.yaml.
+
+    It learns from the training stars of the split, with noise as its settings say. The same
+    settings give the same bytes, whether the fit was interrupted or not.
+    """
     # Stars of the split with their noise; training state goes to a file beside the fit.
     method_class = method(name)
     limit_threads(method_class.threads(config))
@@ -59,7 +63,7 @@ def fit(
             raise click.UsageError(
                 "--start: only fits to templates by a method with a warm start take it"
             )
-        fits.require(method_class, start, product, config, split, "realisation")
+        fits.require_fit(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
     # Fit, store with its configuration, and forget the state of the training.
     described = fits.described_by(method_class, config.model_dump(), split, reference)

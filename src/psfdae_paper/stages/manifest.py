@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Annotated
 
-from psfdae.files import write_text
+from psfdae.files import sha256_of, write_text
 from psfdae.options import Folder
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.command import command
@@ -28,7 +27,5 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
         place = path.relative_to(results)
         is_hidden = any(part.startswith(".") for part in place.parts)
         if path.is_file() and not is_hidden and place.parts[0] not in other_runs | no_products:
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            lines.append(f"{digest}  {place.as_posix()}\n")
+            lines.append(f"{sha256_of(path)}  {place.as_posix()}\n")
     write_text(results / "SHA256SUMS", "".join(lines))

@@ -97,7 +97,11 @@ def figure_telescope(
     table: Annotated[File, "CSV, a row per field point."],
     out: Annotated[File, "PNG."],
 ) -> None:
-    """Draw the static PSFs of a telescope with their light and their width."""
+    """Draw the static PSFs of a telescope with their light and their width, and tabulate them.
+
+    The table has field angles in degrees, the light inside the stamp, FWHM in arcsec, ellipticity
+    and position angle in degrees of every field point.
+    """
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]

@@ -36,7 +36,11 @@ def templates(
     config: Config,
     out: Annotated[File, "HDF5 product with the static PSF of every field point."],
 ) -> None:
-    """Propagate the static PSF of every field point."""
+    """Propagate the static PSF of every field point.
+
+    A PSF is the fraction of the light on each pixel. Its brightest pixel is in the middle, and it
+    has a margin, from which stamps with any centring error are cut.
+    """
     limit_threads(1)  # batches run in parallel
     # PSFs have a margin, from which stamps with any centring error are cut.
     framing = config.framing
@@ -65,7 +69,11 @@ def stars(
     templates: Annotated[File, "Product of the stage templates."],
     out: Annotated[File, "HDF5 product with noise-free stars."],
 ) -> None:
-    """Simulate noise-free stars with random aberrations."""
+    """Simulate noise-free stars with random aberrations.
+
+    Each star has its own image (realisation) and the static PSF of its field (template), both on a
+    stamp of flux 1 with the same centring error, and the random numbers that made it.
+    """
     # A realisation has static and random aberrations, a template static ones only. Both are
     # framed on their own brightest pixel, moved by the same jitter and normalised by the flux
     # inside the stamp (eq. 8). With `framing.subpixel` the pixel grid of a realisation is

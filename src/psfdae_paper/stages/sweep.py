@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import click
@@ -79,7 +80,11 @@ def sweep_point(
     out: Annotated[Folder, "Folder for the point's files; its name is the point's."],
     overrides: Overrides = (),
 ) -> None:
-    """Train one point of a sweep and measure it."""
+    """Train one point of a sweep and measure it.
+
+    A point is named by the hash of all that decides its result, and found by the name of OUT; give
+    the overrides with which the sweep was planned. `psfdae sweep list NAME` prints the points.
+    """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
     if out.name not in plan.points:
@@ -93,7 +98,9 @@ def sweep_point(
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
     trial = None
     if entry.slot is not None:
-        trial = Trial(entry.slot, plan.search, [other.name for other in plan.earlier_trials(entry)])
+        trial = Trial(
+            entry.slot, plan.search, [earlier.name for earlier in plan.earlier_trials(entry)]
+        )
     point(part(sweep.reads, entry.config), sweep.model, entry.values, entry.keys, task, trial)
 
 
@@ -148,11 +155,35 @@ def point(
     module = import_module(module_of(model))
     for name in (*module.files_of(model), *TABLES.values(), "cost.json", "result.json"):
         (task.folder / name).unlink(missing_ok=True)
+    outcome = _train(module, config, task, model)
+    result = {
+        "point": task.folder.name,
+        "slot": trial.slot if trial else None,
+        "model": model,
+        "dataset": task.dataset,
+        "split": task.split,
+        "reference": task.reference,
+        "values": dict(values),
+        "keys": dict(keys),
+        **outcome,
+    }
+    write_text(task.folder / "result.json", json.dumps(result, indent=1) + "\n")
+
+
+def _train(module: ModuleType, config: Config, task: Task, model: str) -> dict[str, object]:
+    """Train and measure a point with the module of its model, and write what it cost.
+
+    Returns
+    -------
+    dict
+        status, reason, epochs, attempt, metrics and config.
+    """
     started, started_cpu = time.monotonic(), time.process_time()
     outcome: dict[str, object]
     try:
         measured: Measured = module.run(config, task, model)
     except FitError as error:
+        # A training that cannot go on is a result: the point has no metrics.
         reason = str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
         task.checkpoint.unlink(missing_ok=True)
@@ -173,15 +204,4 @@ def point(
     seconds, cpu_seconds = (round(duration, 3) for duration in cost)
     cost_text = json.dumps({"seconds": seconds, "cpu_seconds": cpu_seconds})
     write_text(task.folder / "cost.json", cost_text + "\n")
-    result = {
-        "point": task.folder.name,
-        "slot": trial.slot if trial else None,
-        "model": model,
-        "dataset": task.dataset,
-        "split": task.split,
-        "reference": task.reference,
-        "values": dict(values),
-        "keys": dict(keys),
-        **outcome,
-    }
-    write_text(task.folder / "result.json", json.dumps(result, indent=1) + "\n")
+    return outcome

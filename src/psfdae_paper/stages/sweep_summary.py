@@ -35,7 +35,10 @@ def sweep_summary(
     out: Annotated[Folder, "Folder for summary.csv, cost.csv, best.yaml and sweep.yaml."],
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
-    """Tabulate the points of a sweep and choose the best."""
+    """Tabulate the points of a sweep and choose the best by its validation metric.
+
+    All points must be finished; one that failed has a row with the reason.
+    """
     plan = plan_sweep(name, overrides)
     files = [points / point / "result.json" for point in plan.points]
     summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
@@ -173,7 +176,7 @@ def sweep_figure(
     table: Annotated[File, "summary.csv of the same."],
     out: Annotated[File, "PNG."],
 ) -> None:
-    """Draw all points at once, or the metric against each axis."""
+    """Draw all points at once (parallel), or the metric against each axis (response)."""
     described = read_yaml(definition)
     # Axes as text: they may be numbers or names of options.
     table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.errors import Error
-from psfdae.files import as_csv, as_yaml, write_text
+from psfdae.files import as_csv, as_yaml, sha256_of, write_text
 from psfdae.method import CONFIG
 from psfdae.options import File, Folder
 from psfdae.version import __version__
@@ -28,13 +28,12 @@ from psfdae_paper.registry import choose_best, forget, link, log_model, register
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
-    Run,
+    TrackedRun,
     epoch_metrics,
     runs_of_alignment,
     runs_of_datasets,
     runs_of_sweep,
     settings_of,
-    sha256_of,
 )
 from psfdae_paper.views import show
 
@@ -83,12 +82,12 @@ def track(
     import_runs(runs, preset, database, out)
 
 
-def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
+def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt: Path) -> None:
     """Import runs, and write what was done with each.
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of TrackedRun
         A parent before its children.
     preset : str
         Goes into the tags.
@@ -158,13 +157,13 @@ def locked(database: Path) -> Iterator[None]:
 
 
 def _import(
-    runs: Sequence[Run], import_tags: dict[str, str], uri: str, database: Path
+    runs: Sequence[TrackedRun], import_tags: dict[str, str], uri: str, database: Path
 ) -> Iterator[tuple[str, str]]:
     """Import one run after the other; yield MLflow's id of each, and what was done.
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of TrackedRun
     import_tags : dict of str
         Tags that all runs of this import have.
     uri : str
@@ -240,7 +239,7 @@ def delete_live(client: MlflowClient, source: str) -> None:
 
 
 def import_run(
-    client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]
+    client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]
 ) -> tuple[str, str]:
     """Leave exactly one active run with the files and settings of a run.
 
@@ -249,7 +248,7 @@ def import_run(
     client : MlflowClient
     experiment : str
         Id of the experiment.
-    run : Run
+    run : TrackedRun
     tags : dict of str
         All tags of the run.
 
@@ -289,7 +288,7 @@ def import_run(
     return run_id, action
 
 
-def create_run(client: MlflowClient, experiment: str, run: Run, tags: dict[str, str]) -> str:
+def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]) -> str:
     """Create a run in MLflow with all that belongs to it, and return its id.
 
     These are its tags, data, model, metrics, parameters and files. The parameters are the settings
@@ -335,7 +334,7 @@ def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) ->
         client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
 
 
-def tags_of(run: Run) -> dict[str, str]:
+def tags_of(run: TrackedRun) -> dict[str, str]:
     """Return the tags of a run in MLflow, but for those of the whole import.
 
     A run with other settings that takes the place of this one sets `superseded` to "true".

@@ -75,6 +75,7 @@ def _trial(
     """Return an earlier trial as Optuna stores it; a failed one has no value."""
     from optuna.trial import TrialState, create_trial
 
+    # A trial that was stopped early has metrics like one that was trained to its end.
     has_metrics = result["status"] in ("finished", "stopped")
     return create_trial(
         state=TrialState.COMPLETE if has_metrics else TrialState.FAIL,
@@ -92,6 +93,7 @@ def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
         IntDistribution,
     )
 
+    # Steps and logarithms of a range are those of the axis.
     distributions: dict[str, BaseDistribution] = {}
     for name, axis in space.items():
         if axis.options:

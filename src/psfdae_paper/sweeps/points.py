@@ -41,6 +41,7 @@ def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
 
     No axis may be a range.
     """
+    # The product of all lists of options, each combination with the names of the axes.
     names = list(space)
     return [
         dict(zip(names, options, strict=True))
@@ -78,6 +79,7 @@ def tidy(axis: Axis, value: float) -> int | float:
 
     Four digits are enough for a search, and short to paste.
     """
+    # Rounding may leave the range by half a step or half a digit.
     if axis.integer:
         return int(np.clip(round(value), *axis.ends))
     return float(np.clip(float(f"{value:.4g}"), *axis.ends))

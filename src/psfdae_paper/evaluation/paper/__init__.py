@@ -68,7 +68,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     return table
 
 
-def as_markdown(table: pd.DataFrame, dataset: str, metric: str) -> str:
+def paper_table_markdown(table: pd.DataFrame, dataset: str, metric: str) -> str:
     """Return a table of `paper_table` as Markdown, MSE in scientific notation."""
     digits = ".4e" if metric == "mse" else ".4f"
     formatted = table.copy()
