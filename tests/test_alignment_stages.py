@@ -172,10 +172,9 @@ def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
     runs = {run.kind: run for run in runs_of_alignment(results)}
     assert set(runs) == set(WEIGHTS)
     for kind, run in runs.items():
-        values = {(point.name, point.epoch): point.value for point in run.points}
         history = pd.read_csv(results / "alignment" / kind / "history.csv")
         curve = "train_mse" if kind == "dae" else "loss"
-        assert values[curve, 2] == history[curve][1]
-        assert ("uniform_tilt_x_bias_0.002", 0) in values
+        assert float(run.epochs[1][curve]) == history[curve][1]
+        assert "uniform_tilt_x_bias_0.002" in run.metrics
     with pytest.raises(ProductError, match="snakemake scene3"):
         runs_of_alignment(tmp_path)

@@ -21,7 +21,7 @@ from psfdae.model.bundle import (
     read_bundle,
     write_bundle,
 )
-from psfdae.model.photometry import FluxModel, robust_flux
+from psfdae.model.flux_model import FluxModel, robust_flux
 from psfdae.networks.dae import build_dae, predict
 
 

@@ -23,7 +23,7 @@ from psfdae.model.bundle import (
 )
 from psfdae.model.calibration import HeldOutStars, StarErrors, crossed_coverage
 from psfdae.model.error_model import at_noise, brightest, mahalanobis
-from psfdae.model.photometry import FluxModel
+from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
 from psfdae.noise import NoiseModel

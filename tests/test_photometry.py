@@ -10,8 +10,9 @@ from scipy import ndimage
 
 from prediction_stars import observe
 from psfdae.image.stamps import SMOOTHED_NOISE, StarFlag, border_pixels, cut, displacement, smoothed
-from psfdae.model import photometry as module
-from psfdae.model.photometry import FluxModel, Photometer, robust_flux
+from psfdae.model import flux_model as module
+from psfdae.model.flux_model import FluxModel, robust_flux
+from psfdae.model.photometry import Photometer
 from psfdae.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)

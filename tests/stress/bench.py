@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psfdae.model.flux_model import FluxModel
 from psfdae.model.packing import COMPONENTS, leading
-from psfdae.model.photometry import FluxModel, Photometer
+from psfdae.model.photometry import Photometer
 from psfdae.networks.dae import TrainingSet, image_scale
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream

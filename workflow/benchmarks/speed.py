@@ -146,8 +146,8 @@ def untrained_bundle(tree, stars, out):
     from psfdae.files import read_product
     from psfdae.model.bundle import read_bundle, write_bundle
     from psfdae.model.error_model import ErrorModel
+    from psfdae.model.flux_model import FluxModel
     from psfdae.model.packing import leading
-    from psfdae.model.photometry import FluxModel
     from psfdae.noise import noise_equivalent_px
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()

@@ -54,98 +54,6 @@ rule propagation_tables:
         "python {params.program} {params.scenes:q} --out {params.folder} > {log} 2>&1"
 
 
-BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
-STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
-OWN_MODEL = f"{RESULTS}/own_stars/example/model"
-MIXED = BUNDLE.replace("realisation", f"realisation{suffix_of(method('gmm'))}")
-FITTED = [method(name).__module__ for name in names_of(TIMED_DATASET)]
-# By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
-TIMED = {
-    "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
-    "benchmark_methods": ("benchmark", "trainings.methods", STARS, 1500, 20, FITTED),
-    "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
-    "benchmark_scaling": (
-        *("benchmark", "speed.growth", {}, 2000, 30),
-        ["templates", "stars", "predict"],
-    ),
-    "predict_throughput": (
-        *(
-            "prediction",
-            "prediction.throughput",
-            {**STARS, "bundle": BUNDLE, "mixture": MIXED},
-        ),
-        *(1500, 20, ["predict"]),
-    ),
-    "predict_poppy": (
-        *(
-            "prediction",
-            "prediction.poppy",
-            {"bundle": every_bundle_of_timed},
-            1500,
-            20,
-            [],
-        ),
-    ),
-    "predict_coverage": (
-        *(
-            "prediction",
-            "prediction.coverage",
-            {
-                "stars": lambda w: [stars_of(TIMED_DATASET), f"{OWN_MODEL}/stars.h5"],
-                "bundle": lambda w: [
-                    *every_bundle_of_timed(w),
-                    f"{OWN_MODEL}/example.psf.safetensors",
-                ],
-            },
-            1500,
-            30,
-            [],
-        ),
-    ),
-    "predict_strange": (
-        *("prediction", "prediction.strange", {**STARS, "bundle": MIXED}, 1500, 20, []),
-    ),
-    "scaling_stages": (
-        *("scaling", "speed.stages", {}, 4000, 60),
-        ["templates", "stars", "fit", "evaluate", "predict"],
-    ),
-}
-
-TIMED_TABLES = {name: f"{RESULTS}/tables/{name}.csv" for name in TIMED}
-
-for _table, (_target, _run, _inputs, _mb, _minutes, _stages) in TIMED.items():
-
-    rule:
-        name:
-            _table
-        input:
-            **_inputs,
-        output:
-            TIMED_TABLES[_table],
-        log:
-            f"{RESULTS}/logs/benchmark/{_table}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks_on_request/{_target}/{_table}.tsv"
-        threads: workflow.cores
-        resources:
-            mem_mb=_mb,
-            runtime=_minutes,
-            disk_mb=2000,
-        params:
-            config=lambda w, run=_run: settings(run, f"dataset={TIMED_DATASET}"),
-            source=program_code(_run, _stages),
-            program=program(_run),
-            inputs=as_options,
-            limit=lambda w, run=_run: (
-                [f"--count={poppy_stars(w)}"] if run.endswith("poppy") else []
-            ),
-        message:
-            f"Measuring for the table {_table}"
-        shell:
-            "python {params.program} --config {params.config} {params.inputs:q}"
-            " {params.limit} --out {output} > {log} 2>&1"
-
-
 DRAWN = {
     **{f"propagation_{scene}": f"error against time, {scene}" for scene in SCENES},
     "baseline": "baseline: error against time",
@@ -188,21 +96,14 @@ rule figure_benchmark:
 rule benchmark:
     input:
         rules.propagation_tables.output,
-        [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == "benchmark"],
+        rules.benchmark_baseline.output,
+        rules.benchmark_methods.output,
+        rules.benchmark_inference.output,
+        rules.benchmark_scaling.output,
         expand(
             rules.figure_benchmark.output, drawn=[d for d in DRAWN if d != "training"]
         ),
     localrule: True
-
-
-for _wanted in ("prediction", "scaling"):
-
-    rule:
-        name:
-            _wanted
-        input:
-            [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == _wanted],
-        localrule: True
 
 
 KNEE_FOLDER = f"{RESULTS}/knee/{{point}}"
@@ -301,7 +202,8 @@ rule training_knee:
     localrule: True
 
 
-# The scatter of each method over its own random draws, for the same stars.
+# The scatter of each method over its own random draws, for the same stars: a rule for each method
+# (seeds_dae, seeds_gmm, …), those that are plugged in included.
 SEEDS = f"{RESULTS}/seeds/{{dataset}}"
 
 for _method in registered():

@@ -1,3 +1,5 @@
+# A rule for each method whose fit can be packed: bundle (DAE), bundle_gmm, …; a method that is
+# plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage and m.packing):
     _suffix = suffix_of(_method)
     _stem = f"{{dataset}}-{{split}}-{{reference}}{_suffix}"

@@ -35,7 +35,7 @@ from psfdae.image.errors import one_line
 from psfdae.method import HasConditions, Method
 from psfdae.methods import method
 from psfdae.model.error_model import ErrorModel
-from psfdae.model.photometry import FluxModel
+from psfdae.model.flux_model import FluxModel
 from psfdae.model.wings import Wings
 from psfdae.networks.weights import digest_of
 from psfdae.version import __version__

@@ -36,7 +36,7 @@ from psfdae.model.error_model import (
     brightest,
     mahalanobis,
 )
-from psfdae.model.photometry import FluxModel
+from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.restoration import SNR_TOLERANCE
 from psfdae.model.star_sets import field_positions, own_noise

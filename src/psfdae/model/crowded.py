@@ -17,8 +17,8 @@ import numpy as np
 from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.model.flux_model import FAINT_SNR
 from psfdae.model.joint_fit import JointFit, chains, fit_stars
-from psfdae.model.photometry import FAINT_SNR
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_shares
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psfdae.image.stamps import Stamps
-from psfdae.model.photometry import FluxModel
+from psfdae.model.flux_model import FluxModel
 
 
 class Estimated(IntEnum):

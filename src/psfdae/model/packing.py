@@ -31,7 +31,7 @@ from psfdae.model.calibration import (
     with_training_stars,
 )
 from psfdae.model.error_model import ErrorModel
-from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.flux_model import FluxModel, signal_to_noise
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import (
     noise_model,

@@ -39,7 +39,8 @@ from psfdae.method import (
 )
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
-from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
+from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
+from psfdae.model.photometry import Photometer, Photometry
 from psfdae.model.prediction import Prediction
 from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
@@ -433,7 +434,7 @@ def _measurable_stamps(centred: CentredStars) -> tuple[np.ndarray, np.ndarray, n
     repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
     data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
     modulus = np.abs(data).max(axis=(1, 2))
-    has_pixels = bad.mean(axis=(1, 2)) <= 1 - KEPT
+    has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
     is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
     is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
     data = np.where(is_unusable[:, None, None], 0.0, data)

@@ -20,8 +20,8 @@ from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
 from psfdae.model.calibration import COVERAGE
 from psfdae.model.field_psfs import PredictionError
+from psfdae.model.flux_model import signal_to_noise
 from psfdae.model.packing import checksum
-from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.report import (

@@ -1,4 +1,8 @@
-"""Configuration of scene 3, the alignment of a secondary mirror (`dataset=alignment`)."""
+"""Configuration of scene 3, the alignment of a secondary mirror (`dataset=alignment`).
+
+Groups of the telescope's states, of the networks that estimate them and of the maximum-likelihood
+fit, and the keys that decide which products belong together.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,11 @@ from psfdae_paper.configuration.aligners import TRAINED
 
 
 class Alignment(Group):
-    """States of misalignment, fields, stamps and sets of states."""
+    """States of misalignment, fields, stamps and sets of states.
+
+    A state has four numbers: decentre x, y and tilt x, y of the secondary mirror, in units of their
+    ranges from −1 to 1.
+    """
 
     # The paper's ranges (section 3.3).
     decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
@@ -79,7 +87,7 @@ class Cnn(Group):
     )
 
     @model_validator(mode="after")
-    def _check_layers(self) -> Cnn:
+    def check_layers(self) -> Cnn:
         """Require odd kernels, and as many kernels and strides as widths."""
         if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
@@ -109,7 +117,10 @@ NETWORKS: dict[str, type[Cnn] | type[Perceptron]] = {"cnn": Cnn, "perceptron": P
 
 
 class NetworkTrain(Group):
-    """Optimisation of one network; the defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋."""
+    """Optimisation of one network by Adam; the loss is the mean squared error of the states.
+
+    The defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋.
+    """
 
     network: Literal["cnn", "perceptron"] = Field("cnn", description="Network that is trained")
     epochs: Count = Field(100, description="Passes over the training states")
@@ -139,7 +150,10 @@ class NetworkTrain(Group):
 
 
 class Fit(Group):
-    """Maximum-likelihood fit of a state."""
+    """Maximum-likelihood fit of a state: Levenberg steps to the maximum of the likelihood.
+
+    Stamps of a trial state are interpolated between computed ones, but for the last step.
+    """
 
     # With more states the fit is slower, and closer to the exact optics.
     neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
@@ -155,6 +169,7 @@ class Fit(Group):
     tolerance: Positive = Field(
         0.3, description="A step of this many standard errors or fewer is the last"
     )
+    # Relative to the diagonal of the information matrix.
     damping: Positive = Field(1e-3, description="Levenberg damping of the first step")
     limit: Annotated[float, Field(ge=1, le=2)] = Field(
         1.25, description="States are kept within ± this, in units of the range"

@@ -1,4 +1,4 @@
-"""The folder of the configuration, and types that its models share."""
+"""The folder of the configuration, and types of keys that several groups have."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)
 
 
 def _ascending(grid_sizes: list[int]) -> list[int]:
-    """Return grid sizes unchanged; ValueError if they do not ascend."""
+    """Return grid sizes unchanged; ValueError if they do not ascend.
+
+    The first size that suffices is chosen for each wavefront, which must be the smallest one.
+    """
     if sorted(set(grid_sizes)) != grid_sizes:
         raise ValueError(f"{grid_sizes} must be ascending")
     return grid_sizes
@@ -46,7 +49,10 @@ def config_dir() -> Path:
 
 @cache  # looking for the folder takes longer than all else in most calls
 def _folder(environment_value: str) -> Path:
-    """Return the folder that an environment variable names, or the package's folder."""
+    """Return the folder that an environment variable names, or the package's folder.
+
+    A wheel has a copy of the configuration in the package; in the source tree it is beside `src`.
+    """
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "config", package.parents[1] / "config")
     folder = next((path for path in candidates if path.is_dir()), candidates[-1])

@@ -1,4 +1,8 @@
-"""Commands whose settings are groups of the configuration that Hydra composes."""
+"""Commands whose settings are groups of the configuration that Hydra composes.
+
+In goes the name of a command and of the groups that it reads; its function gets them, checked, as
+`config`: from a file that the workflow has written, or from overrides of the command line.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +45,7 @@ class Groups:
         """Return the checked groups, from a file of the workflow, or from overrides `words`."""
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
+        # The workflow passes one file; a user writes words such as noise.kappa=4.98.
         reads = self.names(options)
         if file is not None:
             return load_settings(file, reads)

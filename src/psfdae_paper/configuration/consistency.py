@@ -34,7 +34,7 @@ class Consistent(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _derive(cls, tree: object) -> object:
+    def derive_values(cls, tree: object) -> object:
         """Fill in derived values before the groups are checked."""
         if not isinstance(tree, Mapping):
             return tree
@@ -42,7 +42,7 @@ class Consistent(Group):
         return with_derived_values(tree)
 
     @model_validator(mode="after")
-    def _check_jitter(self) -> Consistent:
+    def check_jitter(self) -> Consistent:
         """Refuse a jitter of aberrations for stars that have no random aberrations."""
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
@@ -57,7 +57,7 @@ class Consistent(Group):
         return self
 
     @model_validator(mode="after")
-    def _check_scene_groups(self) -> Consistent:
+    def check_scene_groups(self) -> Consistent:
         """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both

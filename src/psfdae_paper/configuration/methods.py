@@ -1,4 +1,8 @@
-"""The methods of the configuration: those of the list in `config.yaml`, in the order of tables."""
+"""The methods of the configuration: those of the list in `config.yaml`, in the order of tables.
+
+In goes the list `methods` of names; out come the classes of the methods and the groups of the
+configuration that are their settings. A method that is plugged in needs nothing but its name there.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +37,7 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
     """
     try:
         tree = parse_yaml(path)
+        # Names of different methods; each must be registered, in the library or by a plug-in.
         names = tree.get("methods") if isinstance(tree, dict) else None
         if not isinstance(names, list) or len({*map(str, names)}) < len(names):
             raise ProductError("methods: must be a list of different names")
@@ -44,11 +49,17 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
 
 
 def all_groups() -> tuple[str, ...]:
-    """Return the groups of the configuration that are settings of methods."""
+    """Return the groups of the configuration that are settings of methods, each once.
+
+    Methods may share a group, such as both Gaussian mixtures.
+    """
     return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
 
 
 def oracles_last(names: Iterable[str]) -> list[type[Method]]:
-    """Return the methods of some names in the order of legends: those that are given λ last."""
+    """Return the methods of some names in the order of legends: those that are given λ last.
+
+    Within both kinds the order is that of the configuration.
+    """
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

@@ -1,7 +1,10 @@
 """Every configuration key with its type, unit, range and meaning.
 
-Lengths are in metres and angles in the unit that their name carries; the
-science code receives SI units (`Telescope.pixel_scale` is in radians).
+A class is a group of `config/`, and a field of it one key; files hold only what differs from the
+defaults here. `Config` has all groups, and checks values of one group against those of others.
+
+Lengths are in metres and angles in the unit that their name carries; the science code receives SI
+units (`Telescope.pixel_scale` is in radians).
 """
 
 from __future__ import annotations
@@ -46,7 +49,10 @@ from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
 
 
 class Grid(Group):
-    """A square grid of field points."""
+    """A square grid of field points: the directions in which static PSFs are computed.
+
+    Every star lies at one of them. Angles are from the optical axis.
+    """
 
     points: Count = Field(description="Field points along a side")
     spacing_deg: Positive = Field(
@@ -58,7 +64,7 @@ class Grid(Group):
 
 
 class Scene(Group):
-    """A family of static PSFs."""
+    """A family of static PSFs: what causes the aberrations of the telescope."""
 
     name: Literal["seidel", "turbulence", "telescope"] = Field(
         description="Module that makes its wavefronts"
@@ -67,10 +73,14 @@ class Scene(Group):
 
 
 class Stars(Group):
-    """A set of noise-free stars, shared by all datasets that only differ in noise."""
+    """A set of noise-free stars, shared by all datasets that only differ in noise.
+
+    Aberrations of a star are those of its field, each times 1 + `aberration_fraction` · N(0, 1).
+    """
 
     name: Name = Field(description="Names the file of the stars")
     count: Count = Field(description="Number of stars")
+    # The paper's 10 and 50 %; 0 makes every star its template.
     aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
         description="Relative standard deviation of every aberration term"
     )
@@ -83,7 +93,10 @@ class Stars(Group):
 
 
 class Framing(Stamp):
-    """Stamps of simulated stars."""
+    """Stamps of simulated stars: their brightest pixel is in the middle, up to a centring error.
+
+    Side, centring error and sub-pixel position are keys of `Stamp`, which own images have, too.
+    """
 
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
         description="A template's brightest pixel is searched within ± this of the chief ray; "
@@ -92,13 +105,18 @@ class Framing(Stamp):
     search_lambda_d: SearchDistance = Field(
         default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
     )
+    # Mirror-symmetric PSFs have equal maxima, between which rounding would choose.
     tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
         description="Pixels within this fraction of the maximum count as equally bright"
     )
 
 
 class WholePeriodOptics(Group):
-    """Numerical settings of the propagation by the whole period of the image, of scene 3."""
+    """Numerical settings of the propagation by the whole period of the image, of scene 3.
+
+    A pupil of N samples gives an image that repeats after N λ/D. Results depend on precision and
+    number of samples, and by rounding on batch and threads.
+    """
 
     pupil_samples: PupilSamples = Field(
         description="Grid sizes N, ascending; each wavefront takes the first that suffices"
@@ -113,13 +131,16 @@ class WholePeriodOptics(Group):
 
 
 class Optics(WholePeriodOptics):
-    """Numerical settings of the propagation by matrix products."""
+    """Numerical settings of the propagation by matrix products, which computes stamps only."""
 
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
 def _optics(tree: object) -> object:
-    """Check settings of the optics by the class that has their keys."""
+    """Check settings of the optics by the class that has their keys.
+
+    Scene 3 propagates the whole period of the image and has no choice of a backend.
+    """
     if not isinstance(tree, Mapping):
         return tree
     return (Optics if "backend" in tree else WholePeriodOptics).model_validate(tree)
@@ -133,7 +154,10 @@ else:
 
 
 class Dataset(Group):
-    """A dataset of the paper: stars, a noise band, splits and references."""
+    """A dataset of the paper: stars, a noise band, splits and references.
+
+    Its name is that of its file. Every split and reference has trainings and tables of its own.
+    """
 
     name: Name = Field(description="Names folders, tables and figures")
     splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
@@ -148,7 +172,11 @@ class Dataset(Group):
 
 
 class Calibration(Group):
-    """Scan of parameters that the paper does not state."""
+    """Scan of parameters that the paper does not state: pixel scale, r0, range of the SSIM.
+
+    Stage `scan` computes the SSIM of noisy stars on this grid, and `calibrate` fits it to the rows
+    of the paper's tables that depend on no method.
+    """
 
     stars: Count = Field(description="Stars simulated per point of the scan")
     pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)] = Field(
@@ -178,7 +206,10 @@ class Benchmark(Group):
 
 
 class Bounds(Group):
-    """Lower bounds of the error of any estimate."""
+    """Lower bounds of the error of any estimate: sizes of the banks of simulated stars.
+
+    A larger bank has stars more like a test star, and takes more time and memory.
+    """
 
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
     position_stars: Count = Field(
@@ -239,14 +270,16 @@ class Config(Consistent):
     fit: Fit
 
     @model_validator(mode="after")
-    def _check_groups(self) -> Config:
+    def check_groups(self) -> Config:
         """Refuse values of single groups that contradict those of other groups."""
+        # Parts for training (with validation) and test have no star in common.
         part_stars = self.parts.train_stars + self.parts.test_stars
         if part_stars > self.stars.count:
             raise ValueError(
                 f"parts.train_stars + parts.test_stars = {part_stars}: "
                 f"must be at most stars.count = {self.stars.count}"
             )
+        # A star with a sub-pixel position differs from its template by a shift, too.
         if self.framing.subpixel and "template" in self.dataset.references:
             raise ValueError(
                 "framing.subpixel = true: templates have no sub-pixel phase, "
@@ -257,13 +290,17 @@ class Config(Consistent):
                 "framing.subpixel = true: stars.aberration_fraction must be above 0, "
                 "stars without random aberrations are their templates"
             )
+        # Settings of a method against those of the data.
         for method in registered():
             method.check(self)
         return self
 
 
 def whole_config() -> type[Config]:
-    """Return `Config` with the settings of all methods, and of the trainings of scene 3."""
+    """Return `Config` with the settings of all methods, and of the trainings of scene 3.
+
+    Methods that are plugged in add groups, so that the class is made when it is first used.
+    """
     return _with_settings(registered())
 
 

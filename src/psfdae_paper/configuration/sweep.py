@@ -63,7 +63,7 @@ class Axis(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _expand_short_forms(cls, tree: object) -> object:
+    def expand_short_forms(cls, tree: object) -> object:
         """Accept a bare list as values, and names of choices that YAML reads as numbers."""
         if isinstance(tree, list):
             return {"values": tree}
@@ -72,7 +72,7 @@ class Axis(Group):
         return tree
 
     @model_validator(mode="after")
-    def _check_form(self) -> Axis:
+    def check_form(self) -> Axis:
         """Require exactly one of the three forms, with its own keys only."""
         # Both ends of a range count as one form.
         end_count = (self.low is not None) + (self.high is not None)
@@ -161,7 +161,7 @@ class Sweep(Group):
         )
 
     @model_validator(mode="after")
-    def _check_model(self) -> Sweep:
+    def check_model(self) -> Sweep:
         """Require a dataset and a metric that the model has, and trials for random draws."""
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
@@ -180,7 +180,7 @@ class Sweep(Group):
         return self
 
     @model_validator(mode="after")
-    def _check_axes(self) -> Sweep:
+    def check_axes(self) -> Sweep:
         """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
         columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
@@ -193,7 +193,7 @@ class Sweep(Group):
         return self
 
     @model_validator(mode="after")
-    def _check_keys(self) -> Sweep:
+    def check_keys(self) -> Sweep:
         """Refuse keys that the model does not read, and keys that are set by two axes."""
         # Keys of an axis: those of all its choices; a range has the same keys at every value.
         keys = list(self.overrides)

@@ -1,4 +1,7 @@
-"""Settings of a scene's wavefront: atmospheric turbulence, or the telescope's aberrations."""
+"""Settings of a scene's wavefront: atmospheric turbulence, or the telescope's aberrations.
+
+Those of scene 1, Seidel terms, are in `psfdae.telescope.aberrations`, as telescopes have them, too.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,11 @@ from psfdae.settings import Group, Positive
 
 
 class VonKarman(Group):
-    """Static atmospheric turbulence in layers."""
+    """Static atmospheric turbulence in layers: scene 2 looks through it in every exposure alike.
+
+    Each layer has the von Kármán spectrum with the outer scale L0; its Fried parameter follows from
+    its fraction s of the turbulence, r0_l = r0 s^(−3/5). Lengths are in metres.
+    """
 
     kind: Literal["von_karman"] = Field(description="Tells which keys follow")
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Seed of the turbulence")
@@ -26,7 +33,7 @@ class VonKarman(Group):
     remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
 
     @model_validator(mode="after")
-    def _check_layers(self) -> VonKarman:
+    def check_layers(self) -> VonKarman:
         """Require one strength for each layer, which add up to 1."""
         if len(self.layer_heights_m) != len(self.layer_strengths):
             raise ValueError(

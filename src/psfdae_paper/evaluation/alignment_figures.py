@@ -1,4 +1,8 @@
-"""Figures of scene 3: stamps, estimates, errors, the twin ambiguity, correlations."""
+"""Figures of scene 3: stamps, estimates, errors, the twin ambiguity, correlations.
+
+In go arrays of stamps and of states in units of their range; out come matplotlib figures. A state
+is decentre x, y and tilt x, y of the secondary mirror.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +43,7 @@ def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) ->
     figure = new_figure(0.9 * len(rows) * len(titles) + 0.5 * len(titles), layout="constrained")
     parts = figure.subfigures(len(titles), 1, squeeze=False)[:, 0]
     for group, (part, title) in enumerate(zip(parts, titles, strict=True)):
+        # Rows are treatments, columns are fields.
         panels = part.subplots(len(rows), fields, squeeze=False)
         peak = rows[0][1][group].max()
         for row_panels, (label, stamps) in zip(panels, rows, strict=True):
@@ -82,10 +87,12 @@ def predicted_against_true(
         for index, axes in enumerate(row_panels):
             for level, style in styles:
                 axes.plot(truth[:, index], by_level[level][:, index], ".", ms=2.2, **style)
+            # Perfect estimates lie on the diagonal; others may leave the range.
             axes.plot([-1, 1], [-1, 1], color="black", lw=0.7)
             axes.set_xlim(-1.1, 1.1)
             axes.set_ylim(-1.6, 1.6)
             axes.grid(True)
+        # Long labels are broken where a comma or the training data begin.
         label = ALIGNERS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
         row_panels[0].set_ylabel(label)
     for parameter, top, bottom in zip(PARAMETERS, panels[0], panels[-1], strict=True):
@@ -147,6 +154,7 @@ def errors_against_size(
 
 def binned(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean size, mean error and its standard error in six bins of equally many states."""
+    # States by size, cut into groups of equally many; a group of n has the error σ/√n of its mean.
     order = np.argsort(size, kind="stable")
     bins = [states for states in np.array_split(order, 6) if states.size]
     mean_size, mean_error = (
@@ -214,6 +222,7 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
         The longest row fills the width of the figure.
     """
     short_labels = ("dx", "dy", "tx", "ty")
+    # Rows of panels; those that a row does not fill stay empty.
     figure = new_figure(2.15 * len(panels), layout="constrained")
     all_axes = figure.subplots(len(panels), max(map(len, panels)), squeeze=False)
     images: list[AxesImage] = []
@@ -225,6 +234,7 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
             axes.set_title(title, fontsize=8)
             axes.set_xticks(range(4), short_labels)
             axes.set_yticks(range(4), short_labels)
+            # The number in each cell, white on dark colours.
             for (a, b), value in np.ndenumerate(matrix):
                 if np.isfinite(value):
                     color = "white" if abs(value) > 0.6 else "black"

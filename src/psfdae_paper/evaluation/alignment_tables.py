@@ -1,4 +1,8 @@
-"""Tables of scene 3: errors of states and their correlations, measured and published."""
+"""Tables of scene 3: errors of states and their correlations, measured and published.
+
+In go errors of estimated states (n, 4), or the covariances (n, 4, 4) that bound them; out come rows
+of the tables of errors and correlations, and tables that set them beside the paper's.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +52,7 @@ def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) 
         of the signed error about its mean; `variance_abs` is that of the absolute error, which
         the paper tabulates.
     """
+    # Statistics over all states, one number for each of the four parameters.
     absolute = np.abs(errors)
     statistics = {
         "mean_abs_error": absolute.mean(axis=0),
@@ -163,6 +168,7 @@ def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
         Columns source (paper or psfdae), test_set, method, quantity (mean or
         variance of the absolute error) and one per parameter, in units of the range.
     """
+    # The paper's rows and the measured ones get the same columns, in units of the range.
     paper = published("alignment")
     paper = paper[np.isclose(paper.noise_level, level)].assign(source="paper", test_set="")
     paper = paper.rename(columns={"mean_error": "mean"})
@@ -172,6 +178,7 @@ def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
     )
     columns = ["source", "test_set", "method", "parameter", "mean", "variance"]
     rows = pd.concat([paper[columns], measured[columns]], ignore_index=True)
+    # One row for the mean and one for the variance of the absolute error.
     rows = rows.melt(columns[:4], var_name="quantity", value_name="value")
     index = ["source", "test_set", "method", "quantity"]
     return _pivoted(rows, "parameter", list(PARAMETERS), index)
@@ -185,6 +192,7 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         Columns source, test_set, noise_level, method and one per pair.
     """
+    # Pairs of parameters that the paper has, at levels with noise.
     paper = published("correlation").assign(source="paper", test_set="")
     measured = correlations.assign(
         source="psfdae", pair=correlations.parameter_a + "-" + correlations.parameter_b
@@ -203,6 +211,7 @@ def _pivoted(
 
     Rows are sorted by the index, methods in the order of `ALIGNERS`.
     """
+    # A column for each parameter or pair.
     methods = list(ALIGNERS)
     table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
     table.columns.name = None
@@ -223,6 +232,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
     digits : dict
         Number format by the value of the column `quantity`; the key "" is for tables without it.
     """
+    # Numbers as text; a value that was not measured or published is left empty.
     formatted = table.copy()
     quantities = table.get("quantity", pd.Series("", index=table.index))
     for column in (c for c in table.columns if c in PARAMETERS or c in CORRELATED):

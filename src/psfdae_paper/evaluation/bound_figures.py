@@ -179,6 +179,7 @@ def _draw_posterior_mean(axes: Axes, rows: pd.DataFrame, look: Style) -> None:
     side: Style = {"ha": "right" if look is MEANS["bayes"] else "left", "weight": "bold"}
     for level in rows["noise_level"][rows.value == 0]:
         axes.text(level, 0.02, "0", transform=axes.get_xaxis_transform(), color=color, **side)
+    # The confidence interval of the mean of each level.
     rows = rows[rows.value > 0]
     level, value = rows["noise_level"].to_numpy(), rows["value"].to_numpy()
     half_widths = np.maximum([value - rows["ci_low"], rows["ci_high"] - value], 0.0)
@@ -233,6 +234,7 @@ def headline(
     left, bottom, top = 0.115, 0.13, 0.86
     columns = len(rows[0].images)
     cell_width, cell_height = 0.395 / columns, (top - bottom) / len(rows)
+    # Rows of stamps from the top; each is on the colour scale of the truth below it.
     cell = (cell_width * WIDTH_IN, cell_height * figure.get_figheight())
     peak, stamps = rows[-1].images.max(axis=(1, 2)), in_inches(figure)
     for number, row in enumerate(rows, 1):
@@ -281,6 +283,7 @@ def _draw_errors(
     axes.plot(tight["noise_level"], tight["value"], color=color, marker="o", ls="", ms=5)
     _write_name(axes, bayes["noise_level"], bayes["value"], "least possible", color, below=True)
     floor = bounds[bounds.method == "floor"].sort_values("noise_level")
+    # One logarithmic axis of errors, shaded below the local floor.
     axes.set_yscale("log")
     if not floor.empty:
         bottom = 0.6 * float(floor["value"].min())

@@ -2,6 +2,8 @@
 
 The rows depend on noise and images only, not on any estimator. Their MSE gives the noise per λ.
 Their SSIM gives the dynamic range, and the structure of a stamp, which is the pixel scale.
+
+In goes the scan of simulated stars (stage `scan`); out come the fitted parameters.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ def original_noise_rows() -> list[OriginalNoise]:
     rows = paper[paper.method == "original_noise"]
     by_metric = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
     by_metric = by_metric.reset_index()
+    # The columns have the names of the fields.
     columns = (by_metric[name] for name in OriginalNoise._fields)
     return [OriginalNoise(*row) for row in zip(*columns, strict=True)]
 
@@ -120,6 +123,7 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     DataFrame
         Columns experiment, r0_m, pixel_scale_arcsec, rms, largest (SSIM).
     """
+    # RMS and largest difference of the SSIM over the paper's columns, at each scanned scale.
     table = []
     for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
         rows = _fitted_rows(part)

@@ -1,4 +1,9 @@
-"""Comparison of errors: of two trained networks, of two tables, of known and held-out fields."""
+"""Comparison of errors: of two trained networks, of two tables, of known and held-out fields.
+
+In go errors by star, or tables of mean errors; out come tables of differences with their standard
+errors. Two fits of one setting differ by their seeds, too: that scatter was measured once, and
+counts beside the standard error of the stars.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +58,7 @@ def config_differences(
     Parameters
     ----------
     first, second : mapping
-        Flattened configurations, see `psfdae_paper.tracking.flatten`. A dash stands for a
+        Flattened configurations, see `psfdae.settings.leaves`. A dash stands for a
         setting that one of them does not have.
     """
     keys = sorted(first.keys() | second.keys())
@@ -72,6 +77,7 @@ def training_summary(history: pd.DataFrame) -> dict[str, float]:
     validated = history.dropna(subset=["validation_mse"])
     best_epoch = validated.iloc[validated["validation_mse"].argmin()]
     epochs = float(history["epoch"].max())
+    # The network of the smallest validation error is the result.
     summary = {
         "epochs": epochs,
         "seconds": float(history["seconds"].max()),
@@ -97,6 +103,7 @@ def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     first, second : DataFrame
         Errors per star: method, noise_level, star, field, mse, ssim …
     """
+    # Errors of the unchanged image by noise level and star.
     first_mse, second_mse = (
         table[table["method"] == "noisy"].set_index(["noise_level", "star"])["mse"].sort_index()
         for table in (first, second)
@@ -126,6 +133,7 @@ def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) 
         errors, or of that of the stars alone), verdict: "better", "worse" (the second) or
         "same", for methods and levels that both have.
     """
+    # Methods and levels that both evaluations have, in the order of the first one.
     paired = same_noisy_stars(first, second)
     rows = []
     keys = ["method", "noise_level"]
@@ -170,6 +178,7 @@ def _difference(
         for fit, mean in zip(fits, (first_mean, second_mean), strict=True)
     ]
     both_seeds_stderr = float(np.hypot(seed_errors[0], seed_errors[1]))
+    # Significance: difference over σ = √(σ_stars² + σ_seeds²).
     error = np.hypot(stderr, np.nan_to_num(both_seeds_stderr))
     sigmas = float(0.0 if difference == 0 else difference / error if error > 0 else np.inf)
     verdict = "same"
@@ -219,10 +228,12 @@ def compare_tables(
         `first` and in the `second` table, and if two methods are `exchanged`, by more than the
         scatter in both.
     """
+    # Rows that both tables have, with the standard errors of both.
     tables = [with_seed_stderr(table, scatter) for table in (first, second)]
     keys = [*CELL, "method", "metric"]
     columns = [table[[*keys, "value", "stderr", "seed_stderr"]] for table in tables]
     rows = columns[0].merge(columns[1], on=keys, suffixes=("_first", "_second"))
+    # The first condition that holds decides, from equal to beyond the scatter.
     difference = (rows.value_second - rows.value_first).abs()
     rounding = NEGLIGIBLE * rows[["stderr_first", "stderr_second"]].min(axis=1)
     limit = SIGNIFICANT * np.hypot(rows.seed_stderr_first, rows.seed_stderr_second)
@@ -249,6 +260,7 @@ def _mse_signs(table: pd.DataFrame) -> pd.DataFrame:
     −1 if the MSE of the pair's first method is smaller, 1 if larger, 0 if the difference is below
     `SIGNIFICANT` times its scatter between seeds.
     """
+    # MSE and its scatter by method, of the columns of the paper's tables that have all methods.
     by_method = table[table.metric == "mse"].pivot(index=CELL, columns="method")
     columns = pd.MultiIndex.from_product([["value", "seed_stderr"], PAPER_ORDER])
     by_method = by_method.reindex(columns=columns)
@@ -289,6 +301,7 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
     keys = HELD_OUT_COLUMNS[:4]
     for key, errors in stars.groupby(keys, sort=False):
         by_split = [errors[errors.split == split] for split in ("random", "held_out")]
+        # Stars that both splits test: their two errors differ by what the fit has seen.
         shared = by_split[0].merge(
             by_split[1], on=["star", "field"], suffixes=("_random", "_held_out")
         )

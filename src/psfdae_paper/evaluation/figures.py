@@ -65,6 +65,7 @@ def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
     ndarray, shape (P_y (d + gap) + gap, P_x (d + gap) + gap)
         NaN where there is no stamp.
     """
+    # Pixels between stamps, and where there is none, are NaN, which is drawn in grey.
     side = stamps.shape[-1]
     pitch = side + gap  # pixels from one stamp to the next
     columns, rows = grid.max(axis=0) + 1
@@ -83,6 +84,7 @@ def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: st
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
+    # Each stamp at its field point, on a square-root scale of its own maximum.
     image = _draw_psfs(axes, psf, grid, field)
     axes.set_title(title)
     bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02)
@@ -142,12 +144,14 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     # FWHM, with whiskers: that of a line (ellipticity 1) is 1.6 distances of field points long.
     fwhm_axes = figure.add_subplot(grid[1, 1])
     _draw_map(fwhm_axes, fields, fields.fwhm_arcsec, "cividis", "FWHM (arcsec)")
+    # Spacing of the field points in the unit of the axes, for the length of the whiskers.
     position, _ = in_field_unit(fields.field)
     points = int(fields.grid[:, 0].max()) + 1
     spacing = float(np.ptp(position[:, 0])) / (points - 1) if points > 1 else 1.0
     angle = np.deg2rad(fields.position_angle_deg)
     half_length = 0.5 * 1.6 * spacing * fields.ellipticity
     half_whisker = half_length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # A white line below each whisker sets it off from the map.
     for start, stop in zip(position - half_whisker, position + half_whisker, strict=True):
         fwhm_axes.plot(*np.stack([start, stop], axis=1), color="white", linewidth=1.6)
         fwhm_axes.plot(*np.stack([start, stop], axis=1), color="#c2185b", linewidth=0.9)
@@ -177,6 +181,7 @@ def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray)
     """Draw a mosaic of stamps (F, d, d) over their maxima, on a square-root scale."""
     from matplotlib import colormaps
 
+    # Square roots make the wings visible, which have a few per cent of the maximum.
     share = psf / psf.max(axis=(1, 2), keepdims=True)
     gap = 1  # pixels between stamps
     image = axes.imshow(

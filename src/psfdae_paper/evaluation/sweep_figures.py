@@ -1,32 +1,24 @@
-"""Figures of a sweep: all points at once, and the metric against each axis."""
+"""Figures of a sweep: all points at once, and the metric against each axis.
+
+In go the summary of a sweep and its definition; out come matplotlib figures. An axis of the sweep
+may have numbers, drawn at their distances, or options, which follow each other.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae_paper.evaluation.drawing import Style, legend_entry
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-METRIC_LABELS = {
-    "mse": "MSE, geometric mean over λ",
-    "ssim": "SSIM, mean over λ",
-    "mae": "mean absolute error / range",
-}
-"""Labels of axes by metric."""
-
-Style = dict[str, Any]
-"""Keyword arguments of a line."""
-
-FAILED_HEIGHT = -0.09
-"""Height on the axis of the metric where lines of failed points end, below its scale 0 … 1."""
 
 
 @dataclass(frozen=True)
@@ -93,93 +85,142 @@ def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
     return Scale(np.log10(numbers) if is_log else numbers, ticks, labels)
 
 
-@styled
-def parallel_coordinates(
-    table: pd.DataFrame, described: Mapping[str, Any], axes: Sequence[str], logs: Sequence[str]
-) -> Figure:
-    """Draw every point as a line over the axes of the sweep, coloured by its validation metric.
+@dataclass(frozen=True)
+class SweepPoints:
+    """Points of a sweep with what they are compared by.
 
-    Parameters
+    Attributes
     ----------
     table : DataFrame
-        Summary of the sweep, the columns of the axes as text.
-    described : mapping
-        sweep, metric and direction.
-    axes : sequence of str
-        Columns of the settings that the sweep varies.
-    logs : sequence of str
-        Axes that are logarithmic.
+        Summary of the sweep, a row for each point, the columns of the axes as text.
+    definition : mapping
+        Definition of the sweep: sweep (its name), kind, metric, direction, space.
     """
-    from matplotlib import colormaps
-    from matplotlib.lines import Line2D
 
-    # Height of every line on every axis, from 0 to 1; the last axis is the metric.
-    metric = described["metric"]
-    metric_values = _column(table, metric)
+    table: pd.DataFrame
+    definition: Mapping[str, Any]
+
+    @property
+    def metric(self) -> str:
+        """Column of the metric that chooses the best point."""
+        name: str = self.definition["metric"]
+        return name
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """True if the metric is drawn on a logarithmic scale: all but the SSIM."""
+        return self.metric != "validation_ssim"
+
+    @property
+    def label(self) -> str:
+        """Label of the axis of the metric."""
+        return {
+            "validation_mse": "MSE, geometric mean over λ",
+            "validation_ssim": "SSIM, mean over λ",
+            "validation_mae": "mean absolute error / range",
+        }[self.metric]
+
+    @property
+    def is_best(self) -> np.ndarray:
+        """True for the best point, shape (n,)."""
+        return (self.table["best"] == "yes").to_numpy()
+
+    def errors(self, column: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return a validation metric and the same of the test part, (n,); NaN where points failed.
+
+        `column` is the metric, or METRIC_LEVEL for one noise level.
+        """
+        names = (column, column.replace("validation", "test"))
+        validation, test = (self.table[name].to_numpy(dtype=float) for name in names)
+        return validation, test
+
+    def scale(self, name: str) -> Scale:
+        """Return the scale of an axis; it is logarithmic if its range is."""
+        return scale_of(self.table[name].tolist(), bool(self.definition["space"][name].get("log")))
+
+
+@styled
+def parallel_coordinates(points: SweepPoints) -> Figure:
+    """Draw every point as a line over the axes of the sweep, coloured by its validation metric."""
+    from matplotlib import colormaps
+
+    # Heights of every line on every axis, from 0 to 1; the last axis is the metric.
+    names, table = list(points.definition["space"]), points.table
+    metric_values, _ = points.errors(points.metric)
     succeeded = np.isfinite(metric_values)
     values = metric_values[succeeded]
-    scales = {name: scale_of(table[name].tolist(), name in logs) for name in axes}
-    metric_scale = scale_of([f"{value:.3g}" for value in values], metric != "validation_ssim")
+    scales = [points.scale(name) for name in names]
     # Rank of every point, from 0, the best, to 1: it decides the colour of its line.
-    order = np.argsort(values if described["direction"] == "minimize" else -values, kind="stable")
+    direction = points.definition["direction"]
+    order = np.argsort(values if direction == "minimize" else -values, kind="stable")
     rank = np.argsort(order, kind="stable") / max(values.size - 1, 1)
-    heights = np.full((len(table), len(axes) + 1), FAILED_HEIGHT)
+    # Lines of failed points end below the scale of the metric.
+    failed_height = -0.09
+    heights = np.full((len(table), len(names) + 1), failed_height)
     # Lines of a grid would lie on each other: they leave an axis at slightly different heights.
     offset = np.zeros(len(table))
     offset[succeeded] = 0.025 * (2.0 * rank - 1.0)
-    for i, scale in enumerate(scales.values()):
+    for i, scale in enumerate(scales):
         heights[:, i] = scale.to_unit(scale.coordinate) + offset
-    coordinate = np.log10(values) if _is_log(metric) else values
+    # The scale of the metric has five evenly spaced ticks instead of one per point.
+    metric_scale = scale_of([f"{value:.3g}" for value in values], points.is_logarithmic)
+    coordinate = np.log10(values) if points.is_logarithmic else values
     heights[succeeded, -1] = metric_scale.to_unit(coordinate)
+    low, high = np.nanmin(metric_scale.coordinate), np.nanmax(metric_scale.coordinate)
+    ticks = np.linspace(low, high, 5) if high > low else np.array([low])
+    digits = ".2e" if points.metric.endswith("mse") else ".3g"
+    tick_values = 10.0**ticks if points.is_logarithmic else ticks
+    scales.append(
+        replace(metric_scale, ticks=ticks, labels=[format(v, digits) for v in tick_values])
+    )
     figure = new_figure(4.4, layout="constrained")
     panel = figure.add_subplot()
     # Lines from the largest to the smallest value of the metric; failed ones are grey and dotted.
     colors = np.full((len(table), 4), (0.6, 0.6, 0.6, 1.0))
     colors[succeeded] = colormaps["viridis"](0.92 * rank)
-    is_best = (table["best"] == "yes").to_numpy()
     for i in np.argsort(np.where(succeeded, -metric_values, -np.inf), kind="stable"):
         style = "-" if succeeded[i] else ":"
-        panel.plot(heights[i], color=colors[i], ls=style, lw=3.2 if is_best[i] else 1.1)
-    _draw_vertical_scales(panel, [*scales.values(), _with_metric_ticks(metric_scale, metric)])
-    panel.set_xticks(range(len(axes) + 1), [*axes, f"validation\n{_label(metric)}"])
-    bottom = -0.06 if succeeded.all() else FAILED_HEIGHT - 0.06
-    panel.set(ylim=(bottom, 1.06), xlim=(-0.25, len(axes) + 0.35), yticks=[])
-    panel.set_title(f"Sweep {described['sweep']}: {len(table)} points")
-    handles = [Line2D([], [], color=colormaps["viridis"](0.0), lw=3.2, label="best point")]
-    handles += [Line2D([], [], color=colormaps["viridis"](0.92), lw=1.1, label="worst point")]
-    if not succeeded.all():
-        handles += [Line2D([], [], color="0.6", ls=":", label=f"failed: {(~succeeded).sum()}")]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
-    for side in ("top", "right", "left", "bottom"):
-        panel.spines[side].set_visible(False)
+        panel.plot(heights[i], color=colors[i], ls=style, lw=3.2 if points.is_best[i] else 1.1)
+    _draw_vertical_scales(panel, scales)
+    # Names of the axes below them; the frame of the panel would look like another axis.
+    panel.set_xticks(range(len(names) + 1), [*names, f"validation\n{points.label}"])
+    bottom = -0.06 if succeeded.all() else failed_height - 0.06
+    panel.set(ylim=(bottom, 1.06), xlim=(-0.25, len(names) + 0.35), yticks=[])
+    panel.set_title(f"Sweep {points.definition['sweep']}: {len(table)} points")
+    panel.spines[:].set_visible(False)
     panel.tick_params(axis="x", length=0)
+    handles = [legend_entry("best point", color=colormaps["viridis"](0.0), lw=3.2)]
+    handles += [legend_entry("worst point", color=colormaps["viridis"](0.92), lw=1.1)]
+    if not succeeded.all():
+        handles += [legend_entry(f"failed: {(~succeeded).sum()}", color="0.6", ls=":")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
 
 @styled
-def response_curves(
-    table: pd.DataFrame, described: Mapping[str, Any], axes: Sequence[str], logs: Sequence[str]
-) -> Figure:
+def response_curves(points: SweepPoints) -> Figure:
     """Draw validation and test metric against each axis of the sweep.
 
     The line of a panel joins the best validation values of listed numbers; in a grid of
     two axes there is one line for every value of the other axis. A sweep of one axis has a
-    second panel with the metric at every noise level. Parameters are those of
-    `parallel_coordinates`.
+    second panel with the metric at every noise level.
     """
-    # Name of the axis of each panel, and True for the panel of noise levels.
-    contents = [(name, False) for name in axes] + ([(axes[0], True)] if len(axes) == 1 else [])
+    # Name of the axis of each panel, and what is drawn against it.
+    names = list(points.definition["space"])
+    contents = [(name, _draw_points) for name in names]
+    if len(names) == 1:
+        contents.append((names[0], _draw_noise_levels))
+    # Two panels side by side; panels of a row share the axis of the metric.
     columns = min(len(contents), 2)
     rows = -(-len(contents) // columns)
     figure = new_figure(0.9 + 3.3 * rows, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey="row").ravel()
-    for panel, (name, by_level) in zip(panels, contents, strict=False):
-        scale = scale_of(table[name].tolist(), name in logs)
+    for panel, (name, draw) in zip(panels, contents, strict=False):
+        scale = points.scale(name)
         # Only listed numbers are joined; draws from a range are scattered.
-        joined = scale.numeric and described["space"][name].get("low") is None
-        draw = _draw_noise_levels if by_level else _draw_points
-        title = draw(panel, table, scale, described, name, joined)
-        if _is_log(described["metric"]):
+        joined = scale.numeric and points.definition["space"][name].get("low") is None
+        title = draw(panel, points, scale, name, {"ls": "-" if joined else "", "lw": 1.3})
+        if points.is_logarithmic:
             panel.set_yscale("log")
         panel.set_xticks(scale.ticks, scale.labels)
         panel.set_xlabel(name)
@@ -189,30 +230,21 @@ def response_curves(
     for panel in panels[len(contents) :]:
         panel.set_visible(False)
     for row in range(rows):
-        panels[row * columns].set_ylabel(_label(described["metric"]))
-    failed = ", × failed" if (table["status"] == "failed").any() else ""
-    figure.suptitle(
-        f"Sweep {described['sweep']}: filled validation, open test, star the best{failed}"
-    )
+        panels[row * columns].set_ylabel(points.label)
+    failed = ", × failed" if (points.table["status"] == "failed").any() else ""
+    name = points.definition["sweep"]
+    figure.suptitle(f"Sweep {name}: filled validation, open test, star the best{failed}")
     return figure
 
 
-def _draw_points(
-    panel: Axes,
-    table: pd.DataFrame,
-    scale: Scale,
-    described: Mapping[str, Any],
-    name: str,
-    joined: bool,
-) -> str:
+def _draw_points(panel: Axes, points: SweepPoints, scale: Scale, name: str, line: Style) -> str:
     """Draw every point, and lines through the best; return the axis that the lines stand for."""
-    metric = described["metric"]
-    validation = _column(table, metric)
-    test = _column(table, metric.replace("validation", "test"))
+    table, definition = points.table, points.definition
+    validation, test = points.errors(points.metric)
     succeeded = np.isfinite(validation)
     # In a grid of two axes each value of the second axis has a line, if there are at most six.
-    further_axes = [axis for axis in described["space"] if axis != name]
-    line_axis = further_axes[0] if described["kind"] == "grid" and len(further_axes) == 1 else ""
+    further_axes = [axis for axis in definition["space"] if axis != name]
+    line_axis = further_axes[0] if definition["kind"] == "grid" and len(further_axes) == 1 else ""
     if line_axis and table[line_axis].nunique() > 6:
         line_axis = ""
     for number, value in enumerate(dict.fromkeys(table[line_axis]) if line_axis else [""]):
@@ -221,15 +253,13 @@ def _draw_points(
         coordinate = scale.coordinate[members]
         # The line joins the best validation value at each coordinate.
         positions = np.unique(coordinate)
-        best_of = np.min if described["direction"] == "minimize" else np.max
+        best_of = np.min if definition["direction"] == "minimize" else np.max
         heights = [best_of(validation[members][coordinate == x]) for x in positions]
-        style: Style = {"ls": "-" if joined else "", "lw": 1.3, "label": value}
-        panel.plot(positions, heights, marker="o", ms=4, color=color, **style)
+        panel.plot(positions, heights, marker="o", ms=4, color=color, **line, label=value)
         panel.plot(coordinate, validation[members], ls="", marker="o", ms=4, color=color)
-        panel.plot(coordinate, test[members], ls="", marker="o", ms=7, mfc="none", mec=color)
-    is_best = (table["best"] == "yes").to_numpy()
+        panel.plot(coordinate, test[members], **_open_marker(color))
     star: Style = {"ls": "", "marker": "*", "ms": 14, "mfc": "none", "mec": "black"}
-    panel.plot(scale.coordinate[is_best], validation[is_best], **star)
+    panel.plot(scale.coordinate[points.is_best], validation[points.is_best], **star)
     # Failed points are crosses at the upper edge of the panel.
     cross: Style = {"ls": "", "marker": "x", "ms": 6, "color": "0.4"}
     top = np.full((~succeeded).sum(), 0.97)
@@ -239,30 +269,26 @@ def _draw_points(
 
 
 def _draw_noise_levels(
-    panel: Axes,
-    table: pd.DataFrame,
-    scale: Scale,
-    described: Mapping[str, Any],
-    name: str,
-    joined: bool,
+    panel: Axes, points: SweepPoints, scale: Scale, name: str, line: Style
 ) -> str:
     """Draw the metric at every noise level; return the quantity that the lines stand for."""
     # The table has a column METRIC_LEVEL for each noise level.
-    prefix = f"{described['metric']}_"
-    columns = [column for column in table.columns if column.startswith(prefix)]
+    prefix = f"{points.metric}_"
+    columns = [column for column in points.table.columns if column.startswith(prefix)]
+    # Validation as a line with filled markers, test as open ones, one colour for each level.
     order = np.argsort(scale.coordinate)
     for number, column in enumerate(columns):
-        color = SERIES_COLORS[number % len(SERIES_COLORS)]
-        style: Style = {
-            "ls": "-" if joined else "",
-            "lw": 1.3,
-            "label": column.removeprefix(prefix),
-        }
-        validation = _column(table, column)[order]
-        panel.plot(scale.coordinate[order], validation, marker="o", ms=4, color=color, **style)
-        test = _column(table, column.replace("validation", "test"))
-        panel.plot(scale.coordinate, test, ls="", marker="o", ms=7, mfc="none", mec=color)
+        style = {**line, "color": SERIES_COLORS[number % len(SERIES_COLORS)]}
+        validation, test = points.errors(column)
+        style["label"] = column.removeprefix(prefix)
+        panel.plot(scale.coordinate[order], validation[order], marker="o", ms=4, **style)
+        panel.plot(scale.coordinate, test, **_open_marker(style["color"]))
     return "noise level λ"
+
+
+def _open_marker(color: str) -> Style:
+    """Return the style of test metrics: open markers without a line."""
+    return {"ls": "", "marker": "o", "ms": 7, "mfc": "none", "mec": color}
 
 
 def _draw_vertical_scales(panel: Axes, scales: Sequence[Scale]) -> None:
@@ -281,27 +307,3 @@ def _draw_vertical_scales(panel: Axes, scales: Sequence[Scale]) -> None:
                 zorder=4,
                 bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
             )
-
-
-def _with_metric_ticks(scale: Scale, metric: str) -> Scale:
-    """Return the scale of a metric with five evenly spaced ticks instead of one per point."""
-    low, high = np.nanmin(scale.coordinate), np.nanmax(scale.coordinate)
-    ticks = np.linspace(low, high, 5) if high > low else np.array([low])
-    values = 10.0**ticks if _is_log(metric) else ticks
-    digits = ".2e" if metric.endswith("mse") else ".3g"
-    return Scale(scale.coordinate, ticks, [format(value, digits) for value in values])
-
-
-def _column(table: pd.DataFrame, name: str) -> np.ndarray:
-    """Return a column of numbers; NaN where a point failed."""
-    return table[name].to_numpy(dtype=float)
-
-
-def _is_log(metric: str) -> bool:
-    """Return True if a metric is drawn on a logarithmic scale: all but the SSIM."""
-    return not metric.endswith("ssim")
-
-
-def _label(metric: str) -> str:
-    """Return the label of the axis of a validation metric."""
-    return METRIC_LABELS[metric.removeprefix("validation_")]

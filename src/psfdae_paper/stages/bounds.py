@@ -1,5 +1,8 @@
 """Stages `bank`, `bounds`, `optics`, `efficiency`, `paper-rows`: bounds of the error of estimates.
 
+In go simulated stars and the errors of methods; out come the least errors that any method can have
+on them, and tables that set the errors of all methods beside these.
+
 They simulate stars, bound the error of any estimate of the test stars, and compare the errors of
 methods with these bounds.
 """
@@ -47,6 +50,7 @@ def bank(
 ) -> None:
     """Simulate the bank of fresh stars behind the posterior mean."""
     limit_threads(1)  # batches run in parallel
+    # Two draws of the simulator, one after the other: the second has its own random streams.
     parts = [
         fresh_stars(config, name, count, config.bounds.threads)
         for name, count in (
@@ -75,6 +79,7 @@ def bounds(
     ] = None,
 ) -> None:
     """Bound the error that any estimator can reach on the test stars."""
+    # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
     framed = read_product(templates, "templates", ("psf",))
@@ -82,6 +87,7 @@ def bounds(
     require(templates, framed.config, STATIC, config)
     static = jittered_templates(framed["psf"], config.framing.jitter_px)
     bound = tables.Tables(dataset, bounded_stars(config, product))
+    # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
         tables.add_exact(config, static, bound)
     elif bank is None:
@@ -124,6 +130,7 @@ def optics(
     require(bank, bank_product.config, STARS, product.config, stars)
     bounded = bounded_stars(config, product)
     position = field_positions(product)[bounded.star]
+    # Without, then with the position of the star in the field.
     summary, stars_table = [], []
     for name in ("wavefront", "wavefront_position"):
         method_class = cast("type[Wavefront]", method(name))

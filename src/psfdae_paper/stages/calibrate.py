@@ -1,4 +1,9 @@
-"""Stages `scan` and `calibrate`: parameters that the paper does not state, fitted to its tables."""
+"""Stages `scan` and `calibrate`: parameters that the paper does not state, fitted to its tables.
+
+In go settings of the scenes, and simulated stars; out come tables of the fitted noise constant κ,
+the dynamic range of the SSIM and the pixel scales, beside the configured ones. Only the rows of the
+original noise are used, which depend on no method.
+"""
 
 from __future__ import annotations
 
@@ -53,6 +58,7 @@ def scan(
         # The configured r0 is always scanned: its fit is compared with the configured scale.
         r0_values = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
     table = []
+    # Noisy stars of each pixel scale, whose SSIM is computed at all dynamic ranges.
     for r0 in r0_values:
         source = _source(config, r0)
         for scale in config.calibration.pixel_scales_arcsec:
@@ -92,6 +98,7 @@ class _CachedWavefronts:
 
         Only few stars need double precision.
         """
+        # Exact pixels of a few stars that compete for the maximum.
         if dtype != np.float32:
             return self.source.opd(index, pupil, dtype)
         if pupil.axis.size not in self._opd:
@@ -115,7 +122,10 @@ def _source(config: Config, r0: float) -> WavefrontSource:
 
 
 def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray:
-    """Return noise-free, framed, normalised stars at another pixel scale (arcsec)."""
+    """Return noise-free, framed, normalised stars at another pixel scale (arcsec).
+
+    The search for the brightest pixel covers the same angle as at the configured scale.
+    """
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
     propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
@@ -123,7 +133,10 @@ def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray
 
 
 def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
-    """Add noise to images, scaled so that its MSE is that of a column of the paper."""
+    """Add noise to images, scaled so that its MSE is that of a column of the paper.
+
+    The noise of λ = `row.noise_level` has the variance (κλ)² plus that of the star's photons.
+    """
     level, background = row.noise_level, config.noise.background_photons
     kappa = kappa_of_mse(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
@@ -138,6 +151,7 @@ def calibrate(
     out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
 ) -> None:
     """Fit noise, dynamic range and pixel scales to the scans."""
+    # Each of the paper's columns beside simulated stars with the configured parameters.
     products = dict(stars)
     configured = _configured(products)
     limit_threads(config.evaluation.threads)
@@ -157,6 +171,7 @@ def calibrate(
     kappa = float(np.exp(np.log(fitted_columns.kappa).mean()))
     ssim_residual = fitted_columns.ssim_at_published_mse - fitted_columns.ssim_paper
     rms = float(np.sqrt((ssim_residual**2).mean()))
+    # Fitted values beside configured ones.
     table = [
         ("kappa", kappa, config.noise.kappa, "1"),
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
@@ -183,7 +198,10 @@ def calibrate(
 
 
 def _configured(stars: dict[str, Path]) -> dict[str, float]:
-    """Return the pixel scales and the r0 with which the stars were simulated."""
+    """Return the pixel scales by scene and the r0 with which the stars were simulated.
+
+    Stars of one scene must have the same static PSFs; raises ProductError.
+    """
     values: dict[str, float] = {}
     scenes: dict[str, Product] = {}
     for path in stars.values():
@@ -199,6 +217,7 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
 
 def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]:
     """Return one original-noise column: published and simulated, at κλ and at its own MSE."""
+    # The same stars with the configured κ, and with the κ of this column alone.
     images = read_product(path, "stars", ("realisation",))["realisation"]
     background = config.noise.background_photons
     rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")

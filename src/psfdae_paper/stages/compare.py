@@ -70,6 +70,7 @@ def compare(
     """
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
+    # Folders with tables alone are compared by mean errors, others star by star.
     if all(map(_tables, runs)) and not all(map(_networks, runs)):
         blocks = [describe_tables(runs[0], folder) for folder in runs[1:]]
     else:
@@ -82,7 +83,10 @@ def compare(
 
 
 def _networks(folder: Path) -> set[Path]:
-    """Return the folders of trained networks, relative to a folder of results."""
+    """Return the folders of trained networks, relative to a folder of results.
+
+    A network is METHOD/DATASET/SPLIT-REFERENCE, with its configuration in it.
+    """
     names = (m.name for m in registered() if m.storage and CONFIG in m.storage.files)
     paths = (path for name in names for path in folder.glob(f"{name}/*/*/{CONFIG}"))
     return {path.parent.relative_to(folder) for path in paths}
@@ -98,6 +102,7 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """Return the runs to compare with each other: folder of the network, table of its errors."""
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
+    # Whole results: all networks that they have in common, one group for each.
     networks = [_networks(folder) for folder in folders]
     for folder, names in zip(folders, networks, strict=True):
         if not names:
@@ -129,6 +134,7 @@ def errors_of(folder: Path) -> Path:
 
 def read_run(folder: Path, errors: Path) -> Run:
     """Read a network's settings, training history and errors per star; raises ProductError."""
+    # Settings and training are beside the network, its errors in the evaluation.
     config = read_yaml(folder / CONFIG)
     columns = ("epoch", "train_mse", "validation_mse", "seconds")
     history = read_table(folder / HISTORY, *columns, dtype=str)
@@ -197,6 +203,7 @@ def describe_tables(first: Path, second: Path) -> str:
         "beyond": "differ by more",
         "not measured": "differ, but their scatter between seeds was not measured",
     }
+    # Numbers of rows by verdict; rows that differ are listed.
     lines = [f"# {first} (A) and {second} (B)", ""]
     counts = f"A has {len(first_errors)}, B {len(second_errors)}"
     lines += [f"{len(rows)} mean errors are in both ({counts})."]
@@ -218,6 +225,7 @@ def _row_lines(rows: pd.DataFrame) -> list[str]:
     """Return a line of text for each dataset, split and reference of a table of errors."""
     lines = []
     for key, cell in rows.groupby(["dataset", "split", "reference"], sort=False):
+        # Metrics of a method that differ at the same noise levels are named together.
         metrics: dict[str, list[str]] = {}
         for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
             levels = ", ".join(f"{level:g}" for level in part.noise_level)

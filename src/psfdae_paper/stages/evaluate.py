@@ -1,4 +1,8 @@
-"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars."""
+"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars.
+
+In go the product "stars" and the fitted methods; out come the errors of every star (Parquet) and
+their means with standard errors (CSV). The other stages make tables of these errors.
+"""
 
 from __future__ import annotations
 
@@ -68,6 +72,7 @@ def evaluate(
     out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
     """Measure every method on the test stars at each noise level."""
+    # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), split, reference)
@@ -134,6 +139,7 @@ def estimators(
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
             fits.require(method_class, place, stars, config, split, reference)
             places[name] = place
+    # Methods without a file are fitted here.
     fitted: dict[str, Method] = {}
     for method_class in classes:
         if method_class.storage:
@@ -181,6 +187,7 @@ def paper_tables(
     ],
 ) -> None:
     """Write the paper's tables, with measured errors beside the published ones."""
+    # Each table as CSV, and beside it as Markdown.
     measured = read_tables(evaluations, COLUMNS)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)

@@ -1,4 +1,8 @@
-"""Stage `fit`: fit of a method to one dataset and split, for one reference or for both."""
+"""Stage `fit`: fit of a method to one dataset and split, for one reference or for both.
+
+In goes the product "stars"; out comes the fitted method, as a folder or an HDF5 product, with the
+configuration of the fit and of its stars beside it.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +46,7 @@ def fit(
     out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
 ) -> None:
     """Fit METHOD, a name of the list `methods` in config.yaml."""
+    # Stars of the split with their noise; training state goes to a file beside the fit.
     method_class = method(name)
     limit_threads(method_class.threads(config))
     product = read_stars(stars, fits.learnt(method_class, reference))
@@ -56,6 +61,7 @@ def fit(
             )
         fits.require(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
+    # Fit, store with its configuration, and forget the state of the training.
     described = fits.described_by(method_class, config.model_dump(), split, reference)
     fitted = method_class.fit(data, **method_class.settings(config))
     fits.store(fitted, out, described, product)

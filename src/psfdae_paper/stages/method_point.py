@@ -1,4 +1,8 @@
-"""Training and measurement of one point of a sweep over a method's settings."""
+"""Training and measurement of one point of a sweep over a method's settings.
+
+In go the point's configuration and the product "stars"; out come the method's fit, as the stage
+`fit` makes it, and its errors on validation and test stars.
+"""
 
 from __future__ import annotations
 
@@ -46,6 +50,8 @@ def run(config: Config, task: Task, name: str) -> Measured:
     settings = part(groups_of(name), config)
     stars, place = task.data["stars"], fit_in(method_class, task.folder)
     limit_threads(method_class.threads(settings))
+    # Errors on validation stars need a fit that has not seen them. Some methods leave them out, or
+    # only choose by them; the others are fitted to them in the main workflow.
     validation_fit = None
     if not method_class.needs.validation:
         product = read_stars(stars, fits.learnt(method_class, task.reference))
@@ -53,9 +59,11 @@ def run(config: Config, task: Task, name: str) -> Measured:
         validation_fit = method_class.fit(
             data.without_validation(), **method_class.settings(settings)
         )
+    # The fit of the main workflow, with its cost.
     started, started_cpu = time.monotonic(), time.process_time()
     fit(settings, name, stars, task.split, task.reference, checkpoint=task.checkpoint, out=place)
     seconds, cpu_seconds = time.monotonic() - started, time.process_time() - started_cpu
+    # Errors on both parts, and how the training ended.
     limit_threads(config.evaluation.threads)
     fitted = method_class.load(place, task.reference, config.evaluation)
     metrics = measure_images(config, task, name, validation_fit or fitted, fitted)

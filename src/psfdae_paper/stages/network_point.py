@@ -1,4 +1,8 @@
-"""Training and measurement of one point of a sweep over a network of scene 3."""
+"""Training and measurement of one point of a sweep over a network of scene 3.
+
+In go the point's configuration and states with their stamps, for training, validation and test; out
+come the trained network and its errors of states, in units of their range.
+"""
 
 from __future__ import annotations
 
@@ -47,10 +51,12 @@ def run(config: Config, task: Task, name: str) -> Measured:
     ProductError
         If the products are of different telescopes or stamps.
     """
+    # All states must have stamps of one telescope.
     trained_on = read_product(task.data["states"], "alignment_states", ())
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STAMP_KEYS, trained_on.config, trained_on.path)
+    # The training of the main workflow.
     settings = part(network_groups(name), config)
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)

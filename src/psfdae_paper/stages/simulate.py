@@ -64,6 +64,7 @@ def simulate(
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
         overrides = ("dataset=_telescope", *overrides)
     config = load_stage(STATIC, overrides)
+    # Groups of the static PSFs are checked; then they are propagated and measured.
     folder = out or Path(config.telescope.name)
     # No file is written if the PSFs do not fit.
     with atomic_path(folder / "templates.h5") as temporary:
@@ -97,6 +98,7 @@ def figure_telescope(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw the static PSFs of a telescope with their light and their width."""
+    # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
     x, y = np.rad2deg(fields.field).T
@@ -114,7 +116,10 @@ def figure_telescope(
 
 
 def measure_fields(product: Product) -> FieldOfPsfs:
-    """Measure the shapes of the stamps of the product "templates", without their margin."""
+    """Measure the shapes of the stamps of the product "templates", without their margin.
+
+    Widths become arcsec by the telescope's pixel scale.
+    """
     psf = without_margin(product)
     shapes = measure_shapes(psf)
     return FieldOfPsfs(
@@ -218,6 +223,7 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
     """
     from astropy.io import fits
 
+    # Primary HDU: the PSFs, with what a reader needs to place their pixels on the sky.
     telescope = config.telescope
     cube = fits.PrimaryHDU(fields.psf.astype(np.float32))
     for card in (
@@ -229,6 +235,7 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
         ("CREATOR", f"psfdae {__version__}", ""),
     ):
         cube.header.append(card)
+    # Table: name, FITS format, unit and values of each column.
     x, y = np.rad2deg(fields.field).T
     columns = (
         ("id", "K", None, np.arange(len(fields.psf))),
@@ -266,14 +273,17 @@ def write_image(
     path, catalogue : Path
         FITS image and CSV file.
     """
+    # Flux of a star from its S/N; all stars have the same one.
     stamps, _ = normalise_flux(fields.psf.astype(np.float64))
     sky = 1000.0  # photons per pixel
     flux = snr * np.sqrt(sky * noise_equivalent_px(stamps.mean(axis=0)))
+    # Expected photons: sky, and the stars at the positions of their field points.
     pitch = stamps.shape[-1] + 8
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
     expected = np.full((int(rows) * pitch, int(columns) * pitch), sky)
     add_stamps(expected, flux * stamps, x, y)
+    # Photon noise is all the noise: a gain of 1 and no read noise.
     rng = stream(seed, "simulated image", config.telescope.name)
     write_field(
         path,

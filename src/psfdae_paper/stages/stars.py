@@ -1,4 +1,9 @@
-"""Stages `templates` and `stars`: static PSFs, and noise-free stars with both references."""
+"""Stages `templates` and `stars`: static PSFs, and noise-free stars with both references.
+
+In go settings of a scene; out come HDF5 products with stamps of flux 1: the static PSF of every
+field point, and single stars, each with its own noise-free image (realisation) and the static PSF
+of its field (template). Noise is added later, by the stages that need it.
+"""
 
 from __future__ import annotations
 
@@ -68,6 +73,7 @@ def stars(
     # about 100 bytes per star; then images are made and written, `STARS_AT_A_TIME`.
     static = read_product(templates, "templates", ("psf", "grid"))
     belonging.require(templates, static.config, belonging.STATIC, config)
+    # Field, centring error and sub-pixel phase of each star, each from a stream of its own.
     framing, name, count = config.framing, config.stars.name, config.stars.count
     star_field = assign_fields(count, len(static["psf"]), stream(config.seed, "field", name))
     jitter = draw_jitter(count, framing.jitter_px, stream(config.seed, "jitter", name))
@@ -104,9 +110,11 @@ def stars(
     with stream_product(out, "stars", columns, config.model_dump()) as data:
         for start in range(0, count, STARS_AT_A_TIME):
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
+            # The static PSF of the field, cut with the centring error of the star.
             framed = static["psf"][star_field[part]].astype(np.float64)
             cropped = crop_jittered(framed, jitter[part], framing.jitter_px)
             arrays = dict(zip(("template", "energy"), normalise_flux(cropped), strict=True))
+            # The star's own image: its light inside the stamp is that of the realisation.
             if propagation is not None:
                 stamps, peak = propagation.framed(framing.stamp_px, jitter[part], part, phase[part])
                 arrays["realisation"], arrays["energy"] = normalise_flux(stamps)

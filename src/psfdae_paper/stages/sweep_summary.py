@@ -1,4 +1,8 @@
-"""Stages `sweep summary`, `sweep figure` and `best`: tables and figures of a sweep's points."""
+"""Stages `sweep summary`, `sweep figure` and `best`: tables and figures of a sweep's points.
+
+In go the results of all points; out come their table, the best point as overrides, what each
+training cost, and two figures. Errors on the test part choose nothing.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,8 @@ from psfdae.figures import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.options import File, Folder
 from psfdae.reading import read_json, read_table, read_yaml
-from psfdae.settings import as_overrides, validate
+from psfdae.settings import as_overrides
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.sweep import Axis
 from psfdae_paper.evaluation import sweep_figures
 from psfdae_paper.sweeps.measured import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
@@ -77,11 +80,13 @@ def summary(
     SweepError
         If no point has a metric.
     """
+    # The best point by the validation metric; a sweep without any metric has failed.
     results = [read_json(path) for path in points]
     best_result = choose(results, definition["metric"], definition["direction"])
     if best_result is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
+    # Metrics are the same in every run of a point; what it cost is in a table of its own.
     rows = [_row(result, definition["space"], result is best_result) for result in results]
     write_csv(out / "summary.csv", pd.DataFrame(rows))
     costs = [
@@ -144,6 +149,7 @@ def _best_yaml(
     name: str, definition: Mapping[str, Any], overrides: Sequence[str], result: Mapping[str, Any]
 ) -> str:
     """Return the best point as overrides, those of the workflow before those of the point."""
+    # The preset has a key of its own, because `make reproduce` takes it separately.
     preset = "preset="
     point_overrides = [word.removeprefix("++") for word in as_overrides(result["keys"])]
     tree = {
@@ -169,12 +175,11 @@ def sweep_figure(
 ) -> None:
     """Draw all points at once, or the metric against each axis."""
     described = read_yaml(definition)
-    logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
+    # Axes as text: they may be numbers or names of options.
+    table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))
+    points = sweep_figures.SweepPoints(table_of_points, described)
     draw = {
         "parallel": sweep_figures.parallel_coordinates,
         "response": sweep_figures.response_curves,
     }[kind]
-    axes = list(described["space"])
-    # Axes as text: they may be numbers or names of options.
-    points = read_table(table, dtype=dict.fromkeys(axes, str))
-    write_png(draw(points, described, axes, logarithmic), out)
+    write_png(draw(points), out)

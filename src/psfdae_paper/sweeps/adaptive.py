@@ -1,5 +1,6 @@
 """Adaptive search: Optuna's ask and tell, one process per trial.
 
+In go the axes of a sweep and the results of earlier trials; out come the values of the next trial.
 The values of a trial follow only from the results of earlier trials, which are files of the
 workflow: each process makes a new study and adds these results to it.
 """
@@ -51,12 +52,16 @@ def ask(
     seed = int(stream(search["seed"], "sweep", "trial", slot).integers(2**31))
     # Without this, Optuna writes a message for each trial.
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    # The sampler draws `startup` trials at random, then where a Parzen estimator of good trials is
+    # large against that of the other ones.
     study = optuna.create_study(
         direction=search["direction"],
         sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=search["startup"]),
     )
+    # Earlier trials in the order of their numbers, so that the study is always the same.
     for result in sorted(earlier_results, key=lambda result: result["slot"]):
         study.add_trial(_trial(space, result, search))
+    # Options come back as JSON, numbers of a range are rounded like random draws.
     parameters = study.ask(_distributions(space)).params
     return {
         name: json.loads(parameters[name]) if axis.options else tidy(axis, parameters[name])

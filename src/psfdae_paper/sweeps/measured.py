@@ -85,7 +85,7 @@ class Measured:
 
 
 def geometric_mean(values: Sequence[float]) -> float:
-    """Return the mean over noise levels in which relative changes of all levels count alike."""
+    """Return the geometric mean, in which relative changes at all noise levels count alike."""
     return float(np.exp(np.mean(np.log(values))))
 
 
@@ -94,6 +94,7 @@ def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
 
     The MSE of different levels differ by orders of magnitude, and get the geometric mean.
     """
+    # Name of the metric, and its mean over noise levels.
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
         by_level = {row["noise_level"]: row["value"] for row in rows if row["metric"] == metric}
@@ -150,6 +151,7 @@ def measure_images(
         ("validation", parts.validation, noisy_validation, validate_with),
         ("test", parts.test, noisy_test, test_with),
     ):
+        # Truth, field and position of the stars; then their errors at each noise level.
         stars = MeasuredStars.of(product, indices, task.reference)
         images = product["realisation"][indices]
         rows = []
@@ -170,5 +172,8 @@ def read_cost(folder: Path) -> dict[str, float]:
 
 
 def fit_in(kind: type[Method], folder: Path) -> Path:
-    """Return the place of a point's fit: the folder itself, or a file in it."""
+    """Return the place of a point's fit: the folder itself, or a file in it.
+
+    A method with several files, such as a network, has a folder; one with a product has a file.
+    """
     return folder if storage_of(kind).files else folder / f"{kind.name}.h5"

@@ -1,4 +1,8 @@
-"""The points of a sweep: every combination or random draws, each with its configuration."""
+"""The points of a sweep: every combination or random draws, each with its configuration.
+
+In go the name of a sweep and the overrides of the workflow; out comes a `Plan`, whose points have
+values of the axes, the whole configuration of a training, and a name that is the hash of it.
+"""
 
 from __future__ import annotations
 
@@ -155,6 +159,7 @@ class Plan:
     @cached_property
     def points(self) -> dict[str, Point]:
         """Points by name in the order of the sweep; equal ones are one point."""
+        # Values of adaptive trials are proposed when they run: only their limits can be checked.
         if self.sweep.kind == "adaptive":
             self._check_ends()
             points = [self._point({}, slot) for slot in range(self.sweep.trials or 0)]
@@ -188,6 +193,7 @@ class Plan:
 
     def _point(self, values: dict[str, Value], slot: int | None = None) -> Point:
         """Make the point at some values of the axes, or the trial of a number."""
+        # Keys that all points share, and those of the axes.
         keys = {**self.sweep.overrides, **(changes(self.sweep.space, values) if values else {})}
         config = self._point_config(keys, values)
         # All that can change the result: points with the same content have the same name.
@@ -207,6 +213,7 @@ class Plan:
         self, keys: Mapping[str, Value], values: Mapping[str, Value]
     ) -> dict[str, Any]:
         """Return the groups of a point with some keys set; SweepError names file and point."""
+        # A value that the configuration refuses is a mistake in the sweep's file.
         path = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
             config = validate_tree(with_values(self.tree, keys)).model_dump()
@@ -247,6 +254,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
         If a file is wrong; the message names file and key.
     """
     sweep = load_sweep(name)
+    # The configuration of the sweep's dataset, with those overrides that concern it.
     tree = compose((*sweep.choice, *overrides_for(overrides, sweep.choice)))
     return Plan(name, sweep, tree)
 

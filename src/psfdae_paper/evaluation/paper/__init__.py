@@ -1,4 +1,7 @@
-"""The paper's published tables as data, and tables of measured errors in the same shape."""
+"""The paper's published tables as data, and tables of measured errors in the same shape.
+
+The CSV files beside this module have the numbers as they are printed.
+"""
 
 from __future__ import annotations
 
@@ -37,6 +40,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         The paper has no rows for datasets that it does not tabulate. Methods of psfdae have in
         brackets what they are given beside the image; for the paper's that is unknown.
     """
+    # Measured errors of the methods that the paper has, on test stars of all fields.
     labels = {m.name: m.look.paper[1] for m in registered() if m.look.paper}
     measured = metrics[
         (metrics.dataset == dataset)
@@ -44,6 +48,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         & (metrics.split == "random")
         & metrics.method.isin(list(labels))
     ].assign(source="psfdae")
+    # Its values do not say which reference they are for.
     paper = published("psf")
     paper = paper[(paper.dataset == dataset) & (paper.metric == metric)].assign(
         source="paper", reference="as published"
@@ -56,6 +61,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     table = table.reset_index().drop(columns="order")
+    # Labels of the methods, with what they are given; columns of noise levels as text.
     inputs = table["method"].map({m.name: str(m.needs) for m in registered()})
     table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
     table.columns = [f"{c:g}" if isinstance(c, float) else c for c in table.columns]
