@@ -176,12 +176,12 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
     if model.whole:
         trailing = model.variance[: model.variance.size - leading]
     is_even = trailing.size and (trailing == trailing[0]).all()
-    rest = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
+    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
     # Variances in double precision, maps of pixels in single; the method's arrays as they are.
     groups: dict[str, Mapping[str, np.ndarray]] = {
         "flux": {
             "variance": np.asarray(model.variance[-leading:], np.float64),
-            "rest": np.asarray(rest, np.float64),
+            "rest": np.asarray(trailing_variance, np.float64),
             "mean": np.asarray(model.mean, np.float32),
             "low": np.asarray(model.low, np.float32),
             "high": np.asarray(model.high, np.float32),
