@@ -224,6 +224,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
             remedy = "train the model again, or take the psfdae that wrote it"
             _require(version == FORMAT_VERSION, path, f"{problem}; {remedy}")
             arrays = {name: file.get_tensor(name) for name in list(file.keys())}
+        # The checksum of description and arrays: nothing else is read from a damaged file.
         is_intact = text["sha256"] == _digest(text["info"], arrays)
         _require(is_intact, path, "damaged (the checksum differs)")
         info = BundleInfo.model_validate(text["info"])
@@ -242,7 +243,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
-    # Groups of arrays, without their prefix.
+    # Groups of arrays, without their prefix, make the parts of the bundle.
     flux, errors, weights = (
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)
