@@ -123,8 +123,8 @@ class HeldOutStars:
             At least 0. Quantiles above the own noise are those of errors to noise-free stars; means
             are larger.
         """
-        # The own noise s of a pixel is independent of the error e: the difference from the reference
-        # has the mean square e² + s².
+        # The own noise s of a pixel is independent of the error e: the difference from the
+        # reference has the mean square e² + s².
         square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
         error = np.sqrt(np.maximum(square, 0.0))
         # Equal stars leave a method no doubt: its σ may be 0.
@@ -212,8 +212,8 @@ class StarErrors:
 
     def ratio95(self) -> np.ndarray:
         """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
-        # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels have
-        # about the same distribution, and a single pixel has too few stars for a 95 % quantile.
+        # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
+        # are taken to have the same distribution.
         scaled = self.error / np.maximum(self.half_width, 1e-12)[:, None]
         return np.array([np.quantile(node, COVERAGE95) for node in scaled], np.float64)
 
