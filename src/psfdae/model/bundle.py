@@ -176,12 +176,12 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
     if model.whole:
         trailing = model.variance[: model.variance.size - leading]
     is_even = trailing.size and (trailing == trailing[0]).all()
-    rest = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
+    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
     # Variances in double precision, maps of pixels in single; the method's arrays as they are.
     groups: dict[str, Mapping[str, np.ndarray]] = {
         "flux": {
             "variance": np.asarray(model.variance[-leading:], np.float64),
-            "rest": np.asarray(rest, np.float64),
+            "rest": np.asarray(trailing_variance, np.float64),
             "mean": np.asarray(model.mean, np.float32),
             "low": np.asarray(model.low, np.float32),
             "high": np.asarray(model.high, np.float32),
@@ -224,6 +224,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
             remedy = "train the model again, or take the psfdae that wrote it"
             _require(version == FORMAT_VERSION, path, f"{problem}; {remedy}")
             arrays = {name: file.get_tensor(name) for name in list(file.keys())}
+        # The checksum of description and arrays: nothing else is read from a damaged file.
         is_intact = text["sha256"] == _digest(text["info"], arrays)
         _require(is_intact, path, "damaged (the checksum differs)")
         info = BundleInfo.model_validate(text["info"])
@@ -242,7 +243,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
-    # Groups of arrays, without their prefix.
+    # Groups of arrays, without their prefix, make the parts of the bundle.
     flux, errors, weights = (
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)

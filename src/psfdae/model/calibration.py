@@ -123,6 +123,8 @@ class HeldOutStars:
             At least 0. Quantiles above the own noise are those of errors to noise-free stars; means
             are larger.
         """
+        # The own noise s of a pixel is independent of the error e: the difference from the
+        # reference has the mean square e² + s².
         square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
         error = np.sqrt(np.maximum(square, 0.0))
         # Equal stars leave a method no doubt: its σ may be 0.
@@ -173,6 +175,8 @@ class StarErrors:
         noise = np.repeat(nodes, len(draws[0][1]))
         level = noise / stars.noise.kappa
         estimate = fitted.estimate(noisy, level, stars.position[star])
+        # A method that scores stars by themselves does so in its form for estimated fluxes, as it
+        # does for a user's stars.
         score, free_flux = estimate.outlier_score, with_free_flux(fitted)
         if score is None and isinstance(free_flux, ScoresOutliers):
             score = free_flux.outlier_score(noisy, level)
@@ -201,12 +205,15 @@ class StarErrors:
         At least a quarter of the root mean square: beside much noise of the stars' own, most errors
         in a pixel may be 0.
         """
+        # Quantile and root mean square over the stars, for each node and pixel.
         quantile = np.stack([np.quantile(node, COVERAGE, axis=0) for node in self.error])
         rms = np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
         return np.asarray(np.maximum(quantile, 0.25 * rms))
 
     def ratio95(self) -> np.ndarray:
         """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
+        # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
+        # are taken to have the same distribution.
         scaled = self.error / np.maximum(self.half_width, 1e-12)[:, None]
         return np.array([np.quantile(node, COVERAGE95) for node in scaled], np.float64)
 
@@ -217,6 +224,8 @@ class StarErrors:
         """
         if self.outlier_score is None:
             return None
+        # Scores are squares of distances; excesses are in units of the median absolute deviation,
+        # so that all nodes together show the 0.1 % tail.
         few_star_limit = self._few_star_limit(np.sqrt(np.maximum(self.outlier_score, 0.0)))
         median = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - median[:, None]), axis=1)
@@ -258,6 +267,7 @@ def calibrated(
     bundle: Bundle, fitted: Method, stars: HeldOutStars, seed: int
 ) -> tuple[Bundle, StarErrors]:
     """Return the bundle with all that test stars say of its errors, and these errors."""
+    # Errors of stars of known flux and sky, and limits of outliers.
     rng = stream(seed, "noise", "calibration", "errors")
     nodes, components = bundle.errors.noise, bundle.info.components
     errors = StarErrors.measure(stars, fitted, bundle.flux_model, nodes, components, rng)
@@ -268,6 +278,7 @@ def calibrated(
         outlier_limit=errors.outlier_limit(),
         measured=bundle.errors.measured,
     )
+    # With other noise, factors of these errors where flux, sky or noise are estimated.
     model = PsfModel(replace(bundle, errors=calibration), fitted)
     rng = stream(seed, "noise", "calibration", "scales")
     return replace(bundle, errors=with_case_scales(model, stars, rng)), errors
@@ -317,6 +328,7 @@ def _scales_at(
     # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
     measures = isinstance(model.method, MeasuresStars)
     step, noise_cases = (3, (True,)) if measures else (1, (False, True))
+    # Rows are cases times images, once with stated noise and once without.
     noisy, star = stars.draw(node, rng)
     case, image = np.divmod(np.arange(0, count * len(star), step), len(star))
     is_estimated = np.repeat(noise_cases, len(case))
@@ -342,6 +354,7 @@ def _scales_at(
         for brightness, pixels in enumerate((~is_bright[usable], is_bright[usable])):
             scale[0, *index, brightness] = np.quantile(error[usable][pixels], COVERAGE)
             scale[1, *index, brightness] = np.quantile(over_ratio[pixels], COVERAGE95)
+        # Pull of the flux, |F − 1| / σ_F: 95 % of a normal variable are within 1.96.
         if index == (1, Estimated.FLUX_AND_SKY) and not measures:
             flux_sigma = np.hypot(prediction.flux_error, stars.flux_error[star[image]])[usable]
             pull = np.abs(prediction.flux - 1.0)[usable] / flux_sigma
@@ -367,6 +380,7 @@ def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> B
     bundle, errors = model.bundle, model.bundle.errors
     if errors.outlier_limit is None:
         return bundle
+    # The stars as they are in the image, framed, with the flux 1.
     bright = BrightStars.of_product(stars).of(np.unique(stars["field_index"][train]))
     images, is_measured = bright.framed(bundle.info.stamp_px)
     images = np.where(is_measured, images, 0.0) / bright.flux[:, None, None]
@@ -379,6 +393,7 @@ def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> B
         else 0.0
         for values in (prediction.outlier_score, prediction.distance)
     )
+    # The first node has the least noise, and its limit is that of all stars of less noise.
     outlier_limit = errors.outlier_limit.copy()
     outlier_limit[0] = max(outlier_limit[0], score)
     distance_limit = max(errors.distance_limit, distance)
@@ -399,6 +414,7 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
     noisy = images + noise * rng.normal(size=images.shape)
     prediction = model.predict(noisy, position=position)
     usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
+    # Drawn centres count from the middle of the stamp, fitted ones from its corner.
     centre = centre + images.shape[-1] // 2
 
     def lacking(off: np.ndarray, stated: np.ndarray) -> float:
@@ -434,6 +450,7 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     info, nodes = bundle.info, bundle.errors.noise
     names = ("images", "references", "position")
     test_stars = replace(stars, **{name: getattr(stars, name)[:MIN_IMAGES] for name in names})
+    # Bright stars: the lower half of the noise nodes.
     noisy = [test_stars.draw(node, rng) for node in nodes[: len(nodes) // 2]]
     # Geometric mean over the nodes of the MSE of PSFs of flux 1, until it rises.
     log_mse: list[float] = []
@@ -469,6 +486,7 @@ def crossed_coverage(
         over the flux. It returns the parts `coverage68` and `coverage95` within the half-widths,
         for either half of the stars by those of the other half; nothing for a star alone.
     """
+    # Stars that gave the half-widths would be covered too often: each half is judged by the other.
     count = 1 + int(errors.star.max())
     is_even = np.arange(count) % 2 == 0
     halves = []

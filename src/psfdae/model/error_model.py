@@ -28,7 +28,7 @@ from psfdae.model.flux_model import FluxModel
 
 
 class Estimated(IntEnum):
-    """What of a star's flux and sky was estimated, because it was not stated."""
+    """Case of a star: which of its flux and sky were estimated, because they were not stated."""
 
     NOTHING = 0
     FLUX = 1

@@ -173,7 +173,7 @@ class PsfexField(FieldPsfs):
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
-    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: files of PSFEx do not say how large pixels are."""
 
     def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:

@@ -87,10 +87,10 @@ class FieldPsfs(ABC):
         """Return least and greatest position (x, y) of the training stars; raises as `psf_at`."""
 
     @abstractmethod
-    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Raise PredictionError if pixels have not the size of the model's.
 
-        `what` names the image in the message.
+        `source` names the image in the message.
         """
 
     @abstractmethod

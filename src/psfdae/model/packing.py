@@ -86,10 +86,12 @@ def model_of(
     unpacked = estimator(bundle)  # errors are those of the fit as it is packed
     if isinstance(fitted, DrawsStars):
         bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
+    # Errors on test stars; in an image, limits of outliers by its training stars, too.
     bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
     split = split_stars(stars, trained["split"], config)
     if of_image(stars):
         bundle = with_training_stars(PsfModel(bundle, unpacked), stars, split.train)
+    # Metrics of test stars at the noise levels of the configuration.
     noisy = (
         (level, noisy_test_images(config, stars, split.test, level))
         for level in config.noise.levels
@@ -150,6 +152,7 @@ def uncalibrated(
         config={"stars": stars.config, "train": dict(trained)},
         metrics=[],
     )
+    # Errors are 0 until they are measured.
     nodes = noise_nodes(band)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     bundle = Bundle(info, arrays, flux_model, ErrorModel.uncalibrated(nodes, blank))
@@ -162,6 +165,7 @@ def _stamp_fields(product: Product) -> dict[str, Any]:
     config = product.config
     try:
         telescope, framing = config["telescope"], config["framing"]
+        # Width of a pixel in λ/D, if the aperture is known.
         pixel_lambda_d = None
         if "diameter_m" in telescope:
             diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
@@ -234,6 +238,7 @@ def leading(model: FluxModel, components: int) -> FluxModel:
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
     """Return the bundle of a field model with the light of stars beyond their stamps."""
     info = bundle.info
+    # As plain numbers in the description.
     settings = info.config | {"wings": wings.plain()}
     return replace(bundle, info=info.model_copy(update={"config": settings}))
 

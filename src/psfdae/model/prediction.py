@@ -173,8 +173,8 @@ class Prediction:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Return one prediction of the stars of several, one after the other."""
-        first, *others = parts
-        if not others:
+        first = parts[0]
+        if len(parts) == 1:
             return first
         list_columns = None
         if first.list_columns is not None:

@@ -273,6 +273,7 @@ class Restorer:
         stars, flags, photometry = centred.stars, centred.flags, restored.photometry
         psf, sigma = restored.psf, restored.sigma
         measures_stars = isinstance(self.method, MeasuresStars)
+        # Noise over the flux: the unit of the training, on which errors and limits depend.
         noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
@@ -291,6 +292,7 @@ class Restorer:
         photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
         photons = np.where(measures_stars, 0.0, photons)
         flux_error = np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons)
+        # Flags beside those of centring, photometry and method.
         is_unlike = errors.is_unlike_training(noise, distance, restored.outlier_score)
         flags |= photometry.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
@@ -298,6 +300,7 @@ class Restorer:
         raise_flag(flags, StarFlag.SNR_HIGH, (not measures_stars) & is_bright)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
+        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
         columns = {
             "id": stars.id,
             "x": stars.x,
@@ -360,6 +363,8 @@ def restored_by_measurement(
     stars, photometry, border_level = centred.stars, centred.photometry, centred.border_level
     data, noise, is_unusable = _measurable_stamps(centred)
     has_flux = np.isfinite(stars.flux)
+    # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
+    # that of its flux.
     flux = np.where(has_flux, stars.flux, photometry.flux)
     star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
     place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
@@ -373,6 +378,7 @@ def restored_by_measurement(
         sky=stars.background - border_level,
         gain=stars.gain,
     )
+    # Errors of the method, by noise, and those of its model add up.
     measured = estimate.measured
     assert measured is not None and estimate.sigma is not None
     covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
@@ -433,6 +439,7 @@ def _measurable_stamps(centred: CentredStars) -> tuple[np.ndarray, np.ndarray, n
     )
     repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
     data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
+    # Stamps need as many good pixels as the photometry asks for, and any contrast.
     modulus = np.abs(data).max(axis=(1, 2))
     has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
     is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
@@ -460,6 +467,7 @@ def _centre_columns(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.
     names = ("flux", "background", "y", "x")
     columns = {"y_fit": centre[:, 0], "x_fit": centre[:, 1]}
     columns |= {f"{name}_error": sigma[:, i] for i, name in enumerate(names) if i}
+    # ρ_ij = C_ij / (σ_i σ_j).
     for i, j in combinations(range(4), 2):
         product = sigma[:, i] * sigma[:, j]
         correlation = covariance[:, i, j] / np.where(product > 0, product, 1.0)
