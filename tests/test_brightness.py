@@ -55,7 +55,7 @@ def bright_stars(coordinate, change, count=40):
     images = images / images[:, 8:20, 8:20].sum(axis=(1, 2), keepdims=True)
     images = images + 1e-4 * rng.standard_normal(images.shape)
     return BrightStars(
-        wide=flux[:, None, None] * images,
+        stamps=flux[:, None, None] * images,
         peak=np.zeros((count, 2), int),
         centre=centre,
         position=position,
@@ -69,7 +69,7 @@ def bright_stars(coordinate, change, count=40):
 
 
 def fitted(stars, orders):
-    images = (stars.wide / stars.flux[:, None, None])[:, 8:20, 8:20].astype(np.float32)
+    images = (stars.stamps / stars.flux[:, None, None])[:, 8:20, 8:20].astype(np.float32)
     number = np.arange(len(stars))
     of_image = {"bright": stars, "star": number}
     noise = NoiseModel(1.0, 1e9)

@@ -72,8 +72,8 @@ def test_signal_to_noise_is_that_of_king_s_area():
 def test_area_of_a_star_follows_from_its_signal_to_noise():
     """A = (F / (σ S/N))² is King's 1/Σp², where noise is low."""
     stars, noise = bright_stars([[0.2, 0.4], [0.0, -0.3]]), np.array([0.3, 0.7])
-    measured = replace(stars, noise=noise, snr=signal_to_noise(stars.wide, noise))
-    area = [noise_equivalent_px(image / image.sum()) for image in stars.wide]
+    measured = replace(stars, noise=noise, snr=signal_to_noise(stars.stamps, noise))
+    area = [noise_equivalent_px(image / image.sum()) for image in stars.stamps]
     assert measured.area() == pytest.approx(area, rel=1e-3)
 
 
@@ -162,7 +162,7 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     for image in np.flatnonzero(~subpixel)[::9]:
         one = star[image]
         offset = stars.peak[one] - jitter[image]
-        piece = cut(stars.wide[one : one + 1], 16, offset[None])[0]
+        piece = cut(stars.stamps[one : one + 1], 16, offset[None])[0]
         assert realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
     # The others lie anywhere in their pixel, and so do their templates.
     place = windowed_centres(realisation.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
@@ -176,7 +176,7 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
 def test_a_neighbour_s_saturated_rest_makes_no_negative_rates():
     """Splines that move a star ring beside it; the least sky of a new noise is enough for all."""
     stars = bright_stars(np.zeros((1, 2)))
-    stars.wide[0, 16 - 10, 16 + 4] = 5 * stars.flux[0]  # just beyond the stamp
+    stars.stamps[0, 16 - 10, 16 + 4] = 5 * stars.flux[0]  # just beyond the stamp
     stars.noise[:] = 1e-3 * stars.flux
     star = np.zeros(40, dtype=int)
     images, *_ = make_images(

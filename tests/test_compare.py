@@ -27,9 +27,9 @@ MEASURED = {("d", "realisation", "dae"): 0.03, ("d", "realisation", "pca_som"): 
 def errors(seed, dae, noise_seed=1):
     """Errors per star of the untouched image and of a network with mean error `dae`."""
     noisy = np.random.default_rng(noise_seed).gamma(4.0, 0.25, STARS) * 1e-4
-    own = np.random.default_rng(seed).gamma(4.0, 0.25, STARS) * dae
+    dae_errors = np.random.default_rng(seed).gamma(4.0, 0.25, STARS) * dae
     tables = []
-    for method, mse in (("noisy", noisy), ("dae", own)):
+    for method, mse in (("noisy", noisy), ("dae", dae_errors)):
         table = pd.DataFrame({"method": method, "noise_level": 1e-3, "star": range(STARS)})
         tables.append(
             table.assign(field=table.star % FIELDS, mse=mse, ssim=1 - 1e3 * mse, dataset="d")
@@ -111,8 +111,8 @@ def mean_errors(**scale):
     mse = np.array([methods[name] * scale.get(name, 1.0) for name in table.method])
     is_mse = table.metric == "mse"
     # The standard error is half a per cent of what is lost.
-    lost = np.where(is_mse, 1e-6 * mse, 1e-2 * mse)
-    return table.assign(value=np.where(is_mse, lost, 1 - lost), stderr=0.005 * lost)
+    loss = np.where(is_mse, 1e-6 * mse, 1e-2 * mse)
+    return table.assign(value=np.where(is_mse, loss, 1 - loss), stderr=0.005 * loss)
 
 
 @pytest.fixture
@@ -120,15 +120,15 @@ def recorded(tmp_path, monkeypatch):
     """A run of evaluations alone, and a record of tables; a function that writes the run."""
     monkeypatch.setattr(comparison, "seed_scatter", lambda: MEASURED)
     table = tmp_path / "record/tables/psf_metrics.csv"
-    other = mean_errors().assign(dataset="not in the run")
-    write_text(table, pd.concat([mean_errors(), other]).to_csv(index=False))
+    foreign = mean_errors().assign(dataset="not in the run")
+    write_text(table, pd.concat([mean_errors(), foreign]).to_csv(index=False))
 
-    def written(**scale):
+    def write_run(**scale):
         path = tmp_path / "run/evaluation/d/random-realisation.csv"
         write_text(path, mean_errors(**scale).to_csv(index=False))
         return psfdae("compare", tmp_path / "run", tmp_path / "record")
 
-    return written
+    return write_run
 
 
 @pytest.mark.parametrize(
@@ -158,20 +158,20 @@ def test_tables_of_a_run_and_of_the_record_are_compared(recorded, scale, lines):
 
 def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
     """Each split has stars of its own besides: easy ones there, hard ones here."""
-    both = errors(1, 1e-5).assign(reference="realisation")
-    seen = both[both.star < 300].assign(split="random")
-    unseen = both[both.star >= 100].assign(split="held_out")
-    seen.loc[seen.star < 100, "mse"] = 1.0
+    all_errors = errors(1, 1e-5).assign(reference="realisation")
+    random = all_errors[all_errors.star < 300].assign(split="random")
+    unseen = all_errors[all_errors.star >= 100].assign(split="held_out")
+    random.loc[random.star < 100, "mse"] = 1.0
     network = unseen.method == "dae"
     unseen.loc[network, "mse"] *= 1.25
     unseen.loc[unseen.star >= 300, "mse"] = 0.0
-    alone = seen.assign(dataset="one split only")
-    table = held_out_ratios(pd.concat([seen, unseen, alone])).set_index("method")
+    single = random.assign(dataset="one split only")
+    table = held_out_ratios(pd.concat([random, unseen, single])).set_index("method")
     assert set(table.dataset) == {"d"}
     assert table.ratio.to_dict() == pytest.approx({"noisy": 1.0, "dae": 1.25})
     assert table.stderr.to_numpy() == pytest.approx([0, 0], abs=1e-12)
     assert set(table.n) == {200}
-    assert held_out_ratios(alone).empty
+    assert held_out_ratios(single).empty
 
 
 @pytest.fixture

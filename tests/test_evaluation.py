@@ -12,10 +12,10 @@ from psfdae.metrics import (
     all_metrics,
     clustered_mean,
     clustered_ratio,
-    error_correlation,
     mse,
     ssim,
 )
+from psfdae_paper.evaluation.alignment_tables import error_correlation
 from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 

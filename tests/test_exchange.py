@@ -37,12 +37,12 @@ class Moving(FieldPsfs):
         phase = place - np.floor(place + 0.5)
         part = 0.4 + 0.3 * u - 0.2 * v + 0.1 * u * v
         x, y = ((axis - p[:, None]) ** 2 / 2 for p in phase.T)
-        found = 0.0
+        psf = 0.0
         for weight, first, second in ((part, 1.3, 1.3), (1 - part, 1.8, 1.5)):
             rows, columns = np.exp(-y / second**2), np.exp(-x / first**2)
             unit = weight / (2 * np.pi * first * second)
-            found = found + unit[:, None, None] * rows[:, :, None] * columns[:, None]
-        return found
+            psf = psf + unit[:, None, None] * rows[:, :, None] * columns[:, None]
+        return psf
 
 
 @pytest.mark.parametrize(("samples", "limit"), [(8, 1.5e-3), (16, 1e-3)])
@@ -52,12 +52,12 @@ def test_galsim_reads_what_is_written_for_psfex(tmp_path, samples, limit):
     assert exchange.write_psfex(path, model, samples) < 1e-6
     read = des.DES_PSFEx(str(path))
     for x, y in PLACES:
-        wanted = model.psf_at(x, y, 1)
+        expected = model.psf_at(x, y, 1)
         psf = read.getPSF(galsim.PositionD(x + 1, y + 1))
         # Its middle of an even image is half a pixel before index n//2.
         offset = (x - np.floor(x + 0.5) + 0.5, y - np.floor(y + 0.5) + 0.5)
-        seen = psf.drawImage(nx=24, ny=24, scale=1.0, method="no_pixel", offset=offset).array
-        assert np.abs(seen - wanted).max() < limit * wanted.max()
+        values = psf.drawImage(nx=24, ny=24, scale=1.0, method="no_pixel", offset=offset).array
+        assert np.abs(values - expected).max() < limit * expected.max()
 
 
 def test_psfex_comes_back(tmp_path):
@@ -68,11 +68,11 @@ def test_psfex_comes_back(tmp_path):
     assert (back.order, back.stamp_px, back.name) == (2, 24, "m")
     assert np.array(back.field_range()) == pytest.approx(np.array([LOW, HIGH]))
     for samples in (1, 3, 4):
-        wanted, found = (m.psf_at(*PLACES.T, samples) for m in (model, back))
-        assert found.shape == wanted.shape
-        assert np.abs(found - wanted).max() < 1e-3 * wanted.max()
-    edge, beyond = back.psf_at([980.0, 1500.0], [300.0, 300.0], 1)
-    assert beyond == pytest.approx(edge)
+        expected, converted = (m.psf_at(*PLACES.T, samples) for m in (model, back))
+        assert converted.shape == expected.shape
+        assert np.abs(converted - expected).max() < 1e-3 * expected.max()
+    edge, outside = back.psf_at([980.0, 1500.0], [300.0, 300.0], 1)
+    assert outside == pytest.approx(edge)
 
 
 def test_photutils_reads_stdpsf(tmp_path):
@@ -83,9 +83,9 @@ def test_photutils_reads_stdpsf(tmp_path):
     assert grid.grid_xypos == pytest.approx(np.rint(model.grid(7, 5)))
     for x, y in PLACES:
         columns, rows = np.meshgrid(np.rint(x) + np.arange(-8, 9), np.rint(y) + np.arange(-8, 9))
-        wanted = model.psf_at(x, y, 1)[4:21, 4:21]
-        seen = grid.evaluate(columns, rows, 1.0, x, y)
-        assert np.abs(seen - wanted).max() < 1e-3 * wanted.max()
+        expected = model.psf_at(x, y, 1)[4:21, 4:21]
+        values = grid.evaluate(columns, rows, 1.0, x, y)
+        assert np.abs(values - expected).max() < 1e-3 * expected.max()
 
 
 def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
@@ -123,13 +123,13 @@ def psfex(tmp_path):
 
 
 def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
-    done = psfdae("psf", psfex, "--grid", "3x3", "--out", tmp_path / "g.fits")
-    assert done.exit_code == 0, done.output
-    wanted = Moving().psf_at(*np.rint(Moving().grid(3, 3)).T)
-    assert np.abs(fits.getdata(tmp_path / "g.fits") - wanted).max() < 1e-3 * wanted.max()
+    result = psfdae("psf", psfex, "--grid", "3x3", "--out", tmp_path / "g.fits")
+    assert result.exit_code == 0, result.output
+    expected = Moving().psf_at(*np.rint(Moving().grid(3, 3)).T)
+    assert np.abs(fits.getdata(tmp_path / "g.fits") - expected).max() < 1e-3 * expected.max()
     for name, words in (("a.psf", ()), ("a.stdpsf.fits", ("--grid", "3x3"))):
-        done = psfdae("psf", psfex, *words, "--out", tmp_path / name)
-        assert done.exit_code == 0 and (tmp_path / name).is_file(), done.output
+        result = psfdae("psf", psfex, *words, "--out", tmp_path / name)
+        assert result.exit_code == 0 and (tmp_path / name).is_file(), result.output
 
 
 @pytest.mark.parametrize(

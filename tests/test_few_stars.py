@@ -107,7 +107,7 @@ def test_wide_stars_get_wide_stamps_unless_a_size_is_stated(wide):
     stars = psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
     side = stars.settings.framing.stamp_px
     assert side in (48, 64)  # 96.5 and 98.5 % of the light
-    assert stars.candidates.bright.wide.shape[-1] >= side + 16
+    assert stars.candidates.bright.stamps.shape[-1] >= side + 16
     assert any(f"stamps of {side} px" in note for note in stars.notes)
     assert len(stars) >= 15
     off = stars.candidates.bright.centre - stars.candidates.bright.listed

@@ -73,7 +73,7 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
     known = {"peak": peak, "listed": listed, "position": position, "noise": noise}
     nothing = {"centre": listed, "snr": 1 / noise, "row": np.arange(count)}
     nothing["colour"] = np.full(count, np.nan)
-    return BrightStars(wide=images, flux=np.ones(count), **known, **nothing)
+    return BrightStars(stamps=images, flux=np.ones(count), **known, **nothing)
 
 
 def gridded(path):
@@ -86,7 +86,7 @@ def gridded(path):
 
 
 def fitted(stars, orders=(2,), **changed):
-    images = stars.wide[:, 8:18, 8:18].astype(np.float32)
+    images = stars.stamps[:, 8:18, 8:18].astype(np.float32)
     number = np.arange(len(images))
     noise = NoiseModel(1.0, 1e6)
     own = {"bright": stars, "star": number}
@@ -309,8 +309,8 @@ def test_the_unit_of_a_star_does_not_matter_to_the_field():
     noise = np.where(np.arange(60) < 30, 1e-2, 1e-3)
 
     def fit(unit):
-        wide = unit[:, None, None] * alike.wide
-        stars = replace(alike, wide=wide, flux=unit, noise=unit * noise)
+        wide = unit[:, None, None] * alike.stamps
+        stars = replace(alike, stamps=wide, flux=unit, noise=unit * noise)
         return fit_field(stars, 1e6, 14, SIDE, [1], 0.5, 100.0)
 
     one, other = fit(np.ones(60)), fit(unit := 10 ** rng.uniform(-5.0, 5.0, 60))
@@ -331,9 +331,9 @@ def test_order_is_what_the_field_has(chosen):
 def test_photon_noise_takes_no_light_from_the_wings():
     """Weights by a star's own pixels would take half a photon from each, here 3 % of its light."""
     stars, rng, photons, noise = bright(80, varied=False), np.random.default_rng(5), 1e3, 4e-3
-    sigma = np.sqrt(noise**2 + np.maximum(stars.wide, 0.0) / photons)
-    wide = stars.wide + sigma * rng.standard_normal(sigma.shape)
-    stars = replace(stars, wide=wide, noise=np.full(80, noise))
+    sigma = np.sqrt(noise**2 + np.maximum(stars.stamps, 0.0) / photons)
+    wide = stars.stamps + sigma * rng.standard_normal(sigma.shape)
+    stars = replace(stars, stamps=wide, noise=np.full(80, noise))
     model = fit_field(stars, (photons * noise) ** 2, SIDE + 4, SIDE, [0], 0.5, 1e4).model
     middle, place = np.zeros((1, 2)), np.full((1, 2), FIELD / 2)
     core = [
@@ -348,7 +348,7 @@ def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
     stars, rng = bright(60), np.random.default_rng(3)
     angle, flux = rng.uniform(0, 2 * np.pi, 60), rng.uniform(0, 0.3, 60)
     beside = truth(stars.position, 6.5 * np.stack([np.sin(angle), np.cos(angle)], axis=1), WIDE)
-    stars = replace(stars, wide=stars.wide + flux[:, None, None] * beside)
+    stars = replace(stars, stamps=stars.stamps + flux[:, None, None] * beside)
     model = fit_field(stars, 1e6, SIDE + 4, SIDE, [2], 0.5, 100.0).model
     steps = np.arange(-0.5, 0.5, 0.125)
     phase = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -373,7 +373,7 @@ def test_list_of_the_training_is_known(field):
 def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, stars, monkeypatch):
     assert [node_step(fwhm, 0.25) for fwhm in (1.1, 1.7, 2.5)] == [1 / 8, 1 / 5, 0.25]
     assert field.step_px == 0.25
-    monkeypatch.setattr("psfdae.field_law.MAX_STEP_FWHM", 0.2 / size(stars.wide).mean())
+    monkeypatch.setattr("psfdae.field_law.MAX_STEP_FWHM", 0.2 / size(stars.stamps).mean())
     finer = fitted(stars)
     assert finer.step_px == pytest.approx(0.18, abs=0.021)
     assert np.diff(np.unique(finer.places)) == pytest.approx(finer.step_px)

@@ -151,7 +151,7 @@ def test_held_out_stars_are_the_truth_but_for_their_noise(made, candidates):
     framing = SimpleNamespace(stamp_px=16, jitter_px=0)
     still = np.zeros(len(bright), dtype=bool)
     images, *_ = make_images(
-        bright, bright.wide, np.arange(len(bright)), framing, still, stream(1, "t")
+        bright, bright.stamps, np.arange(len(bright)), framing, still, stream(1, "t")
     )
     for image, row, noise in zip(images, bright.row, bright.noise / bright.flux, strict=True):
         error = best_match(made.psf[row], image)
@@ -307,7 +307,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
 
 def test_a_cube_of_stamps_will_do(candidates, tmp_path):
     sky = np.random.default_rng(1).normal(100, 1, (len(candidates.bright), 32, 32))
-    stamps = (candidates.bright.wide + sky).astype(np.float32)
+    stamps = (candidates.bright.stamps + sky).astype(np.float32)
     write_cube(tmp_path / "cube.fits", stamps[:, 3:29, 3:29], PIXSCALE=1.2)
     with few_draws():
         result = run(tmp_path / "cube.fits", "--out", tmp_path / "m", *WORDS, "--method", "gmm")

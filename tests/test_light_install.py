@@ -33,7 +33,7 @@ SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
 """Options that make a command quick; the picture of the first session is of the full image."""
 
 EXAMPLE = "psfdae example-field --out image.fits --catalogue stars.csv"
-BEFORE = {
+PREPARATION = {
     "README": EXAMPLE,
     "docs/python": f"""{EXAMPLE}
 python - <<'END'
@@ -73,14 +73,14 @@ def run(light, folder, script):
     """What a bash script prints in a folder, `psfdae` and `python` being the environment's."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment["PATH"] = f"{light}{os.pathsep}{os.environ['PATH']}"
-    done = captured(["bash", "-euc", script], cwd=folder, env=environment)
-    assert done.returncode == 0, f"{script}\n{done.stdout}{done.stderr}"
-    return done.stdout
+    process = captured(["bash", "-euc", script], cwd=folder, env=environment)
+    assert process.returncode == 0, f"{script}\n{process.stdout}{process.stderr}"
+    return process.stdout
 
 
 def script_of(page):
     """The shell and Python blocks of a page as one bash script, in their order."""
-    lines = BEFORE.get(page, "").splitlines()
+    lines = PREPARATION.get(page, "").splitlines()
     session = LINES_BEFORE.get(page, "")
     for _, language, body in FENCE.findall(read(f"{page}.md")):
         if language == "python":

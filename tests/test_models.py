@@ -82,7 +82,7 @@ def interrupted(data, folder, epoch, **options):
         train(data, folder, report=interrupt, **options)
 
 
-def same(first, second):
+def are_equal(first, second):
     return all(torch.equal(first[key], second[key]) for key in first)
 
 
@@ -145,9 +145,9 @@ def test_baseline_refuses_more_components_than_stars_and_stars_that_are_not_fini
 def test_map_of_mixed_levels_depends_on_the_seed_and_ignores_the_level(data, monkeypatch):
     seeds, settings = [], Baseline(**BASELINE, per_level=False)
 
-    def begun(images, *, seed, **others):
+    def begun(images, *, seed, **options):
         seeds.append(seed)
-        return fit_pca_som(images, seed=seed, **others)
+        return fit_pca_som(images, seed=seed, **options)
 
     monkeypatch.setattr(pca_som, "fit_pca_som", begun)
     fits = [PcaSom.fit(replace(data, seed=seed), settings) for seed in (1, 2, 1)]
@@ -163,11 +163,11 @@ def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path):
     assert fitted.level.tolist() == [1e-3, 5e-3]
     low, high = (fit.predict(data.images) for fit in fitted.fits)
     assert (low != high).any(axis=(1, 2)).all()
-    near = np.where(np.arange(len(data.images)) % 2, 2e-3, 3e-3)
-    found = fitted.predict(data.images, near)
-    assert (found == np.where(near[:, None, None] < 2.2e-3, low, high)).all()
+    levels = np.where(np.arange(len(data.images)) % 2, 2e-3, 3e-3)
+    psfs = fitted.predict(data.images, levels)
+    assert (psfs == np.where(levels[:, None, None] < 2.2e-3, low, high)).all()
     fitted.save(tmp_path / "fit.h5", {})
-    assert (PcaSom.load(tmp_path / "fit.h5").predict(data.images, near) == found).all()
+    assert (PcaSom.load(tmp_path / "fit.h5").predict(data.images, levels) == psfs).all()
 
 
 @pytest.mark.parametrize(("kernel", "shape"), [(9, (13, 17)), (9, (3, 5)), (1, (6, 7))])
@@ -214,7 +214,7 @@ def test_training_learns_and_repeats(data, tmp_path):
     longer = TRAIN.model_copy(update={"epochs": 8})
     first = train(data, tmp_path, longer)
     second = train(data, tmp_path, longer)
-    assert same(first.result, second.result)
+    assert are_equal(first.result, second.result)
     errors = [row["validation_mse"] for row in first.history]
     assert errors[-1] < 0.5 * errors[0]
 
@@ -222,11 +222,11 @@ def test_training_learns_and_repeats(data, tmp_path):
 @pytest.mark.parametrize("optimiser", ["adam", "muon"])
 def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path, optimiser):
     settings, epochs = TRAIN.model_copy(update={"optimiser": optimiser}), []
-    whole = train(data, tmp_path, settings)
+    complete = train(data, tmp_path, settings)
     interrupted(data, tmp_path, 2, train_config=settings)
     resumed = train(data, tmp_path, settings, report=lambda row: epochs.append(row["epoch"]))
     assert epochs == [2, 3]
-    assert same(whole.result, resumed.result)
+    assert are_equal(complete.result, resumed.result)
 
 
 def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
@@ -235,11 +235,11 @@ def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
     references[data.validation] = 0.0
     contrary = replace(data, references=references)
     quick = TRAIN.model_copy(update={"lr": 1e-2})
-    whole = train(contrary, tmp_path, quick)
-    errors = [row["validation_mse"] for row in whole.history]
+    complete = train(contrary, tmp_path, quick)
+    errors = [row["validation_mse"] for row in complete.history]
     assert errors[0] < min(errors[1:])
     interrupted(contrary, tmp_path, 2, train_config=quick)
-    assert same(whole.result, train(contrary, tmp_path, quick).result)
+    assert are_equal(complete.result, train(contrary, tmp_path, quick).result)
 
 
 @pytest.mark.parametrize("change", [lambda raw: raw, lambda raw: raw[:-1] + b"x"])
@@ -273,7 +273,7 @@ def killed(model):
 
 
 def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(dae_network, "build_dae", lambda *given: killed(build_dae(*given)))
+    monkeypatch.setattr(dae_network, "build_dae", lambda *arguments: killed(build_dae(*arguments)))
     with pytest.raises(TrainingError, match="died in all 2 attempts"):
         train(data, tmp_path)
 
@@ -307,14 +307,14 @@ def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
     # The dead one, the one that was interrupted, and that again.
     assert len(attempts) == 3 and torch.equal(attempts[1], attempts[2])
     assert resumed.attempt == 1
-    assert same(whole.result, resumed.result)
+    assert are_equal(whole.result, resumed.result)
 
 
 @pytest.mark.parametrize("kind", ["fixed", "fresh"])
 def test_noise_is_the_same_in_every_epoch_only_if_fixed(data, kind):
     settings = TRAIN.model_copy(update={"noise": kind, "batch": 250})
-    training, again = (DaeTraining(data, DAE, settings, 3, 0) for _ in range(2))
-    batches = [next(t.batches(epoch))[0] for t, epoch in ((training, 0), (training, 1), (again, 1))]
+    training, twin = (DaeTraining(data, DAE, settings, 3, 0) for _ in range(2))
+    batches = [next(t.batches(epoch))[0] for t, epoch in ((training, 0), (training, 1), (twin, 1))]
     first, second, repeated = (noisy.sum((1, 2, 3)).sort()[0] for noisy in batches)
     assert torch.equal(first, second) == (kind == "fixed")
     assert torch.equal(second, repeated)
@@ -328,8 +328,8 @@ def test_errors_of_faint_stars_count_less_by_a_power_of_their_noise(data):
         sorted((1 / data.levels) / np.mean(1 / data.levels)), rel=1e-6
     )
     errors = ((training.model(noisy) - target) ** 2).mean(dim=(1, 2, 3))
-    wanted = (errors * weight.ravel()).mean().item()
-    assert training.loss((noisy, target, weight), 1).item() == pytest.approx(wanted, rel=1e-5)
+    mean_error = (errors * weight.ravel()).mean().item()
+    assert training.loss((noisy, target, weight), 1).item() == pytest.approx(mean_error, rel=1e-5)
 
 
 def test_steps_of_muon_are_along_orthogonal_matrices():
@@ -337,8 +337,8 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
     matrices = [torch.randn(shape, generator=generator) for shape in shapes]
     for matrix, step in zip(matrices, orthogonal(matrices), strict=True):
         assert step.shape == matrix.shape
-        left, _, right = torch.linalg.svd(matrix, full_matrices=False)
-        along = left.T @ step @ right.T
+        u, _, vt = torch.linalg.svd(matrix, full_matrices=False)
+        along = u.T @ step @ vt.T
         assert along.diagonal().min() > 0.65 and along.diagonal().max() < 1.3
         assert (along - along.diagonal().diag()).abs().max() < 1e-3
 
@@ -353,10 +353,13 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
 def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
     settings = TRAIN.model_copy(update={"crop_epochs": 0.75, "epochs": len(sides)})
     data = replace(data, reference=reference)
-    training, whole = DaeTraining(data, DAE, settings, 3, 0), DaeTraining(data, DAE, TRAIN, 3, 0)
+    training, uncropped = (
+        DaeTraining(data, DAE, settings, 3, 0),
+        DaeTraining(data, DAE, TRAIN, 3, 0),
+    )
     for epoch, side in enumerate(sides):
         for part, full in zip(
-            next(training.batches(epoch))[:2], next(whole.batches(epoch))[:2], strict=True
+            next(training.batches(epoch))[:2], next(uncropped.batches(epoch))[:2], strict=True
         ):
             edge = (16 - side) // 2
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
@@ -364,11 +367,13 @@ def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
 
 def test_training_goes_on_from_another_network(data):
     anew = DaeTraining(data, DAE, TRAIN, 3, 0)
-    known = DaeTraining(data, DAE, TRAIN, 4, 0).model
-    training = DaeTraining(replace(data, start=Fitted(known, "mean")), DAE, TRAIN, 3, 0)
-    for started, weight in zip(training.model.parameters(), known.parameters(), strict=True):
+    first_network = DaeTraining(data, DAE, TRAIN, 4, 0).model
+    training = DaeTraining(replace(data, start=Fitted(first_network, "mean")), DAE, TRAIN, 3, 0)
+    for started, weight in zip(
+        training.model.parameters(), first_network.parameters(), strict=True
+    ):
         assert torch.equal(started, weight) and started.data_ptr() != weight.data_ptr()
-    assert not torch.equal(anew.model.layers[1].weight, known.layers[1].weight)
+    assert not torch.equal(anew.model.layers[1].weight, first_network.layers[1].weight)
     assert torch.equal(next(training.batches(0))[0], next(anew.batches(0))[0])
 
 
@@ -377,13 +382,13 @@ def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):
     for optimiser in ("adam", "muon"):
         settings = TRAIN.model_copy(update={"optimiser": optimiser, "schedule": "constant"})
         training = DaeTraining(data, DAE, settings, 3, 0)
-        before = [p.detach().clone() for p in training.model.parameters()]
+        start = [p.detach().clone() for p in training.model.parameters()]
         training._step(next(training.batches(0)), 1)
-        pairs = zip(training.model.parameters(), before, strict=True)
+        pairs = zip(training.model.parameters(), start, strict=True)
         steps[optimiser] = [(p - b).detach() for p, b in pairs]
-    inner = [f"layers.{i}.weight" for i in range(1, len(training.model.layers) - 1)]
+    hidden = [f"layers.{i}.weight" for i in range(1, len(training.model.layers) - 1)]
     for (name, _), a, m in zip(training.model.named_parameters(), *steps.values(), strict=True):
-        if name in inner:
+        if name in hidden:
             assert not torch.equal(a, m)
             # Adam's first step is the learning rate in every element.
             assert 0.1 < (m.square().mean() / a.square().mean()).sqrt() < 0.4
@@ -408,9 +413,9 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
     save_weights(path, state, {"seed": 1})
     weights = load_weights(path)
     assert all(np.array_equal(weights[name], tensor) for name, tensor in state.items())
-    whole = path.read_bytes()
-    flipped = (whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :] for k in (300, 1000, 2400))
-    for damaged in (*flipped, whole[:-5], whole[:20], b"hello"):
+    content = path.read_bytes()
+    flipped = (content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :] for k in (300, 1000, 2400))
+    for damaged in (*flipped, content[:-5], content[:20], b"hello"):
         path.write_bytes(damaged)
         with pytest.raises(ProductError, match=r"dae\.safetensors: damaged"):
             load_weights(path)

@@ -20,15 +20,15 @@ def points():
 
 def test_principal_axes_are_scikit_learn_s(points):
     mean, axes = principal_axes(points + 7.0, 4)
-    theirs = PCA(4, svd_solver="full").fit(points + 7.0)
-    assert mean == pytest.approx(theirs.mean_)
-    assert axes == pytest.approx(theirs.components_, abs=1e-9)
+    expected = PCA(4, svd_solver="full").fit(points + 7.0)
+    assert mean == pytest.approx(expected.mean_)
+    assert axes == pytest.approx(expected.components_, abs=1e-9)
 
 
 def test_the_map_is_minisom_s_to_the_last_bit(points):
-    given = dict(sigma=1.2, learning_rate=0.5)
-    theirs = MiniSom(5, 4, 6, random_seed=3, **given)
-    theirs.random_weights_init(points)
-    theirs.train(points, 3, random_order=True, use_epochs=True)
-    own = self_organised(points, (5, 4), 3, seed=3, **given)
-    assert (own == theirs.get_weights().reshape(20, 6)).all()
+    settings = dict(sigma=1.2, learning_rate=0.5)
+    minisom = MiniSom(5, 4, 6, random_seed=3, **settings)
+    minisom.random_weights_init(points)
+    minisom.train(points, 3, random_order=True, use_epochs=True)
+    nodes = self_organised(points, (5, 4), 3, seed=3, **settings)
+    assert (nodes == minisom.get_weights().reshape(20, 6)).all()

@@ -214,11 +214,11 @@ def test_bad_pixels_cost_no_stars_and_nan_is_as_a_mask(clean, part):
     # What fills a pixel is near what was there: far nearer than the sky is.
     bright, whole = masked.candidates.bright, before.candidates.bright
     _, same = cKDTree(whole.position).query(bright.position)
-    true = whole.wide[same]
+    true = whole.stamps[same]
     core = np.zeros_like(bright.bad)
     core[:, 13:20, 13:20] = True
     chosen = bright.bad & core & (true > 50 * bright.noise[:, None, None])
-    ratio = bright.wide[chosen] / true[chosen] - 1
+    ratio = bright.stamps[chosen] / true[chosen] - 1
     assert chosen.sum() >= 5 * part / 0.01 and np.abs(ratio).max() < 0.3
     off = bright.centre - whole.centre[same]
     assert np.abs(off - np.rint(off)).max() < 0.03  # a stamp may be cut about the next pixel
@@ -264,7 +264,7 @@ def test_completed_stars_are_their_neighbours_scaled():
     position, nan = rng.uniform(0, 300, (20, 2)), np.full((20, 2), np.nan)
     known = (position, flux, np.full(20, 5.0), flux / 30, np.arange(20), nan, nan[:, 0])
     found, missing = completed(BrightStars(hurt, zero, shift, *known, bad), 16, 3)
-    assert found.wide[7, 16, 17] == pytest.approx(wide[7, 16, 17], rel=0.02)
+    assert found.stamps[7, 16, 17] == pytest.approx(wide[7, 16, 17], rel=0.02)
     part = shape[7, 16, 17] / shape[7, 8:24, 8:24].sum()
     assert missing[7] == pytest.approx(part, rel=0.03) and missing.sum() == missing[7]
     assert found.framed(20)[1].sum() == 20 * 400 - 1
@@ -380,4 +380,4 @@ def test_pixels_far_below_the_sky_are_left_out(clean):
     (index,) = np.flatnonzero(bright.row == 44)
     assert "left out: 1 dead pixels" in "\n".join(stars.notes)
     assert bright.bad[index].sum() == 1
-    assert bright.wide[index][bright.bad[index]] > -5 * bright.noise[index]
+    assert bright.stamps[index][bright.bad[index]] > -5 * bright.noise[index]

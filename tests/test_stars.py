@@ -55,10 +55,10 @@ def test_jitter_is_uniform_over_nine_positions():
 
 def test_random_aberrations_have_their_relative_spread():
     static = np.array([0.5, 4.0, 4.196, 1.813, -0.113])
-    drawn = perturb(np.tile(static, (20000, 1)), 0.1, stream(1, "aberration"))
-    assert drawn.mean(axis=0) == pytest.approx(static, rel=4e-3)
-    assert drawn.std(axis=0) == pytest.approx(0.1 * np.abs(static), rel=0.02)
-    correlation = np.corrcoef(drawn.T) - np.eye(5)
+    coefficients = perturb(np.tile(static, (20000, 1)), 0.1, stream(1, "aberration"))
+    assert coefficients.mean(axis=0) == pytest.approx(static, rel=4e-3)
+    assert coefficients.std(axis=0) == pytest.approx(0.1 * np.abs(static), rel=0.02)
+    correlation = np.corrcoef(coefficients.T) - np.eye(5)
     assert np.abs(correlation).max() < 0.03
 
 
@@ -161,8 +161,8 @@ def test_noise_is_that_of_the_star_in_every_split_and_independent_between_sets(
 
 def test_every_level_of_a_band_is_drawn_as_often():
     levels = np.array([3e-4, 5e-4, 7e-4, 9e-4])
-    drawn = mixed_levels(levels, 40000, stream(1, "levels"))
-    values, counts = np.unique(drawn, return_counts=True)
+    star_levels = mixed_levels(levels, 40000, stream(1, "levels"))
+    values, counts = np.unique(star_levels, return_counts=True)
     assert (values == levels).all()
     assert counts == pytest.approx(np.full(4, 10000), abs=5 * np.sqrt(10000))
 
@@ -208,10 +208,10 @@ def test_subpixel_phase_moves_the_grid_and_keeps_the_frame(scene1, templates):
     propagation, peak = templates
     phase = draw_phase(len(peak), stream(1, "phase"))
     assert np.abs(phase).max() <= 0.5
-    moved = propagation.brightest(phase_px=phase)
-    assert np.abs(moved - peak).max() <= 1 + np.abs(peak).max()
-    stamps = propagation.stamps(16, moved + phase)
+    half_step = propagation.brightest(phase_px=phase)
+    assert np.abs(half_step - peak).max() <= 1 + np.abs(peak).max()
+    stamps = propagation.stamps(16, half_step + phase)
     brightest = stamps.reshape(len(stamps), -1).max(axis=1)
     assert (stamps[:, 8, 8] >= (1 - 2 * scene1.framing.tie) * brightest).all()
-    whole = propagation.brightest(phase_px=np.ones_like(phase))
-    assert (whole == peak - 1).all()
+    full_step = propagation.brightest(phase_px=np.ones_like(phase))
+    assert (full_step == peak - 1).all()

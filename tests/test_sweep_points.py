@@ -95,8 +95,8 @@ def test_point_is_measured_on_both_parts(point):
         for row in table[table.metric.isin(["mse", "ssim"])].itertuples():
             value = metrics[f"{part}_{row.metric}_{row.noise_level:g}"]
             assert value == pytest.approx(row.value, rel=1e-7)
-        both = [metrics[f"{part}_mse_{level:g}"] for level in LEVELS]
-        assert metrics[f"{part}_mse"] == pytest.approx(np.sqrt(both[0] * both[1]))
+        by_level = [metrics[f"{part}_mse_{level:g}"] for level in LEVELS]
+        assert metrics[f"{part}_mse"] == pytest.approx(np.sqrt(by_level[0] * by_level[1]))
 
 
 def test_early_stopping_is_recorded(point):
@@ -151,7 +151,7 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
     counts = {"states": 200, "validation": 60, "test": 50}
     data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in counts.items()}
     folder = tmp_path / "points/0123456789ab"
-    given = ("preset=smoke", "train_noise_trained.mirrors=false", "perceptron.widths=[8,8]")
+    overrides = ("preset=smoke", "train_noise_trained.mirrors=false", "perceptron.widths=[8,8]")
     task = Task(
         *("noise_trained", "random", "realisation"),
         data=data,
@@ -159,7 +159,7 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    settings = load_stage(point_groups("noise_trained"), (*CHOICE, *given))
+    settings = load_stage(point_groups("noise_trained"), (*CHOICE, *overrides))
     stage.point(settings, "noise_trained", {}, {}, task)
     metrics = read_json(folder / "result.json")["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):
@@ -214,13 +214,13 @@ DEFINITION = {
     "space": {"width": {"values": [4, 8]}, "train.lr": {"values": [0.001, 0.004]}},
 }
 OUTCOMES = [(4, 0.001, 3e-5), (4, 0.004, 2e-5), (8, 0.001, None), (8, 0.004, 1e-5)]
-GIVEN = ("preset=smoke", "train.epochs=3")
+OVERRIDES = ("preset=smoke", "train.epochs=3")
 
 
 def summarise(root, outcomes=OUTCOMES, **changes):
     out = root / "sweeps/tried"
     files = write_points(root, outcomes)
-    sweep_summary.summary("tried", {**DEFINITION, **changes}, GIVEN, files, out)
+    sweep_summary.summary("tried", {**DEFINITION, **changes}, OVERRIDES, files, out)
     return out
 
 
@@ -238,8 +238,8 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     for number, result in enumerate(results):
         result["metrics"]["test_mse"] = number
     for direction, number in (("minimize", 3), ("maximize", 0)):
-        best = sweep_summary.choose(results, "validation_mse", direction)
-        assert best["point"] == f"{number:012x}"
+        best_point = sweep_summary.choose(results, "validation_mse", direction)
+        assert best_point["point"] == f"{number:012x}"
 
 
 def test_sweep_is_a_parent_run_with_a_child_per_point(site):  # noqa: F811

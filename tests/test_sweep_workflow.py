@@ -64,30 +64,30 @@ def killed(smoke, configure, tmp_path_factory):
     assert run.poll() is None, "the sweep ended too early"
     run.kill()
     run.wait()
-    before = finished(folder)
+    first = finished(folder)
     assert not (folder / SUMMARY).exists()
     subprocess.run(**locked(folder, SUMMARY), check=True, capture_output=True)
-    return folder, before
+    return folder, first
 
 
 def test_killed_sweep_is_finished_and_keeps_finished_points(killed):
-    folder, before = killed
-    after = finished(folder)
-    assert len(after) == 4
+    folder, first = killed
+    final = finished(folder)
+    assert len(final) == 4
     # At most the point in whose last moments Snakemake was killed.
-    assert sum(after[point] != ended for point, ended in before.items()) <= 1
+    assert sum(final[point] != ended for point, ended in first.items()) <= 1
     table = pd.read_csv(folder / SUMMARY)
-    assert set(table.point) == set(after)
+    assert set(table.point) == set(final)
     assert (table.status == "finished").all()
-    best = table[table.best == "yes"].iloc[0]
-    assert best.validation_mse == table.validation_mse.min()
+    best_row = table[table.best == "yes"].iloc[0]
+    assert best_row.validation_mse == table.validation_mse.min()
 
 
 def test_main_workflow_repeats_the_best_point_to_the_last_digit(killed):
     folder, _ = killed
     overrides = " ".join(best_overrides(folder / "results", "tried"))
-    best = yaml.safe_load((folder / "results/sweeps/tried/best.yaml").read_text())
-    point = folder / "results/sweeps/tried/points" / best["point"]
+    best_point = yaml.safe_load((folder / "results/sweeps/tried/best.yaml").read_text())
+    point = folder / "results/sweeps/tried/points" / best_point["point"]
     name = "results/evaluation/dataset3/random-realisation.csv"
     snakemake(folder, name, overrides=overrides)
     rows = [line for line in (folder / name).read_text().splitlines() if ",dae," in line]

@@ -29,16 +29,16 @@ TEST = 24
 def stars():
     """Simulated stars, the last ones for tests: configuration, columns, images."""
     config = load(["dataset=dataset3", "preset=smoke"])
-    drawn = {name: c.values for name, c in fresh_stars(config, "trial", 120 + TEST).items()}
-    margin = (drawn["framed"].shape[-1] - config.framing.stamp_px) // 2
-    cuts = crop_jittered(drawn["framed"].astype(float), np.array([0, 0]), margin)
-    return config, drawn, normalise_flux(cuts)[0].astype(np.float32)
+    columns = {name: c.values for name, c in fresh_stars(config, "trial", 120 + TEST).items()}
+    margin = (columns["framed"].shape[-1] - config.framing.stamp_px) // 2
+    cuts = crop_jittered(columns["framed"].astype(float), np.array([0, 0]), margin)
+    return config, columns, normalise_flux(cuts)[0].astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def data(stars):
-    config, drawn, images = stars
-    iy, ix = np.divmod(drawn["field_index"], config.grid.points)
+    config, columns, images = stars
+    iy, ix = np.divmod(columns["field_index"], config.grid.points)
     number = np.arange(120)
     return TrainingSet(
         *(images, images, number[:100], number[100:], np.array([LEVEL]), noise_model(config)),
@@ -62,12 +62,12 @@ def noisy(stars):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
-    config, drawn, images = stars
-    model, field = stamp_model(config), drawn["field_index"][-TEST:]
+    config, columns, images = stars
+    model, field = stamp_model(config), columns["field_index"][-TEST:]
     _, slopes = model.derivatives(
-        model.coefficients(model.standardised(drawn["seidel"][-TEST:]), field),
+        model.coefficients(model.standardised(columns["seidel"][-TEST:]), field),
         monomial_coefficients(np.eye(5), model.field[field][:, None]),
-        drawn["peak"][-TEST:],
+        columns["peak"][-TEST:],
     )
     variance = noise_model(config).variance(images[-TEST:].reshape(TEST, -1), LEVEL)
     floor = local_error(slopes, model.sd, variance)
@@ -79,49 +79,53 @@ def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
 
 
 def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, noisy):
-    moved = noisy[:3].copy()
-    moved[1] = np.roll(moved[1], 5, axis=0)
+    images = noisy[:3].copy()
+    images[1] = np.roll(images[1], 5, axis=0)
     for kind in fitted.values():
         position = data.positions[-TEST:][:3]
-        psf = kind.estimate(moved, LEVEL, position)
+        psf = kind.estimate(images, LEVEL, position)
         # One image alone: others beside it would round it otherwise.
-        mixture = kind.mixture.restore(moved[1:2], LEVEL, position[1:2])[0]
+        mixture = kind.mixture.restore(images[1:2], LEVEL, position[1:2])[0]
         assert (psf.psf[1] == mixture).all()
-        whole = kind.mixture.restore(moved, LEVEL, position)
-        assert np.abs(psf.psf[0] - whole[0]).max() > 1e-5
+        psfs = kind.mixture.restore(images, LEVEL, position)
+        assert np.abs(psf.psf[0] - psfs[0]).max() > 1e-5
         assert psf.explained.tolist() == [True, False, True]
 
 
 def test_sigma_covers_the_errors(stars, data, fitted, noisy):
     """Two thirds of the pixels; those of a star err together, and there are few stars."""
     for kind in fitted.values():
-        found = kind.estimate(noisy, LEVEL, data.positions[-TEST:])
-        inside = np.abs(found.psf - stars[2][-TEST:]) <= found.sigma
+        estimate = kind.estimate(noisy, LEVEL, data.positions[-TEST:])
+        inside = np.abs(estimate.psf - stars[2][-TEST:]) <= estimate.sigma
         assert 0.5 < inside.mean() < 0.85
 
 
 def test_one_posterior_serves_both_references(data, fitted, noisy):
     """That of the template is the mean of static PSFs, each of which is possible."""
     kind = fitted["wavefront_position"]
-    other = replace(kind, data=replace(data, reference="template"))
+    for_templates = replace(kind, data=replace(data, reference="template"))
     position = data.positions[-TEST:][:4]
     posterior = kind.posterior(noisy[:4], LEVEL, position)
-    found = other.estimate_from_posterior(*posterior, noisy[:4], LEVEL, position)
+    estimate = for_templates.estimate_from_posterior(*posterior, noisy[:4], LEVEL, position)
     field = (position @ [1, kind.bank.points]).astype(int)
     static = kind.static[field].astype(float)
-    apart = np.abs(found.psf[:, None] - static).max(axis=(2, 3)).min(axis=1)
-    assert (apart < 0.05 * static.max(axis=(1, 2, 3))).all()
-    assert found.psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-4)
+    distance = np.abs(estimate.psf[:, None] - static).max(axis=(2, 3)).min(axis=1)
+    assert (distance < 0.05 * static.max(axis=(1, 2, 3))).all()
+    assert estimate.psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, name):
-    _, drawn, _ = stars
+    _, columns, _ = stars
     modes, missed = fitted[name].modes(noisy, LEVEL, data.positions[-TEST:])
     assert missed.size == 0
-    truth = fitted[name].model.standardised(drawn["seidel"][-TEST:])
-    own = modes.take(np.flatnonzero(modes.field == drawn["field_index"][-TEST:][modes.star]))
-    first = own.take(sampling.largest_of_groups(own.star, own.evidence, 1))
+    truth = fitted[name].model.standardised(columns["seidel"][-TEST:])
+    modes_of_field = modes.take(
+        np.flatnonzero(modes.field == columns["field_index"][-TEST:][modes.star])
+    )
+    first = modes_of_field.take(
+        sampling.largest_of_groups(modes_of_field.star, modes_of_field.evidence, 1)
+    )
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0

@@ -1,4 +1,8 @@
-"""`BrightStars`: stars of an image that are bright enough to learn the PSF from."""
+"""`BrightStars`: stars of an image that are bright enough to learn the PSF from.
+
+In: stamps and measurements of stars (`image.selection`), or a product "stars". Out: the same stars
+aligned, framed, or as places on which the PSF may depend.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ MOST_SKY = 1e12
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
     """Return instrumental magnitudes of fluxes in counts, which are taken to be positive."""
+    # m = −2.5 lg F; a flux of 0 gets the magnitude of the least one that is above it.
     return np.asarray(-2.5 * np.log10(np.maximum(flux, 1e-300)))
 
 
@@ -36,7 +41,7 @@ class BrightStars:
 
     Attributes
     ----------
-    wide : ndarray, shape (n, s, s)
+    stamps : ndarray, shape (n, s, s)
         Sky-subtracted stamps with a margin, in the unit of `flux`.
     peak : ndarray of int, shape (n, 2)
         Brightest pixel (row, column) from index (s//2, s//2).
@@ -53,10 +58,10 @@ class BrightStars:
     colour : ndarray, shape (n,)
         Colour in the star list, NaN where there is none.
     bad : ndarray of bool, shape (n, s, s)
-        Pixels of `wide` that were not measured, and have values of nearby stars; by default none.
+        Pixels of `stamps` that were not measured, and have values of nearby stars; by default none.
     """
 
-    wide: np.ndarray
+    stamps: np.ndarray
     peak: np.ndarray
     centre: np.ndarray
     position: np.ndarray
@@ -69,26 +74,30 @@ class BrightStars:
     bad: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        if self.bad.shape != self.wide.shape:
-            object.__setattr__(self, "bad", np.zeros(self.wide.shape, dtype=bool))
+        # Stars that were made without a mask were measured in all pixels.
+        if self.bad.shape != self.stamps.shape:
+            object.__setattr__(self, "bad", np.zeros(self.stamps.shape, dtype=bool))
 
     @classmethod
     def of_product(cls, stars: Product) -> BrightStars:
         """Read the bright stars of a product "stars" of an image, which has no centroids."""
         names = ("peak", "position", "snr", "row", "listed", "flux", "colour", "bad")
         arrays = {name: stars[name] for name in names}
-        flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
         # The product has stamps and noise of stars of flux 1.
-        stamps, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
-        return cls(**arrays, centre=centre, wide=stamps, noise=noise)
+        flux = arrays["flux"]
+        arrays["stamps"] = stars["wide"] * flux[:, None, None]
+        arrays["noise"] = stars["noise"] * flux
+        return cls(**arrays, centre=np.full(arrays["position"].shape, np.nan))
 
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
         """Return several sets with the same margin as one."""
-        return cls(*(np.concatenate([getattr(s, f.name) for s in several]) for f in fields(cls)))
+        return cls(
+            *(np.concatenate([getattr(stars, f.name) for stars in several]) for f in fields(cls))
+        )
 
     def __len__(self) -> int:
-        return len(self.wide)
+        return len(self.stamps)
 
     def of(self, selected: np.ndarray) -> BrightStars:
         """Return some of the stars, by a mask or by indices."""
@@ -97,6 +106,7 @@ class BrightStars:
     @property
     def place(self) -> np.ndarray:
         """x, y, magnitude and colour, (n, 4); an unknown colour is the median of the others."""
+        # A colour that nobody knows should change the PSF as little as may be.
         has_colour = np.isfinite(self.colour)
         median = np.median(self.colour[has_colour]) if has_colour.any() else np.nan
         return places(self.position, self.flux, np.where(has_colour, self.colour, median))
@@ -107,7 +117,7 @@ class BrightStars:
 
     def aligned(self) -> np.ndarray:
         """Return the stars with flux 1, moved to the common centre (s//2, s//2), (n, s, s)."""
-        return np.asarray(shift_stamps(self.wide, -self.centre) / self.flux[:, None, None])
+        return np.asarray(shift_stamps(self.stamps, -self.centre) / self.flux[:, None, None])
 
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
         """Return the photons per pixel whose Poisson noise is that of the sky and of reading out.
@@ -115,6 +125,7 @@ class BrightStars:
         `gain` is in electrons per count; `otherwise` is the result where it is unknown. It is at
         most `MOST_SKY`, beside which the photons of no star matter.
         """
+        # Variance in electrons², N = (σ gain)²: a Poisson variable of mean N has it.
         if gain is None:
             return otherwise
         return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
@@ -122,15 +133,16 @@ class BrightStars:
     def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return frames (n, side, side) with the brightest pixel at index (side//2, side//2).
 
-        The second array is True for pixels that were measured. Pixels outside of `wide` are 0.
+        The second array is True for pixels that were measured. Pixels outside of the stamps are 0.
         """
-        # Rows and columns of each frame in stamps with a margin as wide as a frame, NaN in the
-        # images and False among the bad pixels.
+        # Rows and columns of each frame in stamps with a margin as wide as a frame, in which images
+        # are NaN and no pixel is bad.
         margin = ((0, 0), (side, side), (side, side))
-        start = side + self.wide.shape[-1] // 2 - side // 2
+        start = side + self.stamps.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
         frame = np.arange(len(self))[:, None, None], rows[:, :, None], columns[:, None, :]
-        images = np.pad(self.wide, margin, constant_values=np.nan)[frame]
+        images = np.pad(self.stamps, margin, constant_values=np.nan)[frame]
+        # Pixels outside of the stamps were not measured.
         is_inside = np.isfinite(images)
         bad = np.pad(self.bad, margin)[frame]
         return np.where(is_inside, images, 0.0).astype(np.float64), is_inside & ~bad

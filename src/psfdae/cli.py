@@ -111,6 +111,7 @@ def refusal(error: Exception) -> str | None:
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):
         return None if error.errno is None else str(error)
+    # A package of an extra, which the message says how to install.
     if isinstance(error, ModuleNotFoundError):
         return missing(error, "this command")
     if isinstance(error, Error):
@@ -289,6 +290,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
             values[name] = dataclass_type(**{key: values.pop(key) for key in names})
         function(**config, **values)
 
+    # The last word is the command's own; the others are those of its groups.
     help_text = cleandoc(function.__doc__ or "")
     return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
 
@@ -340,6 +342,7 @@ def program(*functions: Callable[..., Any]) -> None:
 
 def _parameters(function: Any) -> list[tuple[str, Any, Any]]:
     """Return name, type and default of each parameter of a function or dataclass."""
+    # Annotations are texts in the modules, and classes only now.
     parameters = signature(function).parameters
     hints = get_type_hints(function, include_extras=True)
     return [(name, hints.get(name, Any), p.default) for name, p in parameters.items()]
@@ -357,6 +360,7 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
     if attributes.pop("argument", False):
         nargs = -1 if attributes.pop("multiple", False) else 1
         return click.Argument([name], required=required, nargs=nargs, **attributes)
+    # The help shows a default, unless it is that nothing is given.
     attributes["required"] = required
     if not required and default is not False and default not in (None, ()):
         attributes = {"default": default, "show_default": True, **attributes}
@@ -383,6 +387,7 @@ def _click_type(hint: Any) -> tuple[Any, dict[str, Any]]:
     # The first type of a union that is not None: None is the default of an option.
     if get_origin(hint) in (Union, types.UnionType):
         return _click_type(next(part for part in get_args(hint) if part is not type(None)))
+    # One of some words.
     if get_origin(hint) is Literal:
         return click.Choice(get_args(hint)), {}
     if get_origin(hint) is tuple:

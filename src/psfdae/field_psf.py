@@ -290,7 +290,8 @@ class _Alternating:
     ) -> None:
         self.prior = prior
         self.images, self.measured = stars.framed(side)
-        self.around_px = max(stars.wide[0].size - stamp_px**2, 1)  # of which the sky is the median
+        # Pixels around the stamp, of which the sky is the median.
+        self.around_px = max(stars.stamps[0].size - stamp_px**2, 1)
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
         self.stamp_px, self.smoothness = stamp_px, smoothness

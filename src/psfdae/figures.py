@@ -1,4 +1,7 @@
-"""Style of all figures, angles in the field, and the figure of restored stars."""
+"""Style of all figures, and the figure of restored stars.
+
+In: stamps of stars, or a function that draws. Out: figures of one width and style, and PNG files.
+"""
 
 from __future__ import annotations
 
@@ -24,40 +27,31 @@ WIDTH_IN = 8.0
 SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
 """Colours of lines that are not methods."""
 
-REFERENCES = {
-    "realisation": "against the star's own noise-free image (realisation)",
-    "template": "against the static PSF of the field (template)",
-}
-"""Names of the references in titles."""
-
-RC: dict[str, Any] = {
-    "figure.dpi": 150,
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.labelsize": 9,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.fontsize": 8,
-    "figure.titlesize": 11,
-    "axes.grid": False,
-    "grid.color": "#d9d9d9",
-    "grid.linewidth": 0.6,
-}
-
-"""Settings of matplotlib for every figure."""
-
 Drawing = Callable[..., "Figure"]
 
 
 def in_style() -> AbstractContextManager[None]:
-    """Return a context with the style `RC`, whatever matplotlibrc the user has."""
+    """Return a context with the style of all figures, whatever matplotlibrc the user has."""
     import matplotlib.style
 
-    return matplotlib.style.context(["default", RC])
+    style = {
+        "figure.dpi": 150,
+        "font.size": 9,
+        "axes.titlesize": 10,
+        "axes.labelsize": 9,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "legend.fontsize": 8,
+        "figure.titlesize": 11,
+        "axes.grid": False,
+        "grid.color": "#d9d9d9",
+        "grid.linewidth": 0.6,
+    }
+    return matplotlib.style.context(["default", style])
 
 
 def styled(draw: Drawing) -> Drawing:
-    """Decorate a function that draws a figure, so that it uses the style `RC`."""
+    """Decorate a function that draws a figure, so that it uses the style of all figures."""
 
     @wraps(draw)
     def wrapped(*args: Any, **kwargs: Any) -> Figure:
@@ -72,6 +66,7 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    # A canvas of its own draws it without a screen.
     figure = Figure(figsize=(WIDTH_IN, height_in), **kwargs)
     FigureCanvasAgg(figure)
     return figure
@@ -87,27 +82,6 @@ def as_png(figure: Figure, dpi: int = 150) -> bytes:
     return content.getvalue()
 
 
-def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return field angles in degrees, or in arc minutes if the whole field is within ±1°.
-
-    Parameters
-    ----------
-    field : ndarray
-        Angles in radians.
-
-    Returns
-    -------
-    values : ndarray
-        Angles in this unit.
-    unit : str
-        "deg" or "arcmin".
-    """
-    degrees = np.rad2deg(field)
-    if np.abs(degrees).max() >= 1.0:
-        return degrees, "deg"
-    return 60.0 * degrees, "arcmin"
-
-
 def write_png(figure: Figure, out: Path) -> None:
     """Write a matplotlib figure atomically; the same figure gives the same bytes."""
     write_bytes(out, as_png(figure))
@@ -116,9 +90,7 @@ def write_png(figure: Figure, out: Path) -> None:
 # Restored stars: rows of stamps, a column for each star.
 
 STAMP_MAP = "magma"
-
-STAMP_PART = 0.97
-"""Side of a stamp over that of its cell in a row; the rest is a gap."""
+"""Colour map of stamps."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +113,11 @@ class StripRow:
     images: np.ndarray
     mse: np.ndarray | None = None
     own_scale: bool = False
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of the label: a part in brackets has a line of its own."""
+        return self.label.replace(" (", "\n(").splitlines()
 
 
 def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
@@ -198,21 +175,26 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
         Title of the figure.
     """
     # Margins, height of a row and of the numbers below it, in inches.
-    longest = max(len(line) for row in rows for line in _lines(row.label))
+    longest = max(len(line) for row in rows for line in row.lines)
     margin_left, margin_right = max(1.0, 0.07 * longest), 0.1
     top, bottom, cell, text = 0.85, 0.35, 0.86, 0.17
+    # Numbers stand below the rows that have errors.
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
+    # Cells of equal width from the labels to the right margin.
     axes = in_inches(figure)
     step = (WIDTH_IN - margin_left - margin_right) / len(columns)
-    middle = margin_left + step * (np.arange(len(columns)) + 0.5 * STAMP_PART)
+    # Stamps fill 97 % of their cells.
+    middle = margin_left + step * (np.arange(len(columns)) + 0.5 * 0.97)
     y = height - top
+    # From top to bottom: headings, and each row with its errors below.
     peak = rows[0].images.max(axis=(1, 2))
     for x, name in zip(middle, columns, strict=True):
         axes.text(x, y + 0.02, name, ha="center", va="bottom", fontsize=8)
     for row in rows:
         y -= cell
         draw_row(axes, row, (margin_left, y), (step, cell), peak)
+        # Three digits of the MSE in units of 1e-6.
         if row.mse is not None:
             for x, error in zip(middle, row.mse, strict=True):
                 number = f"{1e6 * error:#.3g}".rstrip(".")
@@ -258,11 +240,14 @@ def draw_row(
     peak : ndarray, shape (n,)
         Value of the brightest colour for each star.
     """
-    side = STAMP_PART * min(cell)
-    lower = corner[1] + 0.5 * (STAMP_PART * cell[1] - side)
+    # The square of a stamp, in the middle of 97 % of its cell; the remainder is a gap.
+    width, height = (0.97 * length for length in cell)
+    side = min(width, height)
+    lower = corner[1] + 0.5 * (height - side)
     for column, image in enumerate(row.images):
+        # From 0 to the brightest pixel; a square root shows faint wings, too.
         scale = image.max() if row.own_scale else peak[column]
-        x = corner[0] + column * cell[0] + 0.5 * (STAMP_PART * cell[0] - side)
+        x = corner[0] + column * cell[0] + 0.5 * (width - side)
         axes.imshow(
             np.sqrt(np.clip(image / scale, 0.0, 1.0)),
             extent=(x, x + side, lower, lower + side),
@@ -272,12 +257,5 @@ def draw_row(
             vmax=1.0,
             interpolation="nearest",
         )
-    label = "\n".join(_lines(row.label))
-    axes.text(
-        corner[0] - 0.06, lower + 0.5 * side, label, ha="right", va="center", ma="right", fontsize=9
-    )
-
-
-def _lines(label: str) -> list[str]:
-    """Return the lines of a label: a part in brackets has a line of its own."""
-    return label.replace(" (", "\n(").splitlines()
+    x, y, label = corner[0] - 0.06, lower + 0.5 * side, "\n".join(row.lines)
+    axes.text(x, y, label, ha="right", va="center", ma="right", fontsize=9)

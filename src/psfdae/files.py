@@ -123,6 +123,7 @@ def write_columns(
 
 def write_parquet(path: str | Path, table: DataFrame) -> None:
     """Write a DataFrame as Parquet with checksums, atomically."""
+    # pyarrow writes pages one after the other, each with a checksum.
     with atomic_path(path) as temporary:
         table.to_parquet(temporary, index=False, write_page_checksum=True)
 
@@ -297,6 +298,7 @@ class Product:
     kind: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
+        # A large product is read piece by piece, when its arrays are used.
         if name not in self.arrays and self.kind:
             self.arrays.update(read_product(self.path, self.kind, (name,)).arrays)
         return self.arrays[name]
@@ -321,6 +323,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
     """
     import h5py
 
+    # Reading a damaged chunk raises OSError, because its checksum is wrong.
     path = Path(path)
     try:
         with h5py.File(path, "r") as file:

@@ -1,4 +1,8 @@
-"""Image metrics per star, their means with clustered standard errors, correlations of errors."""
+"""Image metrics per star, and their means with clustered standard errors.
+
+In: restored PSFs and noise-free references, (n, d, d). Out: one value of each metric for each
+star, and rows of tables.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +14,19 @@ import numpy as np
 if TYPE_CHECKING:
     from psfdae.method import Estimate
 
-SSIM_WINDOW = 7
-"""Side of the uniform SSIM window in pixels, scikit-image's default."""
-
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return the mean squared error of every stamp, shape (n,)."""
+    # ⟨(x̂ − x)²⟩, in double precision: errors of 1e-8 are squared.
     difference = estimates.astype(np.float64) - references
     return np.asarray((difference**2).mean(axis=(1, 2)))
 
 
 def ssim(
-    estimates: np.ndarray, references: np.ndarray, *data_ranges: float | np.ndarray
+    estimates: np.ndarray,
+    references: np.ndarray,
+    *data_ranges: float | np.ndarray,
+    window_px: int = 7,
 ) -> np.ndarray:
     """Return the structural similarity of every stamp, as scikit-image does by default.
 
@@ -34,6 +39,8 @@ def ssim(
     estimates, references : ndarray, shape (n, d, d)
     *data_ranges : float or ndarray, shape (n,)
         Dynamic ranges; one value or one per star.
+    window_px : int
+        Side of the uniform window, by default that of scikit-image.
 
     Returns
     -------
@@ -46,15 +53,16 @@ def ssim(
         If a stamp is smaller than the window or a range is not positive.
     """
     count, side, _ = references.shape
-    if side < SSIM_WINDOW:
-        raise ValueError(f"stamps of {side} px are smaller than the SSIM window, {SSIM_WINDOW} px")
+    if side < window_px:
+        raise ValueError(f"stamps of {side} px are smaller than the SSIM window, {window_px} px")
+    # One range for each star.
     ranges = np.array([np.broadcast_to(r, count) for r in data_ranges], np.float64)
     if not (ranges > 0).all():
         raise ValueError(f"SSIM data_range must be positive, got {ranges.min()}")
     # Matrix that averages the pixels of an axis over the window: column j is 1/window at the pixels
     # of the window at place j, of which there are side − window + 1.
-    place = np.arange(side)[:, None] - np.arange(side - SSIM_WINDOW + 1)
-    window_mean = ((place >= 0) & (place < SSIM_WINDOW)) / SSIM_WINDOW
+    place = np.arange(side)[:, None] - np.arange(side - window_px + 1)
+    window_mean = ((place >= 0) & (place < window_px)) / window_px
 
     def mean(images: np.ndarray) -> np.ndarray:
         """Return the mean of every window, transposed: only its sum over all places is used."""
@@ -73,7 +81,7 @@ def ssim(
             # Sample covariances over the window: n/(n − 1) times ⟨xy⟩ − ⟨x⟩⟨y⟩.
             mean_x, mean_y = mean(x), mean(y)
             product, squares = 2 * mean_x * mean_y, mean_x**2 + mean_y**2
-            sample = SSIM_WINDOW**2 / (SSIM_WINDOW**2 - 1)
+            sample = window_px**2 / (window_px**2 - 1)
             covariance = sample * (2 * mean(x * y) - product)
             variances = sample * (mean(x * x + y * y) - squares)
             for row, data_range in zip(out, ranges[:, block, None, None] / unit, strict=True):
@@ -83,11 +91,6 @@ def ssim(
                 similar /= (squares + c1) * (variances + c2)
                 row[block] = similar.mean(axis=(1, 2))
     return out if len(out) > 1 else out[0]
-
-
-def peak_range(references: np.ndarray) -> np.ndarray:
-    """Return the maximum minus minimum of every reference, shape (n,)."""
-    return np.asarray(references.max(axis=(1, 2)) - references.min(axis=(1, 2)))
 
 
 def all_metrics(
@@ -101,7 +104,9 @@ def all_metrics(
         `mse`; `ssim` with the calibrated range, `ssim_unit` with range 1 and
         `ssim_peak` with each reference's own maximum minus minimum.
     """
-    similar = ssim(estimates, references, data_range, 1.0, peak_range(references))
+    # Three dynamic ranges share the moving sums.
+    peak = references.max(axis=(1, 2)) - references.min(axis=(1, 2))
+    similar = ssim(estimates, references, data_range, 1.0, peak)
     names = ("ssim", "ssim_unit", "ssim_peak")
     return {"mse": mse(estimates, references), **dict(zip(names, similar, strict=True))}
 
@@ -113,6 +118,7 @@ def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[st
     whether the star is `explained`, 1 or 0.
     """
     metrics = all_metrics(estimate.psf, truth, data_range)
+    # Part of the pixels whose error is within the stated σ; 68 % if it is right.
     if estimate.sigma is not None:
         inside = np.abs(estimate.psf - truth) <= estimate.sigma
         metrics["coverage68"] = inside.mean(axis=(1, 2))
@@ -130,6 +136,7 @@ def summarised(
 
     Each is added to a copy of `row`.
     """
+    # A row for each metric.
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
@@ -159,6 +166,7 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
     _, member = np.unique(cluster, return_inverse=True)
     sums = np.bincount(member, weights=values - mean)
     groups = sums.size
+    # One cluster says nothing of the scatter between clusters.
     if groups < 2:
         return mean, float("nan")
     variance = groups / (groups - 1) * float((sums**2).sum()) / values.size**2
@@ -180,77 +188,8 @@ def clustered_ratio(
     cluster : ndarray of int, shape (n,)
         Field of every star.
     """
+    # The mean of (v − R w)/w̄ is 0; its error is that of the ratio.
     ratio = float(values.mean() / denominators.mean())
     residuals = (values - ratio * denominators) / denominators.mean()
     _, stderr = clustered_mean(residuals, cluster)
     return ratio, stderr
-
-
-def error_correlation(
-    errors: np.ndarray, confidence: float = 0.95
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Pearson correlations of signed errors with intervals from Fisher's z.
-
-    z = artanh r is nearly normal with the standard error 1/√(n − 3) for
-    independent, jointly normal errors (Fisher 1921, Metron 1, 3).
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n, k)
-        One row per sample, one column per parameter, any unit.
-    confidence : float
-        Probability of the two-sided interval, 0 … 1.
-
-    Returns
-    -------
-    matrix, low, high : ndarray, shape (k, k)
-        Correlations and the ends of their intervals; 1 on the diagonal. A column
-        without variance correlates with nothing: its row and column are NaN,
-        diagonal included, and no warning is given. With fewer than four samples
-        the intervals are NaN off the diagonal.
-
-    Raises
-    ------
-    ValueError
-        If there is no sample, or an error is not finite.
-    """
-    from scipy.stats import norm
-
-    errors = np.asarray(errors, np.float64)
-    if not errors.size or not np.isfinite(errors).all():
-        raise ValueError(f"errors of shape {errors.shape}: must be at least one and all finite")
-    count = len(errors)
-    varies = np.ptp(errors, axis=0) > 0
-    # In units of the largest deviation, so that no square under- or overflows.
-    deviation = errors - errors.mean(axis=0)
-    deviation = deviation / np.where(varies, np.abs(deviation).max(axis=0), 1.0)
-    length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
-    matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
-    np.fill_diagonal(matrix, 1.0)
-    with np.errstate(divide="ignore"):
-        z = np.arctanh(matrix)
-    # Interval z ± q/√(n − 3); with fewer than four samples there is none.
-    half = norm.isf(0.5 * (1.0 - confidence)) / np.sqrt(max(count - 3, 1))
-    low, high = np.tanh(z - half), np.tanh(z + half)
-    if count < 4:
-        off_diagonal = ~np.eye(len(matrix), dtype=bool)
-        low[off_diagonal] = high[off_diagonal] = np.nan
-    for array in (matrix, low, high):
-        array[~varies, :] = array[:, ~varies] = np.nan
-    return matrix, low, high
-
-
-def seed_stderr(scatter: float, metric: str, mean: float) -> float:
-    """Return the standard deviation of a mean error between seeds of a training.
-
-    Parameters
-    ----------
-    scatter : float
-        Standard deviation of the MSE between seeds, over the MSE; NaN if it was not measured.
-    metric : str
-        "mse", or an SSIM, of which 1 − SSIM is nearly proportional to the MSE; NaN for others.
-    mean : float
-        Mean of the metric.
-    """
-    error = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
-    return scatter * error

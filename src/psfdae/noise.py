@@ -1,5 +1,8 @@
 """Photon noise of a star on a bright sky.
 
+In: noise-free PSFs of sum 1, (n, d, d), and noise levels. Out: variances and noisy images of
+pixels; for bright stars, the noise in the scatter of their images.
+
 The paper's noise level λ is the RMS of a flux-normalised image's pixels up to
 a factor, σ = κλ, and larger for smaller stars. A star of flux F photons on a
 sky of B photons per pixel gives exactly that,
@@ -38,13 +41,13 @@ class NoiseModel:
 
     def flux(self, level: np.ndarray | float) -> np.ndarray:
         """Return the flux F in photons inside the stamp of a star of noise level λ."""
-        photons: np.ndarray = np.sqrt(self.background) / (
-            self.kappa * np.asarray(level, np.float64)
-        )
-        return photons
+        # F = √B / (κ λ).
+        noise = self.kappa * np.asarray(level, np.float64)
+        return np.asarray(np.sqrt(self.background) / noise)
 
     def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
         """Return the pixel variance of a normalised image; `level` broadcasts against `psf`."""
+        # σ² = (κλ)² + p/F.
         return np.asarray((self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level))
 
     def draw(
@@ -61,6 +64,7 @@ class NoiseModel:
         -------
         ndarray, shape (B, ...), float32
         """
+        # n ~ Poisson(F p + B), and the image (n − B)/F.
         flux = _per_image(self.flux(level), psf)
         # A pixel of a measured star may lie so far below the sky that no rate of photons is left.
         photons = rng.poisson(np.maximum(flux * psf + self.background, 0.0))
@@ -74,6 +78,7 @@ class NoiseModel:
         With 1e4 photons of sky in a pixel the two distributions differ by 1 % in skewness,
         and the draw takes a tenth of the time.
         """
+        # p + σ z, in place and in single precision: training draws millions of pixels.
         sigma: np.ndarray = np.sqrt(self.variance(psf, _per_image(level, psf)))
         noisy = sigma.astype(np.float32)
         noisy *= rng.standard_normal(psf.shape, dtype=np.float32)
@@ -98,12 +103,9 @@ def noise_equivalent_px(psf: np.ndarray) -> float:
     mean of their images would be wider than each of them, because they lie at different places in
     their stamps.
     """
+    # n/Σp² over all images is 1 over the mean of Σp².
     count = len(psf) if psf.ndim == 3 else 1
     return count / float(np.square(psf, dtype=np.float64).sum())
-
-
-PHASES = 17
-"""Number of shifts from 0 to ½ pixel at which the correlation of shifted noise is tabulated."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,11 @@ class OwnNoise:
         sky = part * noise**2
         # Correlation of pixels: that of shifted white noise, averaged over the images' shifts, for
         # pairs of pixels (a, c) along rows and (b, d) along columns.
-        place = np.rint(2 * (PHASES - 1) * np.abs(self.phase[images])).astype(int)
-        share = np.zeros((PHASES, PHASES))
-        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), 1e-300))
         along = shifted_noise(side)
+        phases = len(along)
+        place = np.rint(2 * (phases - 1) * np.abs(self.phase[images])).astype(int)
+        share = np.zeros((phases, phases))
+        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), 1e-300))
         pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(share, along, 1))
         # RMS of each pixel, by the sky and by the photons of the mean star.
         photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
@@ -163,11 +166,12 @@ class OwnNoise:
 
 
 @cache
-def shifted_noise(side: int) -> np.ndarray:
-    """Return the covariance of white noise along an axis that splines shift, (PHASES, d, d).
+def shifted_noise(side: int, phases: int = 17) -> np.ndarray:
+    """Return the covariance of white noise along an axis that splines shift, (phases, d, d).
 
     Shifts are 0 … ½ pixel. The axis is the middle third of a longer one, so that no edge counts.
     """
-    moving = moving_matrices(3 * side, np.linspace(0.0, 0.5, PHASES))
+    moving = moving_matrices(3 * side, np.linspace(0.0, 0.5, phases))
+    # A matrix M makes noise of covariance M Mᵀ of white noise.
     rows = moving[:, side : 2 * side]
     return np.asarray(rows @ rows.transpose(0, 2, 1))

@@ -97,6 +97,7 @@ def deciding(group: Group) -> dict[str, Any]:
     """Return the settings of a group and its groups, without those that change no result."""
     tree = group.model_dump()
     for name, field in type(group).model_fields.items():
+        # Groups within the group have such settings of their own.
         value = getattr(group, name)
         if NEUTRAL in field.metadata:
             del tree[name]

@@ -1,4 +1,7 @@
-"""Parts of a set of stars for training, validation and test, and random centring errors."""
+"""Parts of a set of stars for training, validation and test, and random centring errors.
+
+In: numbers or field points of stars, and a seed. Out: indices of the stars of each part.
+"""
 
 from __future__ import annotations
 
@@ -35,6 +38,7 @@ class Split:
 
 def random_split(count: int, train: int, test: int, validation_fraction: float, seed: int) -> Split:
     """Split stars at random, as in the paper: training has stars of every test star's field."""
+    # Of the stars in random order: validation, the rest of the training, then the test.
     order = stream(seed, "split", "random").permutation(count)
     validation_count = round(validation_fraction * train)
     return Split(
@@ -74,13 +78,13 @@ def held_out_split(
     grid : ndarray of int, shape (F, 2)
         (ix, iy) of every field.
     """
+    # Fields of the test, and the other ones in random order.
     test_field = held_out_fields(grid)
     training_field = stream(seed, "split", "held_out").permutation(np.flatnonzero(~test_field))
-    # At least one field is left for validation.
+    # At least one field is left for validation; whole fields go to each part.
     validation_count = max(1, round(validation_fraction * training_field.size))
-    validation_field = training_field[:validation_count]
     is_test = test_field[star_field]
-    is_validation = np.isin(star_field, validation_field)
+    is_validation = np.isin(star_field, training_field[:validation_count])
     return Split(
         fit=np.flatnonzero(~is_test & ~is_validation),
         validation=np.flatnonzero(is_validation),

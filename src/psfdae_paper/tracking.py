@@ -325,6 +325,7 @@ def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
     # A row of the summary for each point, and a run of its own.
     table = read_table(summary, "point", "status", dtype=str)
+    # The parent has the split and the reference of its points, which all are the same.
     points = [_run_of_point(results, name, point) for point in table.point]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
     paths = [*tables, *sorted((folder / "figures").glob("*.png"))]

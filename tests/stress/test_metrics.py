@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from psfdae.metrics import all_metrics, error_correlation, ssim
+from psfdae.metrics import all_metrics, ssim
+from psfdae_paper.evaluation.alignment_tables import error_correlation
 
 EPS = float(np.finfo(np.float64).eps)
 C1 = 0.01**2  # of SSIM's luminance term (Wang et al. 2004, IEEE Trans. Image Process. 13, 600)

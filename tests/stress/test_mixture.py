@@ -13,11 +13,11 @@ def test_limits(bench, record):
     images = bench.seidel.images
     mixture, truth = fit(bench, images, [8]), images[:40]
     # Stars of the fit: so few span no more than themselves, others would be projected.
-    none, what = mixture.predict(truth, 1e-3 * bench.level), "largest change over the peak"
-    record.close("λ → 0", what, none, truth, 1e-4, over=truth.max())
-    mean, lost = images.mean(axis=0), mixture.predict(truth, 1e6 * bench.level)
-    what = "difference from the mean star over its peak"
-    record.close("λ → ∞", what, lost, mean, 100 * EPS, over=mean.max())
+    none, quantity = mixture.predict(truth, 1e-3 * bench.level), "largest change over the peak"
+    record.close("λ → 0", quantity, none, truth, 1e-4, over=truth.max())
+    mean, without_signal = images.mean(axis=0), mixture.predict(truth, 1e6 * bench.level)
+    quantity = "difference from the mean star over its peak"
+    record.close("λ → ∞", quantity, without_signal, mean, 100 * EPS, over=mean.max())
     for factor in (1e-2, 1e2):
         noisy = bench.noise.draw(truth, factor * bench.level, bench.stream("mixture"))
         psf = mixture.predict(noisy, factor * bench.level)
@@ -30,16 +30,16 @@ def test_few_and_equal_stars(bench, record):
     images = bench.seidel.images[:31]
     noisy = bench.noise.draw(images, bench.level, bench.stream("few"))
     equal = fit(bench, np.repeat(images[:1], 30, axis=0), [1, 4]).predict(noisy, bench.level)
-    what, peak = "difference of all estimates from the star over its peak", images[0].max()
-    record.close("equal stars", what, equal, images[0], 100 * EPS, over=peak)
+    quantity, peak = "difference of all estimates from the star over its peak", images[0].max()
+    record.close("equal stars", quantity, equal, images[0], 100 * EPS, over=peak)
     lonely = images.copy()
     lonely[0] = 0.0
     lonely[0, 0, 0] = 10.0  # so far off that no other cluster pays
-    apart = fit(bench, lonely, [2])
-    found = apart.estimate(noisy, bench.level)
-    finite = all(np.isfinite(a).all() for a in (found.psf, found.sigma, found.evidence))
+    fitted = fit(bench, lonely, [2])
+    estimate = fitted.estimate(noisy, bench.level)
+    finite = all(np.isfinite(a).all() for a in (estimate.psf, estimate.sigma, estimate.evidence))
     record.equal(
-        "a cluster of one star", "finite estimates", finite and apart.count.min() == 1, True
+        "a cluster of one star", "finite estimates", finite and fitted.count.min() == 1, True
     )
     with record.refused("more clusters than stars", FitError):
         fit(bench, images, [500])

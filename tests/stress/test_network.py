@@ -16,7 +16,7 @@ from stress.bench import THREADS
 
 pytestmark = pytest.mark.slow
 NARROW = 4  # channels of the networks whose accuracy does not matter
-SEEDS, EPOCHS, SEEN = 10, 3, 2000  # trainings, their epochs, or more: so many stars in all
+SEEDS, EPOCHS, SHOWN_STARS = 10, 3, 2000  # trainings, their epochs, or more: so many stars in all
 DEATHS = 0.1  # part of the trainings that die and start again, seen at rates of 3e-3 to 5e-3
 LIVE = "a live network"
 
@@ -48,11 +48,11 @@ def test_broken_training(bench, record):
 def test_seeds(bench, record):
     """The final validation error of short trainings that differ in the seed, and of one again."""
     data, batch = bench.training_set(len(bench.seidel.images)), bench.config.train.batch
-    settings = short(bench, epochs=max(EPOCHS, SEEN // len(data.images)), batch=batch)
-    chosen = [int(seed) for seed in bench.stream("seeds").integers(2**31, size=SEEDS)]
+    settings = short(bench, epochs=max(EPOCHS, SHOWN_STARS // len(data.images)), batch=batch)
+    seeds = [int(seed) for seed in bench.stream("seeds").integers(2**31, size=SEEDS)]
     run = partial(score, data, bench.config.dae, settings, bench.folder)
     with ProcessPoolExecutor(THREADS, mp_context=get_context("spawn")) as pool:
-        *scores, again = pool.map(run, [*chosen, chosen[0]])
+        *scores, repeated = pool.map(run, [*seeds, seeds[0]])
     errors, restarts, weights = zip(*scores, strict=True)
     case = f"{SEEDS} short trainings"
     # Deaths that one set of trainings in a thousand exceeds.
@@ -62,10 +62,10 @@ def test_seeds(bench, record):
     mean_star = data.images[data.fit].mean(axis=0, dtype=np.float64)
     ignorant = ((data.images[data.validation].astype(np.float64) - mean_star) ** 2).mean()
     record.at_most(case, "largest validation MSE", max(errors), ignorant)
-    what = "spread of the validation MSE, standard deviation over mean"
-    record.within(case, what, np.std(errors, ddof=1) / np.mean(errors), 1e-6, 0.5)
+    quantity = "spread of the validation MSE, standard deviation over mean"
+    record.within(case, quantity, np.std(errors, ddof=1) / np.mean(errors), 1e-6, 0.5)
     record.equal(case, "equal networks among the seeds", len(weights) - len(set(weights)), 0)
-    record.equal("the first seed again", "same weights and error", again == scores[0], True)
+    record.equal("the first seed again", "same weights and error", repeated == scores[0], True)
 
 
 def score(data, dae, settings, folder, seed):
@@ -90,10 +90,10 @@ def train(bench, data, settings):
     return train_dae(data, narrow(bench), settings, 0, bench.folder / "checkpoint.pt", "stability")
 
 
-def fate(bench, *how):
+def fate(bench, *settings):
     """What becomes of a training, in words."""
     try:
-        outcome = train(bench, *how)
+        outcome = train(bench, *settings)
     except Exception as error:  # which one is the question
         return type(error).__name__
     config = narrow(bench)

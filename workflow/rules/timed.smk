@@ -209,7 +209,7 @@ rule predict_strange:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings("prediction.strange", f"dataset={TIMED_DATASET}"),
+        config=lambda w: settings("prediction.outliers", f"dataset={TIMED_DATASET}"),
         source=program_code("prediction.strange", []),
         program=program("prediction.strange"),
         inputs=as_options,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,9 +20,6 @@ from psfdae.moments import robust_scatter
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
-
-COSMIC_SIGMA = 6.0
-"""Height in σ from which a pixel is a cosmic ray, a hot pixel or, below its neighbours, dead."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def blank_areas(
     values = np.where(bad, np.nan, image)
     solid = np.zeros(values.shape, dtype=bool)
     if min(values.shape) >= 8:
-        solid = _in_bands(_constant_squares, values) & np.isfinite(values)
+        solid = _in_bands(constant_squares, values) & np.isfinite(values)
     solid |= (values == values[:1]).all(axis=0)
     solid |= (values == values[:, :1]).all(axis=1, keepdims=True)
     if not solid.any():
@@ -154,6 +152,7 @@ def blank_areas(
         outside_values = values[sample][outside[sample]]
         if not outside_values.size or (saturate is not None and value >= saturate):
             continue
+        # Above the sky, only what touches the edge of the image: a core of a star does not.
         if value > float(np.median(outside_values)):
             label, _ = ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
@@ -170,7 +169,7 @@ def blank_areas(
     return areas
 
 
-def _constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
+def constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     """Return the pixels (h, w) of squares that have one value; noise fills none of 8 px with one.
 
     NaN differs from itself.
@@ -186,7 +185,7 @@ def _constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     return np.asarray(ndimage.maximum_filter(corner, side, origin=-1))
 
 
-def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, most: float = 0.3) -> None:
+def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.3) -> None:
     """Refuse an image of which more than a part of the good pixels have the least value.
 
     Pixels that lie together, as the even sky of an image without noise does, do not count, nor do
@@ -196,13 +195,14 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, most: float = 0.3) ->
     ----------
     image : ndarray, shape (h, w)
     bad : ndarray of bool, shape (h, w)
-    most : float
+    share_max : float
         Part from which the sky was clipped.
 
     Raises
     ------
     ClippedSkyError
     """
+    # Part of the good pixels that has the least value.
     good = ~bad
     count = np.count_nonzero(good)
     if not count:
@@ -210,7 +210,7 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, most: float = 0.3) ->
     least_value = float(image.min(where=good, initial=np.inf))
     at_least = image == least_value
     share = float(np.count_nonzero(at_least & good) / count)
-    if share < most:
+    if share < share_max:
         return
     # Neighbours change between least and other values 2p(1 − p) times where noise decides it.
     pairs = ~(bad[:, 1:] | bad[:, :-1])
@@ -279,7 +279,9 @@ def overscan(
 # Single pixels.
 
 
-def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def dead_pixels(
+    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, least_sigma: float = 6.0
+) -> np.ndarray:
     """Find the pixels (h, w) that are 6 σ below the least of their eight neighbours.
 
     Parameters
@@ -288,6 +290,8 @@ def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.nda
         The noise is that of pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
+    least_sigma : float
+        Least depth of a dead pixel, in σ.
     """
     from scipy import ndimage
 
@@ -295,10 +299,11 @@ def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.nda
     around[1, 1] = False
 
     def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        # First against the noise of the square, then against that of the pixels around.
         clean = interpolated(band, bad)[0]
         depth = ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > COSMIC_SIGMA * noise) & ~bad)
-        deep = depth[row, column] > COSMIC_SIGMA * _noise_around(clean, noise, row, column)
+        row, column = np.nonzero((depth > least_sigma * noise) & ~bad)
+        deep = depth[row, column] > least_sigma * _noise_around(clean, noise, row, column)
         dead = np.zeros(clean.shape, dtype=bool)
         dead[row[deep], column[deep]] = True
         return dead
@@ -314,7 +319,7 @@ def cosmic_rays(
 ) -> np.ndarray:
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
-    A pixel counts if its Laplacian L⁺ is `COSMIC_SIGMA` times the noise, and larger than the fine
+    A pixel counts if its Laplacian L⁺ is 6 times the noise, and larger than the fine
     structure F of the image around it by a factor: 5, or four times what the bright
     sources of this image have where they are so narrow that it is more. Stars are thus never
     taken for cosmic rays, and where they are nearly as narrow as these, only very high ones are
@@ -340,19 +345,25 @@ def cosmic_rays(
     if sharpness > 10.0:  # one pixel has nearly all light of a star
         return np.zeros(image.shape, dtype=bool)
     ratio = max(5.0, 4.0 * sharpness)
-
-    def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        return _cosmic_rays_of_band(band, bad, noise, saturate, ratio)
-
+    find = partial(cosmic_rays_of_band, saturate=saturate, ratio=ratio)
     return np.asarray(_in_bands(find, image, bad, noise) & ~bad)
 
 
-def _cosmic_rays_of_band(
-    band: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None, ratio: float
+def cosmic_rays_of_band(
+    band: np.ndarray,
+    bad: np.ndarray,
+    noise: np.ndarray,
+    saturate: float | None,
+    ratio: float,
+    least_sigma: float = 6.0,
 ) -> np.ndarray:
-    """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio."""
+    """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio.
+
+    They are `least_sigma` times as high as the noise, or half of it beside a higher one.
+    """
     from scipy import ndimage
 
+    # No cosmic ray is beside a bad pixel, or at the edge of a saturated star.
     clean = interpolated(band, bad)[0]
     forbidden = ndimage.binary_dilation(bad)
     if saturate is not None:
@@ -365,19 +376,19 @@ def _cosmic_rays_of_band(
     # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
     for _ in range(8):
         edge = edges(clean)
-        row, column = np.nonzero((edge > 0.5 * COSMIC_SIGMA * noise) & ~forbidden & ~cosmic)
+        row, column = np.nonzero((edge > 0.5 * least_sigma * noise) & ~forbidden & ~cosmic)
         if not row.size:
             break
         sigma = _noise_around(clean, noise, row, column)
         height, structure = _contrast(clean, edge, row, column)
         # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
         limit = ratio * (np.maximum(structure, 0.0) + sigma)
-        sharp = (height > COSMIC_SIGMA * sigma) & (height > limit)
+        sharp = (height > least_sigma * sigma) & (height > limit)
         new = np.zeros_like(cosmic)
         new[row[sharp], column[sharp]] = True
         # Beside a cosmic ray, half the height is enough for both.
         is_beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
-        is_beside &= (height > 0.5 * COSMIC_SIGMA * sigma) & (height > 0.5 * limit)
+        is_beside &= (height > 0.5 * least_sigma * sigma) & (height > 0.5 * limit)
         new[row[is_beside], column[is_beside]] = True
         if not new.any():
             break
@@ -424,12 +435,11 @@ def edges(image: np.ndarray) -> np.ndarray:
     quarters, each cut off at 0.
     """
     padded = np.pad(image, 1, mode="edge")
-    above, below = padded[:-2, 1:-1], padded[2:, 1:-1]
-    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
+    # 2 x − a − b of the neighbours a above or below and b on the left or right, ≥ 0.
     quarters = [
         np.maximum(2.0 * image - vertical - horizontal, 0.0)
-        for vertical in (above, below)
-        for horizontal in (left, right)
+        for vertical in (padded[:-2, 1:-1], padded[2:, 1:-1])
+        for horizontal in (padded[1:-1, :-2], padded[1:-1, 2:])
     ]
     return np.asarray(sum(quarters) / 8.0)
 
@@ -442,6 +452,7 @@ def _contrast(
     L⁺ less its median over 5 × 5 pixels is free of smooth sources. F is the median over 3 × 3
     pixels less that over 7 × 7 of these medians.
     """
+    # Windows of 5 × 5 px of L⁺ and of 9 × 9 px of the image, 4096 at a time to bound the memory.
     height, structure = np.empty((2, len(row)))
     wide_edge, padded = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
     fives = np.lib.stride_tricks.sliding_window_view(wide_edge, (5, 5))
@@ -462,6 +473,7 @@ def _noise_around(
 
     In the light of a bright star the noise is larger than in the sky.
     """
+    # Median |x₁ − x₂| of the neighbours in 9 × 9 px, over √2.
     scatter = np.empty(len(row))
     padded = np.pad(image, 4, mode="edge")
     nines = np.lib.stride_tricks.sliding_window_view(padded, (9, 9))

@@ -77,13 +77,16 @@ class Catalogue:
         ObservationError
             If there is no such column, or it does not hold one number for each star.
         """
+        # One value for each star.
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
+        # Numbers; masked ones are missing.
         if column.dtype.kind in "iuf":
             return np.ma.filled(np.ma.array(column).astype(np.float64), np.nan)
         if column.dtype.kind not in "SUO":
             raise ObservationError(self.path, f"column {name!r} does not hold numbers")
+        # Numbers written as text, as when one row has a word.
         numbers = np.full(len(column), np.nan)
         for row, text in enumerate(_texts(column)):
             try:
@@ -99,6 +102,7 @@ class Catalogue:
     def coordinates(self, name: str) -> np.ndarray:
         """Return a column of finite numbers, (n,), NaN elsewhere; an error if all are NaN."""
         numbers = self.numbers(name, strict=False)
+        # Infinite numbers are as good as none.
         finite = np.isfinite(numbers)
         if not finite.any():
             raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
@@ -108,6 +112,7 @@ class Catalogue:
         """Return a column of pixel positions, as `coordinates`; units but pixels are refused."""
         from astropy import units
 
+        # No unit is as good as pixels.
         unit = getattr(self._column(name), "unit", None)
         pixel_unit = units.Unit(unit or "", parse_strict="silent")
         # A unit that astropy does not know may be a word for pixels.
@@ -137,6 +142,7 @@ class Catalogue:
         sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
         off the sphere are NaN, and an error if all are.
         """
+        # Angles beyond a pole are no place on the sky.
         ra = self._angles(positions.first, "hourangle")
         dec = self._angles(positions.second, "deg")
         on_sphere = np.abs(dec) <= 90
@@ -153,6 +159,7 @@ class Catalogue:
         from astropy import units
         from astropy.coordinates import Angle
 
+        # Sexagesimal text.
         column = self._column(name)
         is_text = column.dtype.kind in "SUO"
         texts = _texts(column) if is_text and column.ndim == 1 else []
@@ -163,11 +170,13 @@ class Catalogue:
             ]
             if max(whole_parts, default=0) > 24:
                 sexagesimal_unit = "deg"
+            # Rows without a text stay NaN.
             angles = np.full(len(texts), np.nan)
             rows = [row for row, text in enumerate(texts) if text]
             with reading(self.path):
                 angles[rows] = Angle([texts[row] for row in rows], unit=sexagesimal_unit).deg
             return angles
+        # Numbers, in degrees unless the column has a unit.
         numbers = self.coordinates(name)
         unit = getattr(column, "unit", None)
         if unit is None or is_text:
@@ -192,9 +201,11 @@ class Catalogue:
 
     def identifiers(self) -> np.ndarray:
         """Return one identifier per star, int64 or str, shape (n,); row numbers from 0 without."""
+        # Without a column, the number of the row.
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
+        # Whole numbers stay numbers, also if they are written as 12.0; all else is text.
         column = self._column(name)
         values = np.ma.getdata(column)
         if values.dtype.kind in "iuf" and not np.ma.getmaskarray(column).any():
@@ -208,6 +219,7 @@ class Catalogue:
 
     def _identifier(self) -> str | None:
         """Return the name of the column that identifies the stars; None without one."""
+        # The first that the list has; of two that differ by their case only, none.
         names = ("id", "source_id", "number", "star_id", "objid", "obj_id")
         for alias in (*names, "object_id", "label", "name"):
             try:
@@ -230,6 +242,7 @@ class Catalogue:
         """
         from astropy.table import Table
 
+        # Positions on the sky stay, as those in pixels are written anew.
         further_columns, positions = Table(), self.positions()
         read = {self._identifier(), *(() if positions.sky else (positions.first, positions.second))}
         for name in self.table.colnames[:900]:
@@ -259,6 +272,7 @@ class Catalogue:
             raise ObservationError(
                 self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
             )
+        # Coordinates and times are objects of astropy, not arrays.
         column = self.table[resolved]
         if not isinstance(column, np.ndarray):
             raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
@@ -267,6 +281,7 @@ class Catalogue:
 
 def _texts(column: Column) -> list[str]:
     """Return the values of a column as text without blanks around it, "" where there is none."""
+    # FITS has text as bytes.
     values = np.where(np.ma.getmaskarray(column), "", np.ma.getdata(column).astype(object))
     return [
         (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
@@ -301,8 +316,10 @@ def as_catalogue(star_list: StarList) -> Catalogue:
         return star_list
     if isinstance(star_list, str | Path):
         return read_catalogue(Path(star_list))
+    # What is no table becomes columns of one.
     path = Path("catalogue")
     with reading(path):
+        # A table of sky coordinates; an array or a sequence of pairs; else a table.
         if isinstance(star_list, SkyCoord):
             star_list = {"sky": star_list.reshape(-1)}
         elif isinstance(star_list, np.ndarray):
@@ -320,6 +337,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
 
 def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
     """Return the columns of positions (n, 2), x and y, NaN where they are masked."""
+    # Positions with another unit than pixels are on the sky, and have no WCS with them.
     values, mask, unit = parts_of_array(star_list)
     if unit not in ("", "pix", "pixel"):
         raise ObservationError(
@@ -341,6 +359,7 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
 
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
+    # A table may have SkyCoord in place of two columns of numbers.
     sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     if len(sky) == 1:
         # In degrees of the ICRS, NaN where a coordinate is masked.

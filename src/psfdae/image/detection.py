@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,9 +19,6 @@ from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, sky_level
 from psfdae.image.source_size import measure_size
 from psfdae.moments import FWHM_OF_SIGMA
-
-LEAST_PX = 5
-"""Least number of connected pixels above the threshold that are a source."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +48,8 @@ class Sky:
     noise_scale: float
     steps: tuple[Sequence[int], Sequence[int]] = ((), ())
     notes: tuple[str, ...] = ()
+    least_px: ClassVar[int] = 5
+    """Least number of connected pixels above the threshold that are a source."""
 
     @cached_property
     def holes(self) -> np.ndarray:
@@ -61,6 +61,7 @@ class Sky:
 
         if not self.bad.any():
             return self.bad
+        # Part of the 5 × 5 pixels that is bad.
         around = ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
         return np.asarray(self.bad & (around > 0.5))
 
@@ -98,6 +99,7 @@ class Sky:
         wide_px : float
             FWHM from which stars are wide.
         """
+        # Slightly smoothed at first, or with the FWHM that is given.
         if fwhm_px is not None:
             return self._sources(threshold, fwhm_px if fwhm_px >= wide_px else 0.0)
         columns, smoothing = self._sources(threshold), 0.0
@@ -121,7 +123,7 @@ class Sky:
 
         smooth, limit = self._above(threshold, fwhm_px)
         # A source has at least a circle of half the FWHM in diameter.
-        least_px = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
+        least_px = max(self.least_px, round(np.pi * (fwhm_px / 4.0) ** 2))
         # Sources are parted at saddles between 8 levels; 32 levels take three times as long for 1 %
         # more stars. Smoothed stars have shallow saddles between them, which few levels miss.
         finder = SourceFinder(least_px, n_levels=32 if fwhm_px else 8, contrast=0.005)
@@ -129,11 +131,13 @@ class Sky:
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
             return {"id": np.empty(0, np.int64)}
+        # Centroids and fluxes; a source of negative pixels only has none.
         catalogue = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
         x, y, flux = (
             np.atleast_1d(v)
             for v in (catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux)
         )
+        # Sources of which the centroid is not a number are left out.
         finite = np.isfinite(x) & np.isfinite(y)
         x, y, flux = x[finite], y[finite], flux[finite]
         # Level of the sky at the pixel of each source.
@@ -167,8 +171,10 @@ class Sky:
         small = np.bincount(enclosed.ravel()) <= 100
         small[0] = False
         parts, _ = ndimage.label(above | small[enclosed], np.ones((3, 3)))
-        source = np.bincount(parts.ravel()) >= LEAST_PX
+        # Connected pixels that are enough for a source.
+        source = np.bincount(parts.ravel()) >= self.least_px
         source[0] = False
+        # Pixels of the list that are on the image.
         height, width = self.flat.shape
         inside: np.ndarray = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         inside[inside] = source[parts[row[inside], column[inside]]]
@@ -201,6 +207,7 @@ def sky_of(
     ValueError
         If no mesh has enough pixels that count.
     """
+    # Level and noise by the pixels that count.
     image = np.where(bad, 0.0, image)
     level, noise, steps, notes = sky_level(image, bad) if measured is None else measured
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.

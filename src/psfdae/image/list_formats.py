@@ -20,14 +20,6 @@ from psfdae.image.fits_file import UNPACK, open_hdus, plain_file
 if TYPE_CHECKING:
     from astropy.table import Table
 
-REGION_SYSTEMS = {
-    "image": ("X_IMAGE", "Y_IMAGE"),
-    "fk5": ("RAJ2000", "DEJ2000"),
-    "j2000": ("RAJ2000", "DEJ2000"),
-    "icrs": ("RA_ICRS", "DE_ICRS"),
-}
-"""Columns for positions of DS9 by coordinates; its pixels count from 1, as SExtractor's do."""
-
 
 def read_table(path: Path) -> Table:
     """Read the table of stars of a file.
@@ -42,6 +34,7 @@ def read_table(path: Path) -> Table:
     # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
     if content.startswith((b"SIMPLE  =", *UNPACK)):
         return _fits_table(path)
+    # Text may begin with a mark of its encoding; a byte 0 is in no text.
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -72,6 +65,7 @@ def _fits_table(path: Path) -> Table:
 
     file = plain_file(path)
     with reading(path), open_hdus(file, memmap=True) as hdus:
+        # LDAC_IMHEAD has the header of the image, LDAC_OBJECTS the stars.
         tables = [
             hdu
             for hdu in hdus
@@ -102,6 +96,7 @@ def _text_table(path: Path, lines: Sequence[str]) -> Table:
         options = {"format": "sextractor"}
     else:
         lines = plain_rows(lines)
+        # The first mark that the line of names has.
         delimiter = next((mark for mark in ",;\t" if mark in lines[0]), " ") if lines else ","
         options = {"format": "basic", "delimiter": delimiter}
     if not lines:
@@ -117,6 +112,7 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
     A comment right before numbers without names is the names. VizieR writes two lines of units and
     of dashes below the names, which are left out.
     """
+    # Rows that are no comments, and the comments above the first of them.
     rows = [line for line in lines if not line.lstrip().startswith("#")]
     if not rows:
         return []
@@ -132,6 +128,7 @@ def votable(path: Path, content: bytes) -> Table:
     """Read the only table with rows of a VOTable."""
     from astropy.io.votable import parse
 
+    # Tables of other things than stars may be there without rows.
     with reading(path):
         tables = [
             table.to_table(use_names_over_ids=True)
@@ -151,11 +148,18 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     Raises
     ------
     ObservationError
-        If there is a region without a centre, or coordinates are of none or several of
-        `REGION_SYSTEMS`.
+        If there is a region without a centre, or coordinates are not all of one system
+        that is known.
     """
     from astropy.table import Table
 
+    # Columns for positions by coordinates; pixels of DS9 count from 1, as SExtractor's do.
+    systems_known = {
+        "image": ("X_IMAGE", "Y_IMAGE"),
+        "fk5": ("RAJ2000", "DEJ2000"),
+        "j2000": ("RAJ2000", "DEJ2000"),
+        "icrs": ("RA_ICRS", "DE_ICRS"),
+    }
     other_systems = {"physical", "fk4", "b1950", "galactic", "ecliptic", "wcs", "detector"}
     shapes = ("circle", "point", "ellipse", "box", "annulus")
     form = re.compile(r"([+-]?)\s*([a-z]+)\s*[( ]\s*([^,\s)]+)[,\s]+([^,\s)]+)", re.IGNORECASE)
@@ -164,14 +168,16 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     for line in lines:
         if line.lstrip().startswith(("#", "global")):
             continue
+        # Behind the # stand text, colour and the like.
         body, _, properties = line.partition("#")
         # Coordinates hold for what follows, or stand before a shape: "fk5; circle(…)".
         for part in filter(None, map(str.strip, body.split(";"))):
-            if part.lower() in other_systems | REGION_SYSTEMS.keys():
+            if part.lower() in other_systems | systems_known.keys():
                 system = part.lower()
                 continue
             region = form.match(part)
             shape = region[2].lower() if region else part[:20]
+            # A polygon or a line has no centre.
             if region is None or shape not in shapes:
                 raise ObservationError(
                     path, f"region {shape!r}, expected one of {', '.join(shapes)}"
@@ -183,13 +189,14 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
             # Three ways to quote the text.
             label = re.search(r"text\s*=\s*(?:\{([^}]*)\}|\"([^\"]*)\"|'([^']*)')", properties)
             labels.append(next(filter(None, label.groups()), "") if label else "")
-    if len(systems) > 1 or not systems <= REGION_SYSTEMS.keys():
+    if len(systems) > 1 or not systems <= systems_known.keys():
         raise ObservationError(
             path,
             f"regions in coordinates {', '.join(sorted(s or 'not stated' for s in systems))}; "
-            f"expected one of {', '.join(REGION_SYSTEMS)}: save them so in DS9",
+            f"expected one of {', '.join(systems_known)}: save them so in DS9",
         )
-    names = REGION_SYSTEMS[systems.pop() if systems else "image"]
+    # No region at all is an empty list, of which the caller says so.
+    names = systems_known[systems.pop() if systems else "image"]
     table = Table(rows=centres or None, names=names, dtype=["U40", "U40"])
     if labels and all(labels):
         table["id"] = labels
@@ -203,6 +210,7 @@ def stetson(path: Path, lines: Sequence[str]) -> Table:
     """
     from astropy.table import Table
 
+    # Two of the three head lines are not blank.
     rows = [line.split()[:3] for line in lines[2:]]
     if any(len(row) < 3 for row in rows):
         raise ObservationError(path, "a list of DAOPHOT with rows of fewer than three numbers")

@@ -74,6 +74,7 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
     Positions.of_pairs("xpix,ypix"),
     Positions.of_pairs("x_pix,y_pix"),
     Positions.of_pairs("x_pixel,y_pixel"),
+    # SExtractor on the sky, by its own and by photometry's names.
     Positions.of_pairs(
         "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
         "ALPHAWIN_SKY,DELTAWIN_SKY ALPHA_SKY,DELTA_SKY",
@@ -120,6 +121,7 @@ def choose_positions(names: Sequence[str]) -> Positions:
             if all(first != choice.first for choice in choices):
                 choices.append(replace(columns, first=first, second=second))
             break
+    # Pixels go before the sky; what remains must be of one program.
     choices = [choice for choice in choices if not choice.sky] or choices
     if not choices:
         raise ColumnError("no position columns")

@@ -93,24 +93,28 @@ class Candidates:
     @classmethod
     def joined(cls, several: Sequence[Candidates]) -> Candidates:
         """Return those of several observations, one after the other."""
+        # Rows of bright stars count in the joined list.
         starts = accumulate((len(candidates.verdict) for candidates in several), initial=0)
         bright = [
             replace(candidates.bright, row=candidates.bright.row + start)
             for candidates, start in zip(several, starts, strict=False)
         ]
         names = [field.name for field in fields(cls) if field.name != "bright"]
-        columns = {name: np.concatenate([getattr(one, name) for one in several]) for name in names}
+        columns = {
+            name: np.concatenate([getattr(candidates, name) for candidates in several])
+            for name in names
+        }
         return cls(**columns, bright=BrightStars.joined(bright))
 
-    def require(self, path: Path, least: int, remarks: Sequence[str] = ()) -> None:
+    def require(self, path: Path, stars_min: int, remarks: Sequence[str] = ()) -> None:
         """Refuse an image with fewer good stars, by CalibrationStarsError.
 
         `remarks` are sentences on a mask or header values that were used or not, which may be why.
         """
-        if len(self.bright) < least:
+        if len(self.bright) < stars_min:
             problem = (
                 f"{path}: {len(self.bright)} stars are good enough to learn from, "
-                f"calibration_stars.stars_min = {least} are needed "
+                f"calibration_stars.stars_min = {stars_min} are needed "
                 f"(of {len(self.verdict)}: {self.count()}); --stars-min takes fewer, --snr-min "
                 "fainter ones"
             )
@@ -125,6 +129,7 @@ class Candidates:
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
         """Return columns of every star of the list, and which good ones are held out, (n,) each."""
+        # Stars that are not good are in no part.
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row[held_out]] = "held out"
         part[self.bright.row[~held_out]] = "training"
@@ -169,11 +174,12 @@ def collect(
     observation.check_list()
     # Measure 2048 stars at a time; stamps of the good ones are kept.
     parts = [
-        _measure(stamps, settings, framing, observation.least_noise, observation.shape)
+        measure_stamps(stamps, settings, framing, observation.least_noise, observation.shape)
         for stamps in observation.chunks(2048)
     ]
     measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
     bright = BrightStars.joined([stars for _, stars in parts])
+    # Stars that no criterion of a single star refuses, with their rows in the list.
     verdict, position = measured["verdict"], measured["position"]
     bright = replace(bright, row=np.flatnonzero(verdict == Verdict.GOOD))
     # Saturation that the pixels show.
@@ -190,31 +196,35 @@ def collect(
         settings.neighbour_ratio,
     )
     verdict[is_crowded & (verdict == Verdict.GOOD)] = Verdict.CROWDED
+    # Without a position, no other reason counts; without light, the star is no star.
     verdict[observation.without_position()] = Verdict.NO_POSITION
     verdict[bright.row[bright.flux <= 0]] = Verdict.MISFIT
     centring = settings.centring_px or 0.0
     bright = _centred(bright.of(verdict[bright.row] == Verdict.GOOD), centring)
 
-    def without(stars: BrightStars, refused: np.ndarray, reason: Verdict) -> BrightStars:
+    def refuse(stars: BrightStars, refused: np.ndarray, reason: Verdict) -> BrightStars:
+        """Return the other stars, and note the reason against these."""
         verdict[stars.row[refused]] = reason
         return stars.of(~refused)
 
     # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
-    bright = without(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
+    bright = refuse(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
+    # Bad pixels of the others get the values of stars nearby, before sizes are compared again.
     bright, missing = completed(bright, framing.stamp_px, settings.search_px, centring)
     # A star with more than a fifth of its light in bad pixels is not learnt from.
-    bright = without(bright, missing > 0.2, Verdict.INCOMPLETE)
-    bright = without(bright, wider_than_stars(bright.area(), bright.position), Verdict.EXTENDED)
+    bright = refuse(bright, missing > 0.2, Verdict.INCOMPLETE)
+    # Galaxies and blends, which are wider than the stars around them.
+    bright = refuse(bright, wider_than_stars(bright.area(), bright.position), Verdict.EXTENDED)
     # Stars that are unlike their neighbours.
     aligned = cut(bright.aligned(), framing.stamp_px)
     score = misfit(aligned, bright.position, bright.noise / bright.flux)
-    bright = without(bright, ~(score <= settings.misfit), Verdict.MISFIT)
+    bright = refuse(bright, ~(score <= settings.misfit), Verdict.MISFIT)
     candidates = Candidates(**measured, bright=bright)
     candidates.require(observation.path, settings.stars_min, observation.remarks)
     return candidates
 
 
-def _measure(
+def measure_stamps(
     stamps: Stamps,
     settings: CalibrationStars,
     framing: Stamp,
@@ -234,22 +244,14 @@ def _measure(
     shape : tuple of int, optional
         Shape of the image, None for a cube.
     """
-    # Sky around each star, and the star above it.
+    # Sky around each star, and the star above it. The noise is that of the observation where it
+    # has a map of it.
     side = framing.stamp_px
     level, noise = sky_around(stamps.data, stamps.bad, side)
     noise = np.where(np.isfinite(stamps.noise), stamps.noise, np.maximum(noise, least_noise))
     light = np.where(stamps.bad, 0.0, stamps.data - level[:, None, None])
-    # Pixels beyond the edges of the image.
     wide_px = light.shape[-1]
-    off_image = np.zeros(light.shape, dtype=bool)
-    if shape is not None:
-        axis = np.arange(wide_px) - wide_px // 2
-        row, column = (central_pixel(v)[:, None] + axis for v in (stamps.y, stamps.x))
-        row_inside, column_inside = (
-            (row >= 0) & (row < shape[0]),
-            (column >= 0) & (column < shape[1]),
-        )
-        off_image = ~(row_inside[:, :, None] & column_inside[:, None, :])
+    off_image = pixels_off_image(stamps, wide_px, shape)
     # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
     # These also make the noise around a star seem large.
     depth = -DEFECT * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
@@ -261,6 +263,7 @@ def _measure(
     peak, is_centred = brightest_pixels(light, reach_px, centring)
     flux = cut(light, side, peak).sum(axis=(1, 2))
     snr = signal_to_noise(cut(light, side), noise)
+    # A star that is smoothed to be centred has its brightest pixel anywhere.
     if centring:
         highest_light = cut(light, side).max((1, 2))
     else:
@@ -287,6 +290,7 @@ def _measure(
         (Verdict.INCOMPLETE, incomplete | is_flagged(StarFlag.TRUNCATED)),
     ):
         verdict[stars] = reason
+    # Columns for all stars, in counts with the sky where pixels are compared with saturation.
     position = np.stack([stamps.x, stamps.y], axis=1)
     columns = {
         "id": stamps.id,
@@ -299,9 +303,10 @@ def _measure(
         "highest": cut(np.where(stamps.bad, -np.inf, stamps.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
+    # Only good stars keep their stamps; centres come later, when fewer are left.
     good = verdict == Verdict.GOOD
     return columns, BrightStars(
-        wide=light[good],
+        stamps=light[good],
         peak=peak[good],
         centre=np.full((good.sum(), 2), np.nan),
         position=position[good],
@@ -315,16 +320,31 @@ def _measure(
     )
 
 
+def pixels_off_image(stamps: Stamps, side: int, shape: tuple[int, ...] | None) -> np.ndarray:
+    """Return the pixels of stamps (n, side, side) beyond the edges of an image of a shape.
+
+    None is that of a cube of stamps, which are all on it.
+    """
+    if shape is None:
+        return np.zeros(stamps.data.shape, dtype=bool)
+    axis = np.arange(side) - side // 2
+    row, column = (central_pixel(v)[:, None] + axis for v in (stamps.y, stamps.x))
+    row_inside = (row >= 0) & (row < shape[0])
+    column_inside = (column >= 0) & (column < shape[1])
+    return np.asarray(~(row_inside[:, :, None] & column_inside[:, None, :]))
+
+
 def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     """Return stars with their centroids, within 1.5 px of their brightest pixels per axis.
 
     The window is a Gaussian with the noise-equivalent area of the star, A = 4π σ², but at least as
     wide as 0.7 px and as the Gaussian of FWHM `centring_px`.
     """
+    # σ of the window from the area of each star.
     sigma = np.maximum(np.sqrt(stars.area() / (4.0 * np.pi)), 0.7)
     window_px = np.maximum(sigma, centring_px / FWHM_OF_SIGMA)
     return replace(
-        stars, centre=windowed_centres(stars.wide, stars.peak, window_px, rounds=10, reach_px=1.5)
+        stars, centre=windowed_centres(stars.stamps, stars.peak, window_px, rounds=10, reach_px=1.5)
     )
 
 
@@ -358,19 +378,21 @@ def completed(
     """
     from scipy.spatial import cKDTree
 
+    # Only stars with bad pixels change; with three neighbours there is no median worth it.
     missing = np.zeros(len(stars))
     incomplete = np.flatnonzero(stars.bad.any(axis=(1, 2)))
     if not incomplete.size or len(stars) < 4:
         return stars, missing
+    # The nearest stars, itself among them, which is left out below.
     place = stars.position
     if not np.isfinite(place).all():  # all stars are as near then
         place = np.arange(len(stars))[:, None] * np.ones(2)
     nearest = cKDTree(place).query(place[incomplete], k=min(companions + 1, len(stars)))[1]
-    start = stars.wide.shape[-1] // 2 - stamp_px // 2
+    start = stars.stamps.shape[-1] // 2 - stamp_px // 2
     stamp = np.s_[start : start + stamp_px, start : start + stamp_px]
     # The second time, neighbours that have bad pixels are complete, too.
     for _ in range(2):
-        aligned, wide = stars.aligned(), stars.wide.copy()
+        aligned, filled = stars.aligned(), stars.stamps.copy()
         for star, neighbours in zip(incomplete, nearest, strict=True):
             # Median of the neighbours, moved to the star's centre; its flux by least squares over
             # the good pixels of the stamp, F = Σ x p / Σ p².
@@ -379,21 +401,21 @@ def completed(
             bad = stars.bad[star]
             good = ~bad[stamp]
             square = float(np.square(psf[stamp][good]).sum())
-            flux = float((wide[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
-            wide[star][bad] = flux * psf[bad]
+            flux = float((filled[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
+            filled[star][bad] = flux * psf[bad]
             missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
         # Measure these stars again; one without light is lost, and keeps its measurements.
-        light = wide[incomplete]
+        light = filled[incomplete]
         peak = brightest_pixels(light, search_px, centring_px)[0]
         flux = cut(light, stamp_px, peak).sum(axis=(1, 2))
         snr = signal_to_noise(cut(light, stamp_px), stars.noise[incomplete])
         usable = (flux > 0) & (snr > 0)
         missing[incomplete[~usable]] = 1.0
         row = incomplete[usable]
-        measured = {"wide": light, "peak": peak, "flux": flux, "snr": snr}
+        measured = {"stamps": light, "peak": peak, "flux": flux, "snr": snr}
         measured = {name: values[usable] for name, values in measured.items()}
         measured["centre"] = _centred(replace(stars.of(row), **measured), centring_px).centre
-        stars = replace(stars, wide=wide)
+        stars = replace(stars, stamps=filled)
         for name in ("peak", "flux", "snr", "centre"):
             column = getattr(stars, name).copy()
             column[row] = measured[name]

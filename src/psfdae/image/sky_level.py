@@ -18,9 +18,6 @@ import numpy as np
 
 from psfdae.image.interpolation import interpolated
 
-MESH_PX = 64
-"""Side of the squares in which the sky is measured."""
-
 
 class SkyLevel(NamedTuple):
     """Sky of an image.
@@ -45,6 +42,7 @@ def sky_level(
     image: np.ndarray,
     bad: np.ndarray,
     steps: tuple[Sequence[int], Sequence[int]] | None = None,
+    mesh_px: int = 64,
 ) -> SkyLevel:
     """Measure level and noise of the sky of an image.
 
@@ -56,6 +54,8 @@ def sky_level(
         Pixels that do not count.
     steps : tuple of two sequences of int, optional
         Rows and columns at which the sky has steps, if they were found before.
+    mesh_px : int
+        Side of the squares in which the sky is measured.
 
     Raises
     ------
@@ -77,12 +77,12 @@ def sky_level(
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
             if not bad[part].all() or not any(steps):
-                level[part], noise[part] = _meshed(image[part], bad[part])
+                level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
     # Structure that is finer than the meshes.
-    level, noise, share = _with_structure(image, bad, level, noise)
+    level, noise, share = _with_structure(image, bad, level, noise, mesh_px)
     if share:
         notes.append(
-            f"the sky has structure within {MESH_PX} px in {100 * share:.0f} % of the image: "
+            f"the sky has structure within {mesh_px} px in {100 * share:.0f} % of the image: "
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
     # Errors are of sums of pixels, which have more noise where neighbours share it.
@@ -105,6 +105,7 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
 
     It is infinite where neighbours do not differ: there is no noise with which to compare.
     """
+    # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
     difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
     hidden = bad | np.concatenate([bad[:, 1:], bad[:, -2:-1]], axis=1)
     difference[hidden] = np.nan
@@ -137,6 +138,7 @@ def noise_correlation(deviation: np.ndarray) -> float:
     """
     from scipy import ndimage
 
+    # The middle of a large image is enough.
     middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
     values = deviation[middle]
     if min(values.shape) < 16:
@@ -149,25 +151,31 @@ def noise_correlation(deviation: np.ndarray) -> float:
     nearest = 0.5 * (_correlation(values, 0, 1) + _correlation(values, 1, 0))
     if nearest < 0.15:
         return 1.0
+    # What faint sources and structure add, by pixels 3 and 4 px apart.
     distant = [_correlation(values, *lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
     shared = max(float(np.mean(distant)), 0.0)
     if nearest - shared < 0.15:
         return 1.0
-    # Each lag stands for itself and its opposite.
-    lags = [(0, 1), (0, 2), *((down, right) for down in (1, 2) for right in range(-2, 3))]
+    # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
+    lags = [
+        (0, 1),
+        (0, 2),
+        *((rows_apart, columns_apart) for rows_apart in (1, 2) for columns_apart in range(-2, 3)),
+    ]
     excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 
 
-def _correlation(values: np.ndarray, down: int, right: int) -> float:
-    """Return the correlation of pixels (h, w) and those some rows down and columns to the right.
+def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> float:
+    """Return the correlation of pixels (h, w) and those some rows below and columns to the right.
 
     ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)) of pairs a, b, with s by median deviations;
     0 if fewer than 1000 pairs are finite.
     """
+    # a and b are the same pixels, seen from the lag's two ends.
     height, width = values.shape
-    a = values[: height - down, max(0, -right) : width - max(0, right)]
-    b = values[down:, max(0, right) : width - max(0, -right)]
+    a = values[: height - rows_apart, max(0, -columns_apart) : width - max(0, columns_apart)]
+    b = values[rows_apart:, max(0, columns_apart) : width - max(0, -columns_apart)]
     is_finite = np.isfinite(a) & np.isfinite(b)
     if np.count_nonzero(is_finite) < 1000:
         return 0.0
@@ -181,9 +189,7 @@ def _correlation(values: np.ndarray, down: int, right: int) -> float:
 # Meshes.
 
 
-def _meshed(
-    image: np.ndarray, bad: np.ndarray, mesh_px: int = MESH_PX
-) -> tuple[np.ndarray, np.ndarray]:
+def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
     from photutils.background import Background2D
 
@@ -207,6 +213,7 @@ def _meshed(
 
 def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
     """Return values of meshes (m, n), continued beyond the edges with a part of their slope."""
+    # Along rows, then along columns: the edge repeated, and the same with its slope.
     for axis, count in enumerate(mesh.shape):
         pads = [(width, width) if axis == padded_axis else (0, 0) for padded_axis in (0, 1)]
         level = np.pad(mesh, pads, mode="edge")
@@ -223,15 +230,18 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     It is the median of the value itself and of the means of the four pairs of neighbours that face
     each other: all five are the same where the sky is a plane, up to the edges of the image.
     """
+    # Meshes beyond the edges go on along straight lines.
     rows, columns = mesh.shape
     continued = _continued(mesh, 1)
 
-    def shifted(down: int, right: int) -> np.ndarray:
-        return continued[1 + down : rows + 1 + down, 1 + right : columns + 1 + right]
+    def shifted(rows_apart: int, columns_apart: int) -> np.ndarray:
+        return continued[
+            1 + rows_apart : rows + 1 + rows_apart, 1 + columns_apart : columns + 1 + columns_apart
+        ]
 
     pairs = [
-        0.5 * (shifted(down, right) + shifted(-down, -right))
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+        0.5 * (shifted(rows_apart, columns_apart) + shifted(-rows_apart, -columns_apart))
+        for rows_apart, columns_apart in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
@@ -257,7 +267,7 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
 
 
 def _with_structure(
-    image: np.ndarray, bad: np.ndarray, level: np.ndarray, noise: np.ndarray
+    image: np.ndarray, bad: np.ndarray, level: np.ndarray, noise: np.ndarray, mesh_px: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return level and noise (h, w) of a sky with its structure, and the part of it that has some.
 
@@ -273,26 +283,28 @@ def _with_structure(
     ratio = ratio[~bad[sample] & (ratio > 0)]
     typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
     share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
-    structure = _median_level(image - level, bad) if share > 0.05 else None
-    if structure is None or not _sources_stay(image - level, structure, bad, pixel_sigma):
+    structure = median_level(image - level, bad) if share > 0.05 else None
+    if structure is None or not sources_stay(image - level, structure, bad, pixel_sigma):
         return level, noise, 0.0
-    weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad)
+    weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad, mesh_px)
     level += weight * structure
     # What remains; its noise changes with the light of the structure, from mesh to mesh of 16.
-    remainder, noise = _meshed(image - level, bad)
+    remainder, noise = _meshed(image - level, bad, mesh_px)
     level += remainder
     noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
     return level, noise, share
 
 
-def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+def median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the median (h, w) of the 14 × 14 px around each pixel, from means of 2 × 2 px."""
     from scipy import ndimage
 
+    # Means of squares of 2 × 2 px, the last row or column repeated where the number is odd.
     height, width = image.shape
     even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
     squares = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2)
     binned = squares.mean(axis=(1, 3))
+    # Median of 7 × 7 squares, smoothed by σ = 1 square.
     smooth = ndimage.gaussian_filter(ndimage.median_filter(binned, 7, mode="nearest"), 1.0)
     # Back to the pixels: linear between the middles of the squares.
     row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
@@ -300,7 +312,7 @@ def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
 
 
-def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
+def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
     """Return True if the brightest sources of an image (h, w) keep most of their peaks.
 
     A level (h, w) that takes more than a quarter of them is that of the sources themselves. Without
@@ -308,6 +320,7 @@ def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: 
     """
     from scipy import ndimage
 
+    # Local maxima of 25 px around, and the 30 highest of them.
     height = light - level
     high = (height == ndimage.maximum_filter(height, 25)) & ~bad
     peak = np.flatnonzero(high & (light > 50.0 * noise))
@@ -316,7 +329,7 @@ def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: 
     return bool(brightest.size < 5 or np.median(height_left) > 0.75)
 
 
-def structure_weight(noise_excess: np.ndarray, bad: np.ndarray) -> np.ndarray:
+def structure_weight(noise_excess: np.ndarray, bad: np.ndarray, mesh_px: int) -> np.ndarray:
     """Return how much the sky of an image changes within a mesh, from 0 to 1, (h, w).
 
     Parameters
@@ -324,14 +337,17 @@ def structure_weight(noise_excess: np.ndarray, bad: np.ndarray) -> np.ndarray:
     noise_excess : ndarray, shape (h, w)
         σ of a mesh over that from differences of neighbouring pixels, over the usual ratio.
     bad : ndarray of bool, shape (h, w)
+    mesh_px : int
+        Side of a mesh.
     """
     from scipy import ndimage
 
+    # From 0 at 1.25 times the usual noise to 1 at 1.75 times.
     weight = np.clip((noise_excess - 1.25) / 0.5, 0.0, 1.0)
     weight[bad] = 0.0
     # Meshes beside those with structure are interpolated from these, and wrong, too.
-    widened = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
-    return np.asarray(ndimage.uniform_filter(widened, MESH_PX, mode="nearest"))
+    widened = ndimage.maximum_filter(weight, 2 * mesh_px + 1, mode="nearest")
+    return np.asarray(ndimage.uniform_filter(widened, mesh_px, mode="nearest"))
 
 
 # Steps.
@@ -351,6 +367,7 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24)
     reach_px : int
         Width of the strips on both sides of a line that say whether there is a step.
     """
+    # Along all of the line and its halves, each with at most 512 columns of it.
     values, good = (image, ~bad) if axis == 0 else (image.T, ~bad.T)
     count = values.shape[1]
     lines: list[int] = []
@@ -374,6 +391,7 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     height, count = values.shape
     if height < 4 * reach_px or count < 64:
         return []
+    # Sums of the good pixels and their numbers up to each row: their differences give means.
     light, number = (
         np.pad(np.cumsum(v, axis=0, dtype=np.float64), ((1, 0), (0, 0)))
         for v in (np.where(good, values, 0.0), good)
@@ -403,6 +421,7 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
         )
         smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
         slope = np.where(slope_before * slope_after > 0, np.sign(slope_before) * smaller, 0.0)
+        # Less the slope over 3 px. A difference of means of 3 px scatters by √(2/3) σ of a pixel.
         jump = middle - 3.0 * slope
         noise = spread * np.sqrt(1.5)
         error = 1.25 * spread / np.sqrt(count)

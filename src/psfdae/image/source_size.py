@@ -1,4 +1,6 @@
-"""How large the stars of an image are: the light of the median star by radius, and what follows.
+"""Size of the stars of an image: the light of the median star by radius, and what follows.
+
+In: an image without its sky and the positions of its stars. Out: `SourceSize`.
 
 The profile of a star is the median of the pixels of a ring about its centre, in which a neighbour
 does not count, above the median far outside. That of all stars is the median again, up to the
@@ -12,18 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from psfdae.moments import FWHM_OF_SIGMA, robust_scatter, windowed_centres
-
-SIDES_PX = (16, 24, 32, 48, 64)
-"""Sides of stamps that are tried, ascending."""
-
-LIGHT_WANTED = 0.98
-"""Part of the light that wider stamps hold."""
-
-REACH_PX = 72
-"""Radius of the windows in which stars are measured."""
-
-MOST_STARS = 60
-"""Brightest stars that are measured."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +44,35 @@ class SourceSize:
         return 2.0 * float(np.interp(0.5, light, radius))
 
     def light_within(self, side_px: int) -> float:
-        """Part of the light in a square, by that in a circle of the same area."""
+        """Return the part of the light in a square, by that in a circle of the same area."""
         radius = side_px / np.sqrt(np.pi)
         return float(np.interp(radius, np.append(0.0, self.radius_px), np.append(0.0, self.light)))
 
     @property
     def hollow(self) -> bool:
-        """Most stars have their brightest pixel off their centre, as rings have."""
+        """True if most stars have their brightest pixel off their centre, as rings have."""
         return self.peak_offset_px > 1.0
 
     def side(self, light_min: float) -> int:
-        """Side of stamps: the least one if it holds so much light, else one that holds 98 %.
+        """Return the side of stamps, of 16, 24, 32, 48 and 64 px.
 
+        It is the least one if it holds `light_min` of the light, else the first that holds 98 %.
         The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
-        star lies.
+        star lies, and 99 % of its light must.
         """
+        sides = (16, 24, 32, 48, 64)
         if self.hollow:
-            enough = (side for side in SIDES_PX if self.light_within(side - 2) >= 0.99)
-            return next(enough, SIDES_PX[-1])
-        if self.light_within(SIDES_PX[0]) >= light_min:
-            return SIDES_PX[0]
-        enough = (side for side in SIDES_PX if self.light_within(side) >= LIGHT_WANTED)
-        return next(enough, SIDES_PX[-1])
+            enough = [side for side in sides if self.light_within(side - 2) >= 0.99]
+        elif self.light_within(sides[0]) >= light_min:
+            return sides[0]
+        else:
+            enough = [side for side in sides if self.light_within(side) >= 0.98]
+        return enough[0] if enough else sides[-1]
 
 
-def measure_size(flat: np.ndarray, bad: np.ndarray, position: np.ndarray) -> SourceSize | None:
+def measure_size(
+    flat: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, stars_max: int = 60
+) -> SourceSize | None:
     """Measure the size of the stars of an image.
 
     Parameters
@@ -86,80 +80,76 @@ def measure_size(flat: np.ndarray, bad: np.ndarray, position: np.ndarray) -> Sou
     flat : ndarray, shape (h, w)
         Sky-subtracted.
     bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
     position : ndarray, shape (n, 2)
         (x, y) of stars, of which the brightest count; NaN where unknown.
+    reach_px : int
+        Radius of the windows in which stars are measured.
+    stars_max : int
+        Number of stars that are measured.
 
     Returns
     -------
     SourceSize or None
         None if no star is seen.
     """
-    windows, measured = _windows(flat, bad, position)
-    if not len(windows):
+    from scipy import ndimage
+
+    # The brightest stars by the light within 8 px; bad pixels have none.
+    place = np.floor(position[np.isfinite(position).all(axis=1)][:, ::-1] + 0.5).astype(np.int64)
+    place = place[((place >= 0) & (place < flat.shape)).all(axis=1)]
+    if not len(place):
         return None
+    clean = np.where(bad, 0.0, flat)
+    light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(place.T)]
+    brightest = place[np.argsort(-light, kind="stable")[:stars_max]]
+    # Windows (n, s, s) about them; pixels off the image were not measured.
+    rows, columns = (brightest[:, i, None] + np.arange(2 * reach_px + 1) for i in (0, 1))
+    pixels = rows[:, :, None], columns[:, None, :]
+    windows = np.pad(clean, reach_px)[pixels]
+    measured = ~np.pad(bad, reach_px, constant_values=True)[pixels]
     # The centre under a window as wide as the star, of which the first profile knows the width.
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):
-        size = _profile(windows, measured, centre)
+        size = size_of_windows(windows, measured, centre)
         if size is None:
             return None
         # A ring has no light in its middle: a window narrower than its radius would leave it.
         sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
-        light = np.where(measured, windows, 0.0)
-        centre = windowed_centres(light, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
-    return _profile(windows, measured, centre)
+        visible = np.where(measured, windows, 0.0)
+        centre = windowed_centres(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
+    return size_of_windows(windows, measured, centre)
 
 
-def _windows(
-    flat: np.ndarray, bad: np.ndarray, position: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Windows (n, s, s) about the brightest stars, and which of their pixels were measured."""
-    height, width = flat.shape
-    place = np.floor(position[np.isfinite(position).all(axis=1)][:, ::-1] + 0.5).astype(np.int64)
-    place = place[((place >= 0) & (place < flat.shape)).all(axis=1)]
-    # Brightness: light within 8 px; bad pixels have none.
-    clean = np.where(bad, 0.0, flat)
-    total = np.zeros((height + 1, width + 1))
-    total[1:, 1:] = clean.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
-    low, high = np.clip(place - 8, 0, None), np.minimum(place + 9, flat.shape)
-    light = total[high[:, 0], high[:, 1]] - total[low[:, 0], high[:, 1]]
-    light += total[low[:, 0], low[:, 1]] - total[high[:, 0], low[:, 1]]
-    brightest = place[np.argsort(-light, kind="stable")[:MOST_STARS]]
-    pad = np.pad(clean, REACH_PX)
-    not_measured = np.pad(bad, REACH_PX, constant_values=True)
-    axis = np.arange(2 * REACH_PX + 1)
-    rows, columns = (brightest[:, i, None] + axis for i in (0, 1))
-    pixels = rows[:, :, None], columns[:, None, :]
-    return pad[pixels], ~not_measured[pixels]
+def size_of_windows(
+    windows: np.ndarray, measured: np.ndarray, centre: np.ndarray
+) -> SourceSize | None:
+    """Return the size by the median profile of stars; None if they have no light.
 
-
-def _profile(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> SourceSize | None:
-    """Size by the median profile of stars whose centres (n, 2) are off the middle of windows."""
-    axis = np.arange(windows.shape[-1]) - windows.shape[-1] // 2
-    edges = np.concatenate([np.arange(0.0, 10.0), np.arange(10.0, REACH_PX - 3.0, 2.0)])
+    Parameters
+    ----------
+    windows : ndarray, shape (n, s, s)
+    measured : ndarray of bool, shape (n, s, s)
+        Pixels that count.
+    centre : ndarray, shape (n, 2)
+        Centres (row, column) from the middle of the windows.
+    """
+    reach_px = windows.shape[-1] // 2
+    axis = np.arange(windows.shape[-1]) - reach_px
+    edges = np.concatenate([np.arange(0.0, 10.0), np.arange(10.0, reach_px - 3.0, 2.0)])
     area = np.pi * np.diff(edges**2)
-    rings = np.full((len(windows), len(edges) - 1), np.nan)
+    # Light per pixel in the rings of each star, and how far its brightest pixel is off.
+    rings = np.empty((len(windows), len(area)))
     offset = np.empty(len(windows))
-    for star, (image, good, (row, column)) in enumerate(
+    for star, (window, good, (row, column)) in enumerate(
         zip(windows, measured, centre, strict=True)
     ):
         radius = np.hypot(axis[:, None] - row, axis - column)
-        place = (np.digitize(radius[good], edges) - 1).astype(np.int16)  # sorted by their digits
-        values = image[good]
-        order = np.argsort(place, kind="stable")
-        starts = np.searchsorted(place[order], np.arange(len(edges)))
-        for ring in range(len(edges) - 1):
-            pixels = values[order[starts[ring] : starts[ring + 1]]]
-            if len(pixels):
-                # Within a few pixels a star is not round on the pixel grid: the mean is the light;
-                # beyond, the median is, the mean of the two middle pixels.
-                if edges[ring + 1] > 4:
-                    middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
-                    pixels = np.partition(pixels, middle)[middle]
-                rings[star, ring] = pixels.mean()
-        core = np.where(radius < max(4.0, REACH_PX / 6), image, -np.inf)
+        rings[star] = ring_light(window[good], radius[good], edges)
+        core = np.where(radius < max(4.0, reach_px / 6), window, -np.inf)
         peak = np.unravel_index(core.argmax(), core.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))
+    # Above the sky, the median of the four outer rings; of flux 1 within 16 px.
     with np.errstate(all="ignore"):
         rings = rings - np.nanmedian(rings[:, -4:], axis=1)[:, None]
     flux = np.nansum(rings[:, edges[1:] <= 16] * area[edges[1:] <= 16], axis=1)
@@ -168,6 +158,7 @@ def _profile(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> S
     if not usable.any():
         return None
     scaled = rings[usable] / flux[usable, None]
+    # Median profile, up to the first ring that half of the stars do not have.
     is_covered = np.isfinite(scaled).sum(axis=0) > 0.5 * usable.sum()
     last = len(is_covered) if is_covered.all() else int(np.argmin(is_covered))
     scaled = np.where(np.isfinite(scaled), scaled, np.nanmedian(scaled, axis=0))[:, :last]
@@ -176,33 +167,54 @@ def _profile(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> S
     error = 1.25 * robust_scatter(scaled) / np.sqrt(len(scaled))
     dark = (profile <= 3.0 * error) & (edges[1 : last + 1] > 4)
     end = int(np.argmax(dark)) if dark.any() else last
-    light = np.cumsum(profile[:end] * area[:end])
+    profile, end_px = profile[:end], edges[end]
+    light = np.cumsum(profile * area[:end])
     if not len(light) or light[-1] <= 0:
         return None
-    outer_light = _beyond(0.5 * (edges[:end] + edges[1 : end + 1]), profile[:end], edges[end])
-    radius = np.append(edges[1 : end + 1], 2.0 * edges[end])
-    light = np.append(light, light[-1] + min(outer_light, 0.1 * light[-1]))
-    stamp = np.median(_scaled(windows[usable], flux[usable]), axis=0)
+    # Light beyond the end, if the profile p falls on by the power law of its outer half:
+    # ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k at least 4; a tenth at most.
+    light_beyond, middle = 0.0, 0.5 * (edges[:end] + edges[1 : end + 1])
+    is_outer = (middle > 0.5 * end_px) & (profile > 0)
+    if np.count_nonzero(is_outer) >= 3:
+        slope, height = np.polyfit(np.log(middle[is_outer] / end_px), np.log(profile[is_outer]), 1)
+        light_beyond = float(2.0 * np.pi * np.exp(height) * end_px**2 / (max(-slope, 4.0) - 2.0))
+    radius = np.append(edges[1 : end + 1], 2.0 * end_px)
+    light = np.append(light, light[-1] + min(light_beyond, 0.1 * light[-1]))
+    # The inner 49 × 49 px of the median star say how fine its structure is.
+    middle_px = slice(reach_px - 24, reach_px + 25)
+    stamp = np.median(
+        windows[usable][:, middle_px, middle_px] / flux[usable][:, None, None], axis=0
+    )
     rows, columns = np.gradient(stamp)
     gradient = float(np.square(rows).sum() + np.square(columns).sum())
     sharpness = float(np.sqrt(np.square(stamp).sum() / gradient)) if gradient > 0 else 1.0
     return SourceSize(radius, light / light[-1], float(np.median(offset)), sharpness)
 
 
-def _beyond(radius: np.ndarray, profile: np.ndarray, end: float) -> float:
-    """Light beyond a radius `end`, if the profile falls on by the power law of its outer half.
+def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the light per pixel of a star in rings between some radii, (k,), NaN without pixels.
 
-    ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k at least 4.
+    Within a few pixels a star is not round on the pixel grid: the mean is the light; beyond 4 px,
+    the median is.
+
+    Parameters
+    ----------
+    values, radius : ndarray, shape (n,)
+        Pixels of the star, and their distances from its centre.
+    edges : ndarray, shape (k + 1,)
+        Radii, ascending.
     """
-    outer_half = (radius > 0.5 * end) & (profile > 0)
-    if np.count_nonzero(outer_half) < 3:
-        return 0.0
-    slope, height = np.polyfit(np.log(radius[outer_half] / end), np.log(profile[outer_half]), 1)
-    return float(2.0 * np.pi * np.exp(height) * end**2 / (max(-slope, 4.0) - 2.0))
-
-
-def _scaled(windows: np.ndarray, flux: np.ndarray) -> np.ndarray:
-    """The inner parts of windows over the fluxes of their stars."""
-    middle = windows.shape[-1] // 2
-    core = slice(middle - 24, middle + 25)
-    return np.asarray(windows[:, core, core] / flux[:, None, None])
+    # Pixels in the order of their rings; rings are small whole numbers, which are sorted by digits.
+    ring = (np.digitize(radius, edges) - 1).astype(np.int16)
+    order = np.argsort(ring, kind="stable")
+    values, starts = values[order], np.searchsorted(ring[order], np.arange(len(edges)))
+    light = np.full(len(edges) - 1, np.nan)
+    for k in range(len(light)):
+        pixels = values[starts[k] : starts[k + 1]]
+        if not len(pixels):
+            continue
+        if edges[k + 1] > 4:
+            middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
+            pixels = np.partition(pixels, middle)[middle]
+        light[k] = pixels.mean()
+    return light

@@ -31,6 +31,7 @@ def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
     noise : ndarray, shape (n,)
         RMS σ of a pixel.
     """
+    # Noise alone has Σx²/σ² = P; a sum below that is no star.
     power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
     safe = np.where(noise > 0, noise, np.inf)
     return np.asarray(np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0)))
@@ -56,6 +57,7 @@ def brightest_pixels(
     inside : ndarray of bool, shape (n,)
         True if no pixel just outside the search window is brighter.
     """
+    # One pixel more on each side, in which a star that is elsewhere has its brightest pixel.
     middle, reach = stamps.shape[-1] // 2, search_px + 1
     window = slice(middle - reach, middle + reach + 1)
     peak = peaks(softened(stamps, centring_px)[:, window, window]) - reach
@@ -122,6 +124,7 @@ def overlapping(position: np.ndarray, side: int) -> float:
     """Return the part of the stars (n, 2) in whose stamps of a side another one stands."""
     from scipy.spatial import cKDTree
 
+    # Distance of the nearest other star along the farther axis, as stamps are squares.
     located = position[np.isfinite(position).all(axis=1)]
     if len(located) < 2:
         return 0.0
@@ -140,6 +143,7 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     """
     if len(area) < 4:
         return np.zeros(len(area), dtype=bool)
+    # Factors are differences of logarithms.
     size = np.log(area)
     limit = max(np.log(2.0), 5.0 * float(robust_scatter(size)))
     return np.asarray(size < np.median(size) - limit)
@@ -162,11 +166,13 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial import cKDTree
 
+    # With fewer than eight sources there is no locus to see.
     is_wide = np.zeros(len(area), dtype=bool)
     if len(area) < 8:
         return is_wide
     size = np.log(area)
     for _ in range(10):
+        # The locus is searched among those that are not yet known to be wide.
         star = np.flatnonzero(~is_wide)
         if len(star) < 8:
             break
@@ -178,6 +184,7 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
         # A quarter of a normal distribution about its middle has the width 0.637 σ.
         ordered, count = np.sort(excess[star]), -(-len(star) // 4)
         width = ordered[count:] - ordered[:-count]
+        # The shortest interval, its middle and the scatter that it implies.
         first = int(width.argmin())
         local_area, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
         is_wider = excess > local_area + max(np.log(1.5), 5.0 * float(scatter))
@@ -217,20 +224,21 @@ def misfit(
     if count < 4:
         return np.ones(count)
 
-    def usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def expected(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return median and robust variance of every pixel of some stars, (d, d) each."""
         scatter = robust_scatter(stars)
         # A dozen stars may agree in a pixel by chance.
         return np.median(stars, axis=0), scatter**2 + np.median(scatter) ** 2
 
     local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
+    # Neighbours of each star; all stars where there are few, or positions are not known.
     if np.isfinite(position).all() and count > companions:
         neighbours = cKDTree(position).query(position, k=companions + 1)[1]
         local_medians = (
-            usual(aligned[nearest[nearest != star]]) for star, nearest in enumerate(neighbours)
+            expected(aligned[nearest[nearest != star]]) for star, nearest in enumerate(neighbours)
         )
     else:
-        local_medians = repeat(usual(aligned), count)
+        local_medians = repeat(expected(aligned), count)
     # Half of the stamp, or 8 px if that is more: farther out is no place for a faint neighbour.
     core_px = min(side, max(side // 2, 8))
     score = np.empty((count, 2))

@@ -106,6 +106,7 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
                 break
             mask |= trail
             count += 1
+            # Another trail may cross it: the pixels off this one are searched again.
             is_left = ~trail[row, column]
             row, column = row[is_left], column[is_left]
             if len(row) < shortest_px:

@@ -1,5 +1,8 @@
 """Stars of an image as training data: bright ones are what the faint ones look like.
 
+In: bright stars (`selection`) and which of them are held out. Out: images of them for the training
+and the test of methods, and their templates.
+
 A bright star is its own template. Moved by fractions of a pixel it is seen at every
 phase of the pixel grid, moved by whole pixels it learns of centring errors, and new
 noise makes it a faint star as often as one likes. Every star is a field point of its
@@ -23,11 +26,9 @@ from psfdae.splits import draw_jitter, draw_phase
 if TYPE_CHECKING:
     from psfdae.settings import Parts, Stamp
 
-IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
-
 
 def star_grid(position: np.ndarray) -> np.ndarray:
-    """Stars on a square lattice that keeps their order in the image.
+    """Return places of stars on a square lattice that keeps their order in the image.
 
     Columns of equally many stars follow each other in x, the stars of a column in y.
     The pattern of `psfdae_paper.stars.fields.held_out_fields` then takes every fifth star,
@@ -43,6 +44,7 @@ def star_grid(position: np.ndarray) -> np.ndarray:
     ndarray of int, shape (n, 2)
         (ix, iy) of every star.
     """
+    # Columns of √n stars, in the order of x; in each, the order of y.
     count = len(position)
     rows = max(1, round(np.sqrt(count)))
     is_located = np.isfinite(position).all()
@@ -57,11 +59,12 @@ def star_grid(position: np.ndarray) -> np.ndarray:
 
 
 def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
-    """Star of every image, shape (images,): the training stars, then those held out.
+    """Return the star of every image, shape (images,): training stars, then those held out.
 
     So many images are wanted to train and to test, but at least one of each star; each
     star of a part comes as often as the others, or once more.
     """
+    # Stars of each part in turn, until there are enough images.
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
     return np.concatenate(
         [np.resize(stars, max(image_count, stars.size)) for stars, image_count in parts]
@@ -75,6 +78,7 @@ def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
     """
     if not np.isfinite(position).all():
         return np.zeros(len(position), dtype=np.int64)
+    # Place in the range of the positions, 0 … 1, along both axes.
     low, high = position.min(axis=0), position.max(axis=0)
     share = (position - low) / np.where(high > low, high - low, 1.0)
     place = np.minimum((share * bins).astype(np.int64), bins - 1)
@@ -82,7 +86,7 @@ def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
 
 
 def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
-    """Mean star of every part of the field, weighted by signal to noise, (parts, s, s).
+    """Return the mean star of every part of the field, weighted by S/N, shape (parts, s, s).
 
     The weight is S/N and not its square, so that one very bright star is not all of
     its part. A part without stars gets the stack of all.
@@ -94,29 +98,31 @@ def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -
     part : ndarray of int, shape (n,)
     parts : int
     """
+    # The stack of all, in place of which come those of the parts that have stars.
     everyone = np.average(aligned, axis=0, weights=snr)
-    out = np.broadcast_to(everyone, (parts, *everyone.shape)).copy()
+    stack = np.broadcast_to(everyone, (parts, *everyone.shape)).copy()
     for index in np.unique(part):
         members = part == index
-        out[index] = np.average(aligned[members], axis=0, weights=snr[members])
-    return out
+        stack[index] = np.average(aligned[members], axis=0, weights=snr[members])
+    return stack
 
 
 def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndarray:
-    """Template of every star: the stack of the training stars of its part of the field.
+    """Return the template of every star: the stack of training stars of its part of the field.
 
     Returns
     -------
     ndarray, shape (n, s, s)
         Centre at index (s//2, s//2), flux 1 inside the stamp.
     """
+    # Stars that are held out get the stack of the training stars around them.
     part = bins_of(stars.position, bins)
     training = stars.of(~held_out)
     return np.asarray(stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part])
 
 
 def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
-    """The stack of all training stars, (s, s), centre at index (s//2, s//2)."""
+    """Return the stack of all training stars, (s, s), centre at index (s//2, s//2)."""
     training = stars.of(~held_out)
     everyone = np.zeros(len(training), dtype=int)
     return np.asarray(stacks(training.aligned(), training.snr, everyone, 1)[0])
@@ -160,20 +166,24 @@ def make_images(
     phase : ndarray, shape (n, 2)
         Part of a pixel (row, column) by which the star was moved.
     """
+    # All draws first: the same images whatever their number at a time.
     side = framing.stamp_px
     phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
     jitter = draw_jitter(star.size, framing.jitter_px, rng)
     realisations, templates = np.empty((2, star.size, side, side), np.float32)
+    # A moved star may have its brightest pixel one px farther off.
     reach = int(np.abs(stars.peak).max()) + 1
-    for start in range(0, star.size, IMAGES_AT_A_TIME):
-        rows = slice(start, start + IMAGES_AT_A_TIME)
-        star_rows, stamps = star[rows], stars.wide[star[rows]]
+    # 512 images at a time, which bounds the memory.
+    for rows in (slice(start, start + 512) for start in range(0, star.size, 512)):
+        star_rows, stamps = star[rows], stars.stamps[star[rows]]
+        # Move the star by its phase. Splines ring beside what is left of a saturated
+        # neighbour.
         is_moved = subpixel[rows]
-        # Splines ring beside what is left of a saturated neighbour.
         floor = -DEFECT * stars.noise[star_rows[is_moved], None, None]
         stamps[is_moved] = np.maximum(
-            shift_stamps(stars.wide, phase[rows][is_moved], star_rows[is_moved]), floor
+            shift_stamps(stars.stamps, phase[rows][is_moved], star_rows[is_moved]), floor
         )
+        # The brightest pixel goes to the middle, off by the jitter; the template likewise.
         offset = brightest_pixels(stamps, reach, centring_px)[0] - jitter[rows]
         shifted = shift_stamps(template, stars.centre[star_rows] + phase[rows], star_rows)
         for source, target in ((stamps, realisations), (shifted, templates)):
@@ -192,18 +202,20 @@ def training_columns(
     rng: np.random.Generator,
     centring_px: float = 0.0,
 ) -> dict[str, Column]:
-    """Columns of the product "stars": images of bright stars, and what is known of these.
+    """Return columns of the product "stars": images of bright stars, and measurements of these.
 
     `grid` (n, 2) is their place (`star_grid`); stars of each of `bins`² parts of the field
     are stacked, and stars are framed as `make_images` does it.
     """
+    # Images of every star; those held out are not interpolated.
     star = star_of_images(held_out, parts.train_stars, parts.test_stars)
     template = templates_of(bright, held_out, bins)
     subpixel = ~held_out[star] & framing.subpixel
     images, templates, jitter, phase = make_images(
         bright, template, star, framing, subpixel, rng, centring_px
     )
-    wide = (bright.wide / bright.flux[:, None, None]).astype(np.float32)
+    # The bright stars themselves, of flux 1.
+    bright_stamps = (bright.stamps / bright.flux[:, None, None]).astype(np.float32)
     return {
         "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
         "realisation": Column(images, "1", "the star itself, sum 1"),
@@ -217,7 +229,7 @@ def training_columns(
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
         "row": Column(bright.row, "1", "row of every star in the catalogue"),
-        "wide": Column(wide, "1", "the bright stars with a margin, of flux 1"),
+        "wide": Column(bright_stamps, "1", "the bright stars with a margin, of flux 1"),
         "peak": Column(bright.peak, "pixel", "brightest pixel (row, column) from the middle's"),
         "listed": Column(bright.listed, "pixel", "centre by the catalogue, likewise"),
         "bad": Column(bright.bad, "1", "pixels of `wide` that were not measured"),

@@ -172,8 +172,8 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
     model, leading = bundle.flux_model, bundle.info.components
     # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
     # of a model from a file are equal; their mean could differ from them in the last digit.
-    trailing = np.array([model.rest])
-    if model.whole:
+    trailing = np.array([model.other_variance])
+    if model.is_complete:
         trailing = model.variance[: model.variance.size - leading]
     is_even = trailing.size and (trailing == trailing[0]).all()
     trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)

@@ -18,7 +18,7 @@ from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.flux_model import FAINT_SNR
-from psfdae.model.joint_fit import JointFit, chains, fit_stars
+from psfdae.model.joint_fit import JointFit, chains, fit_stars, pairs_within
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_shares
 
@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 
     from psfdae.model.field_psfs import FieldPsfs
 
-ROUNDS = 3  # of fits, at most
-FIT_FWHM, GROUP_FWHM = 1.6, 2.4  # side of the pixels that are fitted; nearest of two groups
-MOST_MOVED_FWHM, SAME_FWHM = 1.0, 0.5  # by a fit; nearer to each other, two stars are one
-LEAST_SEEN = 3.0  # σ, from which hidden stars are real
+SAME_FWHM = 0.5
+"""Distance in FWHM below which two stars cannot be told apart: they are one."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +59,22 @@ class CrowdedPhotometry:
 
     @property
     def radius_px(self) -> float:
-        """Inside of which a flux is the light of its star; that of a stamp without wings."""
+        """Radius within which a flux is the light of its star; half a stamp without wings."""
         half = self.model.stamp_px / 2
         return half if self.wings is None else float(self.wings.radius_px[-1])
 
     def part_of_model(self) -> tuple[float, float]:
-        """Part of a usual star's flux that the model knows, and its standard error."""
+        """Return the part of a typical star's flux that is in the stamp, and its standard error."""
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
-        """Flux of a star over what an aperture gets; see `psfdae.model.wings`."""
+        """Return the flux of a star over what an aperture gets; see `psfdae.model.wings`."""
         return aperture_correction(self.model, self.wings, x, y, radius_px)
 
 
 def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> CrowdedPhotometry:
-    """Positions and fluxes of all stars of an image.
+    """Fit positions and fluxes of all stars of an image.
 
     Parameters
     ----------
@@ -98,6 +96,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
+    # The image with its sky; saturated pixels are not fitted.
     sky = observation.sky()
     image, bad = sky.flat + sky.level, sky.bad
     if observation.saturate is not None:
@@ -108,13 +107,14 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     wings, wing_light = None, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = _pixel_error(sky.noise, sky.flat, observation.gain)
-    for turn in range(ROUNDS):
-        limits = _box(fwhm), MOST_MOVED_FWHM * fwhm
+    for turn in range(3):
+        # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
-        fit = fit_stars(psfs, without_wings, error, bad, place, flux, *limits, origin)
+        fit = fit_stars(psfs, without_wings, error, bad, place, flux, _box(fwhm), fwhm, origin)
         del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
+        # Sky and light beyond the stamps, from the image without the light of stars.
         outer_parts = outer_shares(model.on_pixels, place)
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, place, flux, outer_parts, side, wings
@@ -128,14 +128,15 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
             # or if it has moved to another star.
             sigma = _psf_doubt(place, flux, side, area_px)
-            real = flux > LEAST_SEEN * np.hypot(fit.flux_error, sigma)
-            real &= ~_beside_others(place, SAME_FWHM * fwhm)
+            real = flux > 3.0 * np.hypot(fit.flux_error, sigma)
+            real[pairs_within(place, SAME_FWHM * fwhm)] = False
             real[: observation.count] = True
-            if real.all() or turn == ROUNDS - 1:
+            if real.all() or turn == 2:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
+    # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    result = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + wing_light, wings_used)
+    result = _described(model, fit, 2.4 * fwhm, sky.flat, fit.light + wing_light, wings_used)
     stars = result.stars
     # The error of the PSF is no noise, and is as large a part of each flux.
     model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1)) * stars["flux"]
@@ -158,7 +159,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
 def star_flags(
     stars: Table, bad: np.ndarray, saturated: np.ndarray, side: int, fwhm: float
 ) -> np.ndarray:
-    """Flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
+    """Return the flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
 
     Parameters
     ----------
@@ -171,7 +172,6 @@ def star_flags(
         In pixels.
     """
     from scipy.ndimage import maximum_filter
-    from scipy.spatial import cKDTree
 
     place = np.stack([stars["x"], stars["y"]], axis=1)
     is_located = np.isfinite(place).all(axis=1)
@@ -192,9 +192,7 @@ def star_flags(
     # Not at rest, or a place at its bound.
     raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > 10.0) | (photutils & 8 > 0))
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
-    located = np.flatnonzero(is_located)
-    pairs = cKDTree(place[located]).query_pairs(fwhm, output_type="ndarray")
-    raise_flag(flags, StarFlag.BLENDED, located[pairs.ravel()])
+    raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
     return flags
 
 
@@ -204,14 +202,14 @@ def _pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np
 
 
 def _box(fwhm: float) -> int:
-    """Side of the pixels that are fitted to a star, odd."""
-    return 2 * int(np.ceil(FIT_FWHM * fwhm / 2)) + 1
+    """Return the side of the pixels that are fitted to a star, odd, about 1.6 FWHM."""
+    return 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
 
 
 def _with_hidden(
     sky: Sky, error: np.ndarray, place: np.ndarray, flux: np.ndarray, threshold: float, fwhm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places and fluxes with those of stars in what is left of an image with this error."""
+    """Return places and fluxes with those of stars in what is left of an image with this error."""
     from scipy.spatial import cKDTree
 
     with warnings.catch_warnings():
@@ -219,6 +217,7 @@ def _with_hidden(
         residual_stars = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
     if not len(residual_stars["id"]):
         return place, flux
+    # X_IMAGE counts from 1. Those at a star that was fitted are its residuals.
     candidates = np.stack([residual_stars["X_IMAGE"], residual_stars["Y_IMAGE"]], axis=1) - 1.0
     located = place[np.isfinite(place).all(axis=1)]
     is_alone = cKDTree(located).query(candidates)[0] > SAME_FWHM * fwhm
@@ -228,31 +227,18 @@ def _with_hidden(
 
 
 def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
-    """Flux (n,) that errors of the PSFs of other stars may make at places (n, 2).
+    """Return the flux (n,) that errors of the PSFs of other stars may make at places (n, 2).
 
     A PSF may lack 1.5 % of its light in and about its stamp of `side` pixels, of which a star gets
     what falls on its noise-equivalent area.
     """
-    from scipy.spatial import cKDTree
-
-    bright = np.flatnonzero(np.isfinite(place).all(axis=1) & (flux > 0))
-    pairs = bright[cKDTree(place[bright]).query_pairs(0.75 * side, output_type="ndarray")]
+    # Squares of the fluxes of all stars near enough to each star.
+    is_bright = (flux > 0)[:, None]
+    pairs = pairs_within(np.where(is_bright, place, np.nan), 0.75 * side)
     square = np.zeros(len(place))
     for first, second in ((0, 1), (1, 0)):
         np.add.at(square, pairs[:, first], np.square(flux[pairs[:, second]]))
     return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))
-
-
-def _beside_others(place: np.ndarray, distance_px: float) -> np.ndarray:
-    """Whether another star is nearer than a distance to each of the places (n, 2)."""
-    from scipy.spatial import cKDTree
-
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
-    has_neighbour = np.zeros(len(place), dtype=bool)
-    has_neighbour[
-        located[cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")]
-    ] = True
-    return has_neighbour
 
 
 def _described(
@@ -263,7 +249,10 @@ def _described(
     light: np.ndarray,
     wings: Wings | None,
 ) -> CrowdedPhotometry:
-    """The stars with the fluxes that they have with their wings."""
+    """Return the stars of a fit with their fluxes, wings included, and their chains.
+
+    Chains hold stars that are nearer than `group_px` to the next one.
+    """
     from astropy.table import Table
 
     # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as much
@@ -277,6 +266,7 @@ def _described(
         total, _ = wings.total(outer_shares(model.on_pixels, fit.place))
     stars["flux"], stars["flux_error"] = total * fit.flux, total * excess * fit.flux_error
     stars["flux_model"] = fit.flux
+    # Chains of neighbours, numbered from 1.
     group = chains(fit.place, group_px)
     stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
     stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags

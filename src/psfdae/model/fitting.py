@@ -16,8 +16,9 @@ from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
+from psfdae.model.star_choice import ENOUGH_STARS
 from psfdae.model.star_sets import field_positions, fit_apart, noise_model, training_set
-from psfdae.model.stars import ENOUGH_STARS, REFERENCE, SPLIT, Stars
+from psfdae.model.stars import REFERENCE, SPLIT, Stars
 from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError

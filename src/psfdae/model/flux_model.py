@@ -54,7 +54,7 @@ class FluxModel:
         Eigenvalues, ascending.
     low, high : ndarray, shape (P,)
         Least and greatest value of every pixel in the set.
-    rest : float
+    other_variance : float
         Variance along all directions that `basis` leaves out.
     """
 
@@ -63,10 +63,10 @@ class FluxModel:
     variance: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    rest: float = 0.0
+    other_variance: float = 0.0
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """True if the basis leaves no direction out."""
         return bool(self.basis.shape[1] >= self.mean.size)
 
@@ -113,13 +113,13 @@ class FluxModel:
         # units of the flux squared: C + 10⁴ c cᵀ, with the constant c of length 1.
         free_sky_variance = 1e4
         constant = np.full((self.mean.size, 1), self.mean.size**-0.5)
-        if not self.whole:
+        if not self.is_complete:
             # All but the rest of the covariance lives in the space of basis and constant.
             space = np.linalg.qr(np.hstack([self.basis, constant]))[0]
             modes, sky = space.T @ self.basis, space.T @ constant
-            inside = (modes * (self.variance - self.rest)) @ modes.T
+            inside = (modes * (self.variance - self.other_variance)) @ modes.T
             variance, turn = np.linalg.eigh(inside + free_sky_variance * sky @ sky.T)
-            variance = np.maximum(variance + self.rest, 0.0)
+            variance = np.maximum(variance + self.other_variance, 0.0)
             return replace(self, basis=space @ turn, variance=variance)
         covariance = (self.basis * self.variance) @ self.basis.T
         variance, basis = np.linalg.eigh(covariance + free_sky_variance * constant @ constant.T)
@@ -198,9 +198,9 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
     flat = images.reshape(len(images), pixels).astype(np.float64)
     finite = np.isfinite(flat)
     flat = np.where(finite, flat, 0.0)
-    greatest = flat.max(axis=1, where=finite, initial=-np.inf)
-    least = flat.min(axis=1, where=finite, initial=np.inf)
-    possible = (finite.mean(axis=1) >= MIN_GOOD_PIXELS) & (greatest > least)
+    maximum = flat.max(axis=1, where=finite, initial=-np.inf)
+    minimum = flat.min(axis=1, where=finite, initial=np.inf)
+    possible = (finite.mean(axis=1) >= MIN_GOOD_PIXELS) & (maximum > minimum)
     # A stand-in for hopeless stars: linear algebra on fewer rows would round the others anew.
     x = np.where(possible[:, None], flat, model.mean)
     usable_pixel = finite | ~possible[:, None]
@@ -305,7 +305,7 @@ def _generalised_least_squares(
         Stamps with the unused pixels at their conditional expectation.
     """
     # w₀, w − w₀, and the diagonal of S⁻¹.
-    common = 0.0 * sigma if model.whole else 1.0 / (prior * model.rest + sigma**2)
+    common = 0.0 * sigma if model.is_complete else 1.0 / (prior * model.other_variance + sigma**2)
     weight = 1.0 / (prior[:, None] * model.variance + sigma[:, None] ** 2) - common[:, None]
     precision = weight @ (model.basis**2).T + common[:, None]
     data = np.where(used, x, 0.0)
@@ -314,7 +314,7 @@ def _generalised_least_squares(
     # of S over the used pixels is that of S⁻¹ − S⁻¹_ub (S⁻¹_bb)⁻¹ S⁻¹_bu.
     for star in np.flatnonzero(~used.all(axis=1)):
         bad = np.flatnonzero(~used[star])
-        if model.whole:
+        if model.is_complete:
             columns = (model.basis * weight[star]) @ model.basis[bad].T
             gain = columns @ np.linalg.inv(columns[bad])
             data[star, bad] = -data[star] @ gain

@@ -36,13 +36,13 @@ class JointFit:
     place, place_error : ndarray, shape (n, 2)
         Centres, x and y, 0-based pixels, and their standard errors.
     flux, flux_error : ndarray, shape (n,)
-        In the stamp of the PSF, counts.
+        Light in the stamp of the PSF, counts, and its standard errors.
     chi2 : ndarray, shape (n,)
-        Reduced, of the pixels of the box.
+        Reduced χ² of the pixels of the box.
     flags : ndarray of int, shape (n,)
-        As photutils' `PSFPhotometry` has them (`photutils.psf.decode_psf_flags`).
+        Flags as photutils' `PSFPhotometry` has them (`photutils.psf.decode_psf_flags`).
     light : ndarray, shape (h, w)
-        Of all stars, counts.
+        Light of all stars, counts.
     """
 
     place: np.ndarray
@@ -71,19 +71,19 @@ def fit_stars(
     ----------
     psfs : PsfGrid
     image, error : ndarray, shape (h, w)
-        Without its sky, and σ of its pixels, counts.
+        Image without its sky, and σ of its pixels, counts.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
     place : ndarray, shape (n, 2)
-        Where the fit starts, x and y; stars whose place is not finite are not fitted.
+        Start of the fit, x and y; stars whose place is not finite are not fitted.
     flux : ndarray, shape (n,), or None
-        With which it starts, if known.
+        Fluxes at the start, if known.
     box_px : int
         Side of the pixels about each star that decide on it, odd.
     range_px : float
-        How far a star may move from its origin along either axis.
+        Distance that a star may move from its origin along either axis.
     origin : ndarray, shape (n, 2), optional
-        Where the stars are by a list or by detection, by default where the fit starts.
+        Places of the stars by a list or by detection, by default where the fit starts.
     """
     fit = _Fit(psfs, image, error, bad, place, min(box_px, psfs.side_px))
     middle = fit.start if origin is None else origin[fit.stars]
@@ -119,17 +119,27 @@ def fit_stars(
     return fit.result(len(place), fit.design(), prior, moving, middle, range_px)
 
 
+def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
+    """Return the pairs of stars that are nearer to each other than a distance, (k, 2), by number.
+
+    Stars of which no place (n, 2) is known are in no pair.
+    """
+    from scipy.spatial import cKDTree
+
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    pairs = cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")
+    return np.asarray(located[pairs])
+
+
 def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
-    """Numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
+    """Return the numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
 
     A star of which no place (n, 2) is known is a chain of its own.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
 
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
-    pairs = located[cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")]
+    pairs = pairs_within(place, distance_px)
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])
 
@@ -167,6 +177,8 @@ class _Fit:
         self.stars, self._middle, self.pixels = (
             values[fitted] for values in (self.stars, self._middle, pixels)
         )
+        # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
+        # are the pixels of all boxes.
         self.boxes, self._stamps = map(self._pixel_numbers, (box_px, side))
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
         self.weight = weight.ravel()[self.boxes]
@@ -177,13 +189,13 @@ class _Fit:
         self._draw(np.arange(len(self.stars)))
 
     def _pixel_numbers(self, side_px: int) -> np.ndarray:
-        """Numbers (m, s, s) of the pixels about the stars in the image with its border."""
+        """Return the numbers (m, s, s) of the pixels about stars in the image with its border."""
         axis = np.arange(side_px) - side_px // 2 + self.psfs.side_px
         row, column = self._middle[:, 1, None] + axis, self._middle[:, 0, None] + axis
         return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
     def _draw(self, rows: np.ndarray) -> None:
-        """The light of some stars of flux 1, and its derivatives by their places in their boxes."""
+        """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
         side = self.psfs.side_px
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
@@ -192,7 +204,7 @@ class _Fit:
             self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
-        """Take the light of some stars with these fluxes from the residuals."""
+        """Subtract the light of some stars with these fluxes from the residuals."""
         light = flux[:, None, None] * self._light[rows]
         np.subtract.at(self.residual.reshape(-1), self._stamps[rows], light)
 
@@ -202,7 +214,7 @@ class _Fit:
         self._subtract(np.arange(len(flux)), self.flux)
 
     def best_flux(self) -> np.ndarray:
-        """Fluxes (m,) that fit best at the places as they are."""
+        """Return the fluxes (m,) that fit best at the places as they are."""
         return self.solve(self._derivatives[:, :1] * self.weight[:, None], np.zeros(1))[0][:, 0]
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
@@ -214,25 +226,26 @@ class _Fit:
         self._subtract(rows, self.flux[rows])
 
     def design(self) -> np.ndarray:
-        """Derivatives (m, 3, b, b) of the light by flux, x and y, in units of σ."""
+        """Return the derivatives (m, 3, b, b) of the light by flux, x and y, in units of σ."""
         factor = np.stack([np.ones_like(self.flux), self.flux, self.flux], axis=1)
         return np.asarray(self._derivatives * factor[..., None, None] * self.weight[:, None])
 
     def squares(self) -> np.ndarray:
-        """Sums (m,) of the squared residuals in the boxes, in units of σ."""
+        """Return the sums (m,) of the squared residuals in the boxes, in units of σ."""
         residual = self.weight * self.residual.ravel()[self.boxes]
         return np.asarray(np.square(residual).sum(axis=(1, 2)))
 
     def solve(
         self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The Gauss–Newton step (m, k) with a design (m, k, b, b), and the gradient of −χ²/2."""
+        """Return the Gauss–Newton step (m, k) of a design (m, k, b, b), and the slope of −χ²/2."""
         from scipy.sparse import diags_array
         from scipy.sparse.linalg import splu
 
         matrix, unit = _normal_matrix(design, self._rows, prior)
         added = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
         matrix = (matrix + diags_array(added)).tocsc()
+        # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
         residual = self.weight * self.residual.ravel()[self.boxes]
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
         if not len(unit):
@@ -252,6 +265,7 @@ class _Fit:
         range_px: float,
     ) -> JointFit:
         """Return the fit of `count` stars, these among them; `moving` ones were not at rest."""
+        # Standard errors, and the reduced χ² of the pixels of each box.
         error = _standard_errors(*_normal_matrix(design, self._rows, prior))
         residual = self.weight * self.residual.ravel()[self.boxes]
         freedom = np.maximum(self.pixels - PARAMETERS, 1)
@@ -268,6 +282,7 @@ class _Fit:
             column[self.stars] = values
             return column
 
+        # The light of all stars is what the image has beyond the residuals.
         core = np.s_[self.psfs.side_px : -self.psfs.side_px]
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
         np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
@@ -285,7 +300,7 @@ class _Fit:
 def _normal_matrix(
     design: np.ndarray, boxes: np.ndarray, prior: np.ndarray
 ) -> tuple[csc_array, np.ndarray]:
-    """Σ over pixels of products of derivatives, scaled to a diagonal of 1, and the unit (m, k).
+    """Return the sums over pixels of products of derivatives, scaled to a diagonal of 1.
 
     Parameters
     ----------
@@ -295,6 +310,13 @@ def _normal_matrix(
         Numbers of the pixels, from 0, ascending in a box.
     prior : ndarray, shape (k,)
         Inverse variances of the parameters.
+
+    Returns
+    -------
+    matrix : csc_array, shape (m k, m k)
+        Normal matrix DᵀD of the design D in units of `unit`, with the prior.
+    unit : ndarray, shape (m, k)
+        Root of the diagonal, 1/σ of a parameter if all others were known.
     """
     from scipy.sparse import csc_array, diags_array
 
@@ -312,7 +334,7 @@ def _normal_matrix(
 
 
 def _standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
-    """Standard errors (m, k) of the parameters of m stars.
+    """Return the standard errors (m, k) of the parameters of m stars.
 
     Those of a star are from the inverse of the part of the matrix that belongs to it and to the
     stars whose boxes overlap with its own; what these share with others changes little.
@@ -320,6 +342,7 @@ def _standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
     stars, parameters = unit.shape
     blocks = matrix.tobsr((parameters, parameters))
     blocks.sort_indices()
+    # Key of the block of two stars (i, j) is i · m + j, ascending; each star has its neighbours.
     row = np.repeat(np.arange(stars), np.diff(blocks.indptr))
     key = row * stars + blocks.indices
     neighbours = np.diff(blocks.indptr)
@@ -329,9 +352,11 @@ def _standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
         # Few at a time: matrices of (count · k)² numbers.
         for part in np.array_split(members, len(members) * count**2 // 2**16 + 1):
             neighbour_rows = blocks.indices[blocks.indptr[part, None] + np.arange(count)]
+            # Blocks among the neighbours of each star; 0 for those that do not overlap.
             block_keys = neighbour_rows[:, :, None] * stars + neighbour_rows[:, None, :]
             block_rows = np.minimum(np.searchsorted(key, block_keys), len(key) - 1)
             local = blocks.data[block_rows] * (key[block_rows] == block_keys)[..., None, None]
+            # The diagonal of the inverse at the block of the star itself.
             side = count * parameters
             inverse = np.linalg.inv(local.transpose(0, 1, 3, 2, 4).reshape(-1, side, side))
             diagonal = np.einsum("nii->ni", inverse).reshape(-1, count, parameters)

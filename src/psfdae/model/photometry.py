@@ -116,15 +116,19 @@ class Photometer:
         leading = model.basis[:, -leading_count:]
         self._variance = model.variance[-leading_count:]
         self._peak = float(model.mean @ model.mean)
-        unseen = model.variance[: pixels - leading_count] if model.whole else np.array([model.rest])
+        unseen = (
+            model.variance[: pixels - leading_count]
+            if model.is_complete
+            else np.array([model.other_variance])
+        )
         self._unseen = float(unseen.mean())
-        self._others = pixels - 1 - leading_count
+        self._unseen_count = pixels - 1 - leading_count
         # Mean PSF without its mean, c = m − 1/P; its part along E, and the square of the rest.
         contrast = model.mean - 1.0 / pixels
         # Double precision: OpenBLAS rounds single precision by the place of a star in its block.
         self._projector = np.column_stack([leading, contrast])
         self._modes = leading.T @ contrast
-        self._left = max(float(contrast @ contrast - self._modes @ self._modes), 0.0)
+        self._unseen_power = max(float(contrast @ contrast - self._modes @ self._modes), 0.0)
         ring = self._ring = border_pixels(self.side)
         self._ring_contrast = contrast[ring]
         self._ring_basis = np.ascontiguousarray(leading[ring].T)
@@ -223,7 +227,9 @@ class Photometer:
             prior = np.maximum(fitted_flux, 0.0) ** 2 + sigma2 / self._peak
             weight = 1.0 / (prior[:, None] * self._variance + sigma2[:, None])
             rest_weight = 1.0 / (prior * unseen + sigma2)
-            information = weight @ self._modes**2 + rest_weight * self._left + sky_variance / sigma2
+            information = (
+                weight @ self._modes**2 + rest_weight * self._unseen_power + sky_variance / sigma2
+            )
             signal = (
                 (weight * modes) @ self._modes
                 + rest_weight * outside
@@ -234,12 +240,12 @@ class Photometer:
 
         # Flux and noise settle in three rounds; the start is the flux in white noise, cᵀx / cᵀc.
         fitted_flux = np.where(
-            np.isfinite(flux), flux, along / (self._left + self._modes @ self._modes)
+            np.isfinite(flux), flux, along / (self._unseen_power + self._modes @ self._modes)
         )
         for _ in range(4):
             # σ² is the mean of (x − F c)² beyond E.
-            rest_energy = energy - 2.0 * fitted_flux * outside + fitted_flux**2 * self._left
-            sigma2 = np.maximum(rest_energy / self._others, NOISE_FLOOR**2)
+            rest_energy = energy - 2.0 * fitted_flux * outside + fitted_flux**2 * self._unseen_power
+            sigma2 = np.maximum(rest_energy / self._unseen_count, NOISE_FLOOR**2)
             sigma2 = np.where(np.isfinite(noise), noise**2, sigma2)
             # What the star has beyond the leading eigenvectors is in σ² here.
             fitted_flux, _, weight = flux_of(fitted_flux, sigma2, 0.0)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.field_psf import SLOPE_PX
 from psfdae.image.camera import CameraValue
+from psfdae.model.psf_grid import PsfGrid
 from psfdae.moments import SIGMA_OF_MAD
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def measure_gain(
     PredictionError
         If the model knows no PSF of a place.
     """
+    # Stars alone in a box of about 1.6 FWHM, and without a neighbour within 3 FWHM.
     fwhm = model.fwhm_px()
     half = min(int(np.ceil(0.8 * fwhm)), model.stamp_px // 2 - 1)
     axis = np.arange(-half, half + 1)
@@ -86,14 +87,19 @@ def measure_gain(
     if len(place) < 10:
         return None
     pixels = row[:, None, None] + axis[:, None], column[:, None, None] + axis
+    # Pixels (n, P) in units of a typical σ of the sky.
     data, sigma = (image[pixels].reshape(len(place), -1) for image in (flat, noise))
     unit = float(np.median(sigma))
     data, sigma = data / unit, sigma / unit
-    photons, off = 0.0, 0.0
+    psfs, photons, off = PsfGrid.of(model), 0.0, 0.0
     light = np.zeros(data.shape)
     for _ in range(4):
         # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
-        design = _changes_of_star(model, place, axis)
+        # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
+        corner = np.stack([column, row], axis=1) - half
+        light_and_slopes = psfs.stamps(place, corner, len(axis)).reshape(len(place), 3, -1)
+        design = np.pad(light_and_slopes, ((0, 0), (0, 1), (0, 0)), constant_values=1.0)
+        design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted = design / variance[..., None]
         inverse = np.linalg.inv(weighted.transpose(0, 2, 1) @ design)
@@ -109,10 +115,11 @@ def measure_gain(
         photons, error, off = _slopes_of_variance(
             light[is_fitted], residual[is_fitted], sigma[is_fitted]
         )
-        # Centres stay in their pixel, whose stamp the PSF is drawn in.
+        # Centres stay in their pixel, about which the box lies.
         move = np.clip(fitted[:, 1:3] / np.maximum(fitted[:, :1], 1e-12), -0.2, 0.2)
-        middle = np.floor(place + 0.5)
+        middle = np.stack([column, row], axis=1)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
+    # g = 1 / (photons · unit), and σ_g = g σ_photons / photons.
     if not photons > 5.0 * error:
         return None
     return 1.0 / (photons * unit), error / (photons**2 * unit)
@@ -131,6 +138,7 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     is_alone = np.zeros(len(place), dtype=bool)
     if len(located) < 2:
         return is_alone
+    # The nearest star of the list but the star itself.
     distance = cKDTree(place[located]).query(place[located], k=2)[0][:, 1]
     # Beyond its edges, an image has only bad pixels.
     masked = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
@@ -139,22 +147,6 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     masked = masked[np.where(inside, row, 0), np.where(inside, column, 0)]
     is_alone[located] = inside & ~masked & (distance > distance_px)
     return is_alone
-
-
-def _changes_of_star(model: FieldPsfs, place: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return the change of the pixels (n, P) about stars with flux, x, y and sky, (n, P, 4)."""
-    at = model.stamp_px // 2 + axis
-
-    def psfs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return model.psf_at(x, y, 1)[:, at[:, None], at].reshape(len(x), -1)
-
-    x, y = place.T
-    # Steps towards the middle of the pixel, about which the stamp lies.
-    step_x, step_y = (np.where(v > np.floor(v + 0.5), -SLOPE_PX, SLOPE_PX) for v in (x, y))
-    psf = psfs(x, y)
-    slope_x = (psfs(x + step_x, y) - psf) / step_x[:, None]
-    slope_y = (psfs(x, y + step_y) - psf) / step_y[:, None]
-    return np.stack([psf, slope_x, slope_y, np.ones_like(psf)], axis=-1)
 
 
 def _slopes_of_variance(
@@ -167,6 +159,7 @@ def _slopes_of_variance(
     """
     from scipy.optimize import nnls
 
+    # Bins of pixels in the order of L/σ²; pixels where it is below 0.02 show no photon noise.
     light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
     scaled = light / sigma**2
     order = np.argsort(scaled, kind="stable")
@@ -189,6 +182,7 @@ def _slopes_of_variance(
             strict=True,
         )
     )
+    # Weighted least squares; weights follow from the variances that the last fit expects.
     expected = np.maximum(variance, 1.0)
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected)

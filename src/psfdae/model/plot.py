@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,59 +27,50 @@ UNUSABLE_FLAGS = (
 )
 """Flags of stars whose measured size and shape mean nothing; they are not drawn."""
 
+MAP_COLUMNS = ("x", "y", "snr", "fwhm_px", "ellipticity", "position_angle_deg", "flags")
+"""Columns of a prediction that a map needs; `psf_map` explains them."""
 
-@dataclass(frozen=True)
-class FieldStars:
-    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each.
 
-    Attributes
+def usable_stars(stars: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return indices of the stars that can be drawn, brightest first.
+
+    Parameters
     ----------
-    x, y : ndarray
-        Positions, 0-based pixels of the image; NaN if unknown.
-    snr : ndarray
-        Signal-to-noise ratio, by which stars are ordered.
-    fwhm_px, ellipticity, position_angle_deg : ndarray
-        Size and shape of the PSF of the star; the angle is from +x to +y.
-    flags : ndarray of int
-        Sum of the values of `StarFlag`.
+    stars : mapping of str to ndarray, shape (n,)
+        Columns of a prediction; see `psf_map`.
     """
+    is_finite = np.isfinite([stars[name] for name in ("x", "y", "fwhm_px")]).all(axis=0)
+    usable = np.flatnonzero(is_finite & ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0))
+    return usable[np.argsort(-stars["snr"][usable], kind="stable")]
 
-    x: np.ndarray
-    y: np.ndarray
-    snr: np.ndarray
-    fwhm_px: np.ndarray
-    ellipticity: np.ndarray
-    position_angle_deg: np.ndarray
-    flags: np.ndarray
 
-    def usable_stars(self) -> np.ndarray:
-        """Return indices of the stars that can be drawn, brightest first."""
-        is_finite = np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.fwhm_px)
-        usable = np.flatnonzero(is_finite & ((self.flags & int(UNUSABLE_FLAGS)) == 0))
-        return usable[np.argsort(-self.snr[usable], kind="stable")]
+def stars_with_stamps(stars: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
+    """Choose bright stars so far from each other that their stamps do not overlap in a map.
 
-    def stamp_spacing_px(self) -> float:
-        """Return the least distance of two drawn stamps along an axis, in pixels of the image."""
-        stars = self.usable_stars()
-        extent = max((np.ptp(axis[stars]) for axis in (self.x, self.y) if stars.size), default=0.0)
-        # Nine stamps along the longer side of the field.
-        return float(extent) / 8 if extent > 0 else 1.0
+    Parameters
+    ----------
+    stars : mapping of str to ndarray, shape (n,)
+        Columns of a prediction; see `psf_map`.
 
-    def stamp_stars(self) -> np.ndarray:
-        """Return indices of bright stars so far from each other that their stamps do not overlap.
-
-        They are taken from the brightest down.
-        """
-        # Take the brightest star, drop all whose stamps would overlap with its stamp, and repeat.
-        candidates, spacing_px, selected = self.usable_stars(), self.stamp_spacing_px(), []
-        while candidates.size:
-            star = candidates[0]
-            selected.append(star)
-            distance = np.maximum(
-                *(np.abs(axis[candidates] - axis[star]) for axis in (self.x, self.y))
-            )
-            candidates = candidates[distance >= spacing_px]
-        return np.array(selected, dtype=int)
+    Returns
+    -------
+    selected : ndarray of int
+        Indices of stars, brightest first.
+    spacing_px : float
+        Least distance of two of them along an axis, in pixels of the image.
+    """
+    # Nine stamps along the longer side of the field.
+    candidates, position = usable_stars(stars), np.stack([stars["x"], stars["y"]])
+    extent = float(np.ptp(position[:, candidates], axis=1).max()) if candidates.size else 0.0
+    spacing_px = extent / 8 if extent > 0 else 1.0
+    # Take the brightest star, drop all whose stamps would overlap with its stamp, and repeat.
+    selected = []
+    while candidates.size:
+        star = candidates[0]
+        selected.append(star)
+        distance = np.abs(position[:, candidates] - position[:, star, None]).max(axis=0)
+        candidates = candidates[distance >= spacing_px]
+    return np.array(selected, dtype=int), spacing_px
 
 
 def map_of_file(path: Path) -> Figure:
@@ -94,30 +85,42 @@ def map_of_file(path: Path) -> Figure:
 
     with fits.open(path, memmap=True) as file:
         table: Any = file["STARS"].data
-        columns = (table[name] for name in FieldStars.__dataclass_fields__)
         # Copies in the machine's byte order.
-        stars = FieldStars(*(values.astype(values.dtype.newbyteorder("=")) for values in columns))
+        stars = {
+            name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in MAP_COLUMNS
+        }
+
         # Only the PSFs that are drawn are read: a file may have a million.
-        psfs = [file["PSF"].section[int(star)] for star in stars.stamp_stars()]
-        return psf_map(np.array(psfs, dtype=np.float32), stars, file[0].header["INFILE"])
+        def read_psfs(selected: np.ndarray) -> np.ndarray:
+            psfs = [file["PSF"].section[int(star)] for star in selected]
+            return np.array(psfs, dtype=np.float32)
+
+        return psf_map(stars, read_psfs, file[0].header["INFILE"])
 
 
 @styled
-def psf_map(psf: np.ndarray, stars: FieldStars, image_name: str) -> Figure:
+def psf_map(
+    stars: Mapping[str, np.ndarray],
+    psfs_of: Callable[[np.ndarray], np.ndarray],
+    image_name: str,
+) -> Figure:
     """Draw stamps at the positions of their stars, and beside them a whisker for every star.
 
     Parameters
     ----------
-    psf : ndarray, shape (k, d, d)
-        PSFs of the stars `stars.stamp_stars()`.
-    stars : FieldStars
+    stars : mapping of str to ndarray, shape (n,)
+        Columns of a prediction: `x` and `y` in 0-based pixels of the image, NaN if unknown; `snr`,
+        by which stars are ordered; `fwhm_px`, `ellipticity` and `position_angle_deg` (from +x to
+        +y) of the PSF of each star; `flags`, sums of the values of `StarFlag`.
+    psfs_of : callable
+        It returns the PSFs (k, d, d) of the stars with the given indices (k,).
     image_name : str
         Name of the image in the title.
     """
-    usable, stamp_stars = stars.usable_stars(), stars.stamp_stars()
-    spacing_px = stars.stamp_spacing_px()
+    usable, (stamp_stars, spacing_px) = usable_stars(stars), stars_with_stamps(stars)
+    psf = psfs_of(stamp_stars)
     # Limits of the axes: all usable stars with room for a stamp about each.
-    x, y = stars.x[usable], stars.y[usable]
+    x, y = stars["x"][usable], stars["y"][usable]
     margin = 0.6 * spacing_px
     limits = (0.0, 1.0, 0.0, 1.0)
     if usable.size:
@@ -127,7 +130,7 @@ def psf_map(psf: np.ndarray, stars: FieldStars, image_name: str) -> Figure:
     stamp_axes, whisker_axes = figure.subplots(1, 2, sharex=True, sharey=True)
     # Stamps fill 92 % of their spacing. A square root shows core and wings in one picture.
     half = 0.46 * spacing_px
-    for stamp, x0, y0 in zip(psf, stars.x[stamp_stars], stars.y[stamp_stars], strict=True):
+    for stamp, x0, y0 in zip(psf, stars["x"][stamp_stars], stars["y"][stamp_stars], strict=True):
         stamp_axes.imshow(
             np.sqrt(np.clip(stamp / stamp.max(), 0.0, 1.0)),
             origin="lower",
@@ -147,19 +150,20 @@ def psf_map(psf: np.ndarray, stars: FieldStars, image_name: str) -> Figure:
         both_axes = [stamp_axes, whisker_axes]
         bar = figure.colorbar(whiskers, ax=both_axes, location="bottom", shrink=0.6, aspect=40)
         bar.set_label("FWHM of the PSF (px)")
-    figure.suptitle(f"{image_name}: {len(usable)} of {len(stars.x)} stars", parse_math=False)
+    figure.suptitle(f"{image_name}: {len(usable)} of {len(stars['x'])} stars", parse_math=False)
     return figure
 
 
 def _draw_whiskers(
-    axes: Axes, stars: FieldStars, selected: np.ndarray, spacing_px: float
+    axes: Axes, stars: Mapping[str, np.ndarray], selected: np.ndarray, spacing_px: float
 ) -> LineCollection | None:
     """Draw a line along the major axis of each selected star, with a key for ellipticity 0.2.
 
     Parameters
     ----------
     axes : Axes
-    stars : FieldStars
+    stars : mapping of str to ndarray, shape (n,)
+        As in `psf_map`.
     selected : ndarray of int
         Numbers of the stars.
     spacing_px : float
@@ -177,14 +181,14 @@ def _draw_whiskers(
         return None
     # A whisker is as long as two stamps for an ellipticity of 1.
     px_per_ellipticity = 2.0 * spacing_px
-    angle = np.deg2rad(stars.position_angle_deg[selected])
-    half = 0.5 * px_per_ellipticity * stars.ellipticity[selected]
+    angle = np.deg2rad(stars["position_angle_deg"][selected])
+    half = 0.5 * px_per_ellipticity * stars["ellipticity"][selected]
     step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
-    centre = np.stack([stars.x[selected], stars.y[selected]], axis=1)
+    centre = np.stack([stars["x"][selected], stars["y"][selected]], axis=1)
     ends = np.stack([centre - step, centre + step], axis=1)
     lines = LineCollection(list(ends), cmap="viridis", linewidths=1.3)
     # Colours leave out 2 % of the stars at either end, so that outliers do not flatten the scale.
-    fwhm_px = stars.fwhm_px[selected]
+    fwhm_px = stars["fwhm_px"][selected]
     lines.set_array(fwhm_px)
     lines.set_clim(*np.percentile(fwhm_px, [2, 98]))
     axes.add_collection(lines)

@@ -14,19 +14,24 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
-from psfdae.image.camera import other_instruments
 from psfdae.image.containers import as_images
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
-from psfdae.image.observation import ASSUMED_SCALE_ARCSEC, Observation
+from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
-from psfdae.image.selection import Candidates, Verdict, collect
+from psfdae.image.selection import Candidates, Verdict
 from psfdae.image.selection_advice import advice
-from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
-from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
+from psfdae.model.star_choice import (
+    ENOUGH_STARS,
+    MIN_STARS_WITH_ERROR,
+    choose_bright_stars,
+    few_stars_notes,
+    require_one_camera,
+    require_unique_names,
+)
 from psfdae.model.star_sets import split_stars
 from psfdae.rng import stream
 from psfdae.settings import Noise
@@ -47,15 +52,6 @@ REFERENCE = "realisation"
 
 ALL = "all"
 """Default name of a model of several exposures."""
-
-ENOUGH_STARS = 20
-"""Number of bright stars below which the limits on S/N and neighbours are relaxed."""
-
-MIN_STARS_WITH_ERROR = 5
-"""Number of bright stars below which no error of the model is stated."""
-
-MIN_CROWDED_RATIO = 1.0
-"""Ratio of bright stars with neighbours to those without from which neighbours are subtracted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,33 +145,14 @@ class Stars:
 
         A single image must have enough stars itself; of several, all together must.
         """
-        _require_unique_names(sources)
+        require_unique_names(sources)
         calibration = settings.calibration_stars
-        opened = [
+        opened: Sequence[Observation] = [
             source.open(settings.framing.stamp_px, calibration.margin_px).assuming()
             for source in sources
         ]
-        _require_one_camera(opened)
-        # Choose stars in stamps of the stated size, then in larger ones if these hold too little
-        # of their light.
-        relaxed, candidates = collect_enough(opened, settings)
-        notes = []
-        if (enlarged := enlarge_stamps(opened, candidates, settings)) is not None:
-            settings, note = enlarged
-            notes.append(note)
-            size, calibration = settings.framing.stamp_px, settings.calibration_stars
-            opened = [
-                replace(observation, stamp_px=size, margin=calibration.margin_px)
-                for observation in opened
-            ]
-            relaxed, candidates = collect_enough(opened, settings)
-        # The user learns that stars below the stated S/N take part.
-        if relaxed.calibration_stars.least_snr < calibration.least_snr:
-            notes.append(
-                f"few stars: those of S/N {relaxed.calibration_stars.least_snr:g} and above are "
-                f"used, because fewer than 20 have S/N {calibration.least_snr:g}; --snr-min sets "
-                "another limit"
-            )
+        require_one_camera(opened)
+        opened, candidates, relaxed, notes = choose_bright_stars(opened, settings)
         # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
         for source, observation, measured in zip(sources, opened, candidates, strict=True):
@@ -190,7 +167,8 @@ class Stars:
                 stars = without_neighbours(stars, calibration.neighbour_ratio)
             exposures.append(stars)
         stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
-        return replace(stars, notes=(*stars.notes, *notes, *few_stars_notes(stars)))
+        few_notes = few_stars_notes(stars.candidates.bright.row, stars.held_out)
+        return replace(stars, notes=(*stars.notes, *notes, *few_notes))
 
     @classmethod
     def joined(cls, exposures: Sequence[Stars]) -> Stars:
@@ -301,11 +279,11 @@ class Stars:
         has_image = self.observation.shape is not None
         if not has_image or not np.isfinite(self.candidates.bright.position).all():
             return False
+        # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that
+        # have neighbours than stars without, those without are enough.
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
-        # With fewer stars, there is no field to fit neighbours with.
-        return len(self) >= MIN_STARS_WITH_ERROR and bool(
-            crowded >= MIN_CROWDED_RATIO * max(len(self), ENOUGH_STARS)
-        )
+        enough = max(len(self), ENOUGH_STARS)
+        return len(self) >= MIN_STARS_WITH_ERROR and bool(crowded >= enough)
 
     @property
     def _counts(self) -> str:
@@ -401,234 +379,6 @@ class Stars:
         # Tuples become lists, as in the description of a product that was read from a file.
         plain: dict[str, Any] = json.loads(json.dumps(description))
         return plain
-
-
-def collect_enough(
-    opened: Sequence[Observation], settings: Settings
-) -> tuple[Settings, list[Candidates]]:
-    """Choose stars from the brightest down, until there are enough.
-
-    Where S/N 100 gives fewer than `ENOUGH_STARS`, the least S/N is lowered until there are three
-    times as many, or to 20; and to 10 if even that gives too few. Where these are still too few
-    because bright stars have neighbours, brighter and brighter neighbours are accepted, whose light
-    is subtracted later.
-
-    Parameters
-    ----------
-    opened : sequence of Observation
-        Images of one camera; their stars count together.
-    settings : Settings
-
-    Returns
-    -------
-    settings : Settings
-        Settings with the least S/N, and the brightness of accepted neighbours.
-    candidates : list of Candidates
-        Measured stars of each observation.
-    """
-    calibration = settings.calibration_stars
-
-    def collect_all(by_core: bool = False, **limits: float) -> tuple[Settings, list[Candidates]]:
-        """Choose stars with other limits."""
-        relaxed = calibration.model_copy(update=limits)
-        # Only the stars of all images together must be enough, which is required later.
-        image_limits = relaxed.model_copy(update={"stars_min": 0})
-        return settings.model_copy(update={"calibration_stars": relaxed}), [
-            collect(observation, image_limits, settings.framing, by_core=by_core)
-            for observation in opened
-        ]
-
-    def bright_count(selection: tuple[Settings, list[Candidates]]) -> int:
-        """Return the number of bright stars of a selection."""
-        return sum(len(candidates.bright) for candidates in selection[1])
-
-    selection = collect_all(snr_min=calibration.least_snr)
-    if bright_count(selection) >= ENOUGH_STARS:
-        return selection
-    # Fainter stars: three times as many as needed while their S/N is above 20. Of two selections
-    # with as many stars, the first one stays.
-    for snr in calibration.lower_snr():
-        selection = max(selection, collect_all(snr_min=snr), key=bright_count)
-        if bright_count(selection) >= (ENOUGH_STARS if snr <= 20.0 else 3 * ENOUGH_STARS):
-            return selection
-    crowded = sum(np.count_nonzero(c.verdict == Verdict.CROWDED) for c in selection[1])
-    # Brighter neighbours; their brightness is that of their cores, since the stamp of a faint star
-    # has the light of a bright neighbour. The mean PSF is a median: of neighbours on all sides it
-    # has little light.
-    for ratio in (0.05, 0.1, 0.2, 0.4) if crowded >= ENOUGH_STARS else ():
-        if bright_count(selection) < ENOUGH_STARS:
-            limits = {"snr_min": calibration.least_snr, "neighbour_ratio": ratio}
-            selection = max(selection, collect_all(True, **limits), key=bright_count)
-    return selection
-
-
-def enlarge_stamps(
-    opened: Sequence[Observation], candidates: Sequence[Candidates], settings: Settings
-) -> tuple[Settings, str] | None:
-    """Adapt the settings to stars that are too large for their stamps, or hollow.
-
-    Margin, search distance, isolation and the sub-pixel steps follow the side of the stamps.
-
-    Parameters
-    ----------
-    opened : sequence of Observation
-    candidates : sequence of Candidates
-        Measured stars of each observation.
-    settings : Settings
-
-    Returns
-    -------
-    settings : Settings
-    note : str
-        Size of the stars and of the stamps.
-        None in place of both, if the stamps hold the light of the stars and these have their
-        brightest pixels in their middle.
-    """
-    calibration, framing = settings.calibration_stars, settings.framing
-    # A stated size of stamps and a stated centring leave nothing to adapt.
-    if not calibration.light_min and calibration.centring_px is not None:
-        return None
-    largest = _largest_size(opened, candidates)
-    if largest is None:
-        return None
-    # The side of stamps that hold the stated part of the light, at least that of the settings.
-    side = framing.stamp_px
-    if calibration.light_min:
-        side = max(side, largest.side(calibration.light_min))
-    is_larger = side > framing.stamp_px
-    if not (is_larger or largest.hollow):
-        return None
-    # Lengths of the choice of stars grow with their stamps, up to what the settings allow. Stars
-    # without a sharp peak are centred on their light smoothed by their own width.
-    scale, centring = side / framing.stamp_px, calibration.centring_px
-    if centring is None:
-        centring = largest.fwhm_px if largest.hollow or largest.fwhm_px > 5.0 else 0.0
-    lengths = {
-        "centring_px": float(f"{centring:.3g}"),
-        "margin_px": min(round(calibration.margin_px * scale), 64),
-        "search_px": min(round(calibration.search_px * scale), 16),
-        "isolation_px": calibration.isolation_px * scale,
-    }
-    groups: dict[str, Any] = {
-        "calibration_stars": calibration.model_copy(update=lengths),
-        "framing": framing.model_copy(update={"stamp_px": side}),
-    }
-    if is_larger and (field := getattr(settings, "field", None)) is not None:
-        # Steps of the field's splines grow with the finest structure of the stars, in powers of 2.
-        # The settings are made for stars of a FWHM of 2.8 px, whose finest structure is 1.5 px.
-        factor = 2.0 ** max(np.floor(np.log2(largest.sharpness_px / 1.5)), 0.0)
-        steps_px = {
-            "spacing_px": min(2.0, field.spacing_px * factor),
-            "step_px": min(1.0, field.step_px * factor),
-        }
-        groups["field"] = field.model_copy(update=steps_px)
-    note = f"stars: half of the light is within a diameter of {largest.fwhm_px:.3g} px"
-    if is_larger:
-        old_part, new_part = (100 * largest.light_within(s) for s in (framing.stamp_px, side))
-        note += (
-            f"; stamps of {side} px, which hold {new_part:.1f} % of it, are used instead of "
-            f"{framing.stamp_px} px ({old_part:.0f} %); --stamp-px sets another size"
-        )
-    if largest.hollow:
-        note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
-    return settings.model_copy(update=groups), note
-
-
-def _largest_size(
-    opened: Sequence[Observation], candidates: Sequence[Candidates]
-) -> SourceSize | None:
-    """Return the size of stars in the image where it is largest.
-
-    Parameters
-    ----------
-    opened : sequence of Observation
-    candidates : sequence of Candidates
-        Measured stars of each observation.
-
-    Returns
-    -------
-    SourceSize or None
-        None for cubes of stamps, or if no star is detected.
-    """
-    sizes = []
-    for observation, measured in zip(opened, candidates, strict=True):
-        if observation.shape is not None and observation.positions is not None:
-            # Stars that are good in small stamps are not saturated; without such stars, all count.
-            sky, position = observation.sky(), measured.bright.position
-            if len(position) < MIN_STARS_WITH_ERROR:
-                position = observation.positions
-            sizes.append(measure_size(sky.flat, sky.bad, position))
-    return max(filter(None, sizes), key=lambda size: size.fwhm_px, default=None)
-
-
-def few_stars_notes(stars: Stars) -> list[str]:
-    """Return notes on a model of few stars: none, or one line.
-
-    Errors of a model rest on the stars held out, a fifth of all: with fewer than 20 stars they are
-    rough, with fewer than 5 not stated.
-    """
-    count, held_out = len(stars), int(stars.held_out.sum())
-    if count >= ENOUGH_STARS:
-        return []
-    if len(np.unique(stars.candidates.bright.row)) == 1:
-        return ["one star: the PSF is this star, tested on itself; its error is not known"]
-    training = count - held_out
-    if count >= MIN_STARS_WITH_ERROR:
-        sentence = f"{training} train the model, {held_out} test it; its errors are rough"
-    else:
-        sentence = f"the PSF is the mean of {training} stars, tested on {held_out}; its error is "
-        sentence += "not known"
-    return [f"few stars: {sentence}"]
-
-
-def _require_unique_names(sources: Sequence[ImageInput]) -> None:
-    """Refuse images whose models would have the same name.
-
-    Raises
-    ------
-    ObservationError
-        If two files have the same name without suffix.
-    """
-    paths: dict[str, Path] = {}
-    for source in sources:
-        if source.name in paths:
-            problem = f"its model would have the name of that of {paths[source.name]}"
-            raise ObservationError(source.path, f"{problem}, {source.name!r}")
-        paths[source.name] = source.path
-
-
-def _require_one_camera(opened: Sequence[Observation]) -> None:
-    """Refuse several images with pixels of several sizes, or several cameras or filters.
-
-    Parameters
-    ----------
-    opened : sequence of Observation
-        A single one is accepted, a cube of stamps as well.
-
-    Raises
-    ------
-    ObservationError
-        Names the first difference from the first image.
-    """
-    first = opened[0]
-    for observation in opened if len(opened) > 1 else ():
-        if observation.shape is None:
-            raise ObservationError(observation.path, "a cube of stamps; expected an image")
-        # Telescope, camera and filter of the headers, then the pixel scale, which is named first.
-        differences = [
-            (key, repr(first_value), repr(value))
-            for key, first_value, value in other_instruments(
-                first.instrument, observation.instrument
-            )
-        ]
-        scales = [o.pixel_scale_arcsec or ASSUMED_SCALE_ARCSEC for o in (first, observation)]
-        if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
-            first_text, text = (f"{scale:.6g} arcsec" for scale in scales)
-            differences.insert(0, ("the pixel scale", first_text, text))
-        if differences:
-            name, first_text, text = differences[0]
-            problem = f"{name} is {text}, but that of {first.path} is {first_text}"
-            raise ObservationError(observation.path, f"{problem}; a model is of one")
 
 
 def _with_noise(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:

@@ -22,19 +22,18 @@ from psfdae.model.calibration import COVERAGE
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.flux_model import signal_to_noise
 from psfdae.model.packing import checksum
-from psfdae.model.plot import FieldStars, psf_map
+from psfdae.model.plot import psf_map
 from psfdae.model.psf_model import PsfModel
-from psfdae.model.report import (
+from psfdae.model.report import checks_html, quality_page
+from psfdae.model.report_checks import (
     MEAN_PSF,
     Check,
     check_held_out,
-    checks_html,
     comparison_sentence,
     fit_mean_psf,
     nearest_snr,
-    quality_page,
-    residual_strip,
 )
+from psfdae.model.report_figures import residual_strip
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
@@ -428,10 +427,7 @@ class Report:
         # The map has the PSFs of bright stars whose stamps do not overlap.
         field_map = None
         if stars.observation.positions is not None:
-            names = FieldStars.__dataclass_fields__
-            field_stars = FieldStars(**{name: columns[name] for name in names})
-            field_psf = psf[field_stars.stamp_stars()]
-            field_map = psf_map(field_psf, field_stars, stars.observation.path.name)
+            field_map = psf_map(columns, psf.__getitem__, stars.observation.path.name)
         columns |= {name: selection[name] for name in ("verdict", "part")}
         # Row of the prediction for each held-out image; a star has several images.
         degraded_rows = product["row"][product["field_index"][stars.split.test]]

@@ -12,7 +12,6 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from psfdae.metrics import error_correlation
 from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.paper import published
@@ -247,3 +246,57 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
         for method, source in zip(table["method"], table["source"], strict=True)
     ]
     return f"{title}\n\n{formatted.to_markdown(index=False, disable_numparse=True)}\n"
+
+
+def error_correlation(
+    errors: np.ndarray, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Pearson correlations of signed errors with intervals from Fisher's z.
+
+    z = artanh r is nearly normal with the standard error 1/√(n − 3) for
+    independent, jointly normal errors (Fisher 1921, Metron 1, 3).
+
+    Parameters
+    ----------
+    errors : ndarray, shape (n, k)
+        One row per sample, one column per parameter, any unit.
+    confidence : float
+        Probability of the two-sided interval, 0 … 1.
+
+    Returns
+    -------
+    matrix, low, high : ndarray, shape (k, k)
+        Correlations and the ends of their intervals; 1 on the diagonal. A column
+        without variance correlates with nothing: its row and column are NaN,
+        diagonal included, and no warning is given. With fewer than four samples
+        the intervals are NaN off the diagonal.
+
+    Raises
+    ------
+    ValueError
+        If there is no sample, or an error is not finite.
+    """
+    from scipy.stats import norm
+
+    errors = np.asarray(errors, np.float64)
+    if not errors.size or not np.isfinite(errors).all():
+        raise ValueError(f"errors of shape {errors.shape}: must be at least one and all finite")
+    count = len(errors)
+    varies = np.ptp(errors, axis=0) > 0
+    # In units of the largest deviation, so that no square under- or overflows.
+    deviation = errors - errors.mean(axis=0)
+    deviation = deviation / np.where(varies, np.abs(deviation).max(axis=0), 1.0)
+    length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
+    matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
+    np.fill_diagonal(matrix, 1.0)
+    with np.errstate(divide="ignore"):
+        z = np.arctanh(matrix)
+    # Interval z ± q/√(n − 3); with fewer than four samples there is none.
+    half = norm.isf(0.5 * (1.0 - confidence)) / np.sqrt(max(count - 3, 1))
+    low, high = np.tanh(z - half), np.tanh(z + half)
+    if count < 4:
+        off_diagonal = ~np.eye(len(matrix), dtype=bool)
+        low[off_diagonal] = high[off_diagonal] = np.nan
+    for array in (matrix, low, high):
+        array[~varies, :] = array[:, ~varies] = np.nan
+    return matrix, low, high

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from psfdae.metrics import clustered_mean, clustered_ratio, seed_stderr
+from psfdae.metrics import clustered_mean, clustered_ratio
 from psfdae_paper.evaluation.measure import CELL
 
 SIGNIFICANT = 3.0
@@ -311,3 +311,19 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
             means = (random_mse.mean(), held_out_mse.mean())
             rows.append((*key, *means, ratio, stderr, len(shared), shared.field.nunique()))
     return pd.DataFrame(rows, columns=HELD_OUT_COLUMNS)
+
+
+def seed_stderr(scatter: float, metric: str, mean: float) -> float:
+    """Return the standard deviation of a mean error between seeds of a training.
+
+    Parameters
+    ----------
+    scatter : float
+        Standard deviation of the MSE between seeds, over the MSE; NaN if it was not measured.
+    metric : str
+        "mse", or an SSIM, of which 1 − SSIM is nearly proportional to the MSE; NaN for others.
+    mean : float
+        Mean of the metric.
+    """
+    error = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
+    return scatter * error

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import REFERENCES, new_figure
+from psfdae.figures import new_figure
 from psfdae.method import Method
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import oracles_last
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+REFERENCES = {
+    "realisation": "against the star's own noise-free image (realisation)",
+    "template": "against the static PSF of the field (template)",
+}
+"""Names of the references in titles."""
 
 METRIC_LABELS = {
     "mse": "MSE per pixel (stamp sum = 1)",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.figures import STAMP_MAP, in_field_unit, new_figure, styled
+from psfdae.figures import STAMP_MAP, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,3 +257,24 @@ def _field_axes(axes: Axes, field: np.ndarray) -> None:
     _, unit = in_field_unit(field)
     axes.set_xlabel(f"field angle x ({unit})")
     axes.set_ylabel(f"field angle y ({unit})")
+
+
+def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return field angles in degrees, or in arc minutes if the whole field is within ±1°.
+
+    Parameters
+    ----------
+    field : ndarray
+        Angles in radians.
+
+    Returns
+    -------
+    values : ndarray
+        Angles in this unit.
+    unit : str
+        "deg" or "arcmin".
+    """
+    degrees = np.rad2deg(field)
+    if np.abs(degrees).max() >= 1.0:
+        return degrees, "deg"
+    return 60.0 * degrees, "arcmin"

@@ -89,15 +89,19 @@ def _fit_config(
     ProductError
         For the first setting that differs.
     """
+    # Files that the fit consists of.
     for path in fits.own_files(method_class, place):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
     path = place / CONFIG if place.is_dir() else place
     fit_config = method_class.described(place)
+    # Its configuration says how it was trained: the groups of the method, and the split of the
+    # stars; also the reference, if there is a fit for each.
     required = {*SEEN_BY_TRAINING, *method_class.groups, "split"}
     required |= {"reference"} if fits.storage_of(method_class).per_reference else set()
     if missing := required - set(fit_config):
         raise BundleError(f"{path}: key {min(missing)!r} is missing")
+    # Errors are measured with the noise and on the parts of the training, hence they must agree.
     stage_config = config.model_dump(include={*SEEN_BY_TRAINING})
     stage_config |= {"split": split or fit_config["split"]}
     keys = (*SEEN_BY_TRAINING, "split")
@@ -133,6 +137,7 @@ def ship(
             )
     # Its stars are simulated: it has the licence of the package.
     info = packed.info.model_copy(update={"name": SHIPPED, "licence": "MIT"})
+    # The package must stay small: the bundle is in every installation.
     size = source.stat().st_size
     if size > MAX_SHIPPED_BYTES:
         raise BundleError(f"{source}: {size} bytes, at most {MAX_SHIPPED_BYTES}")

@@ -14,14 +14,7 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import (
-    REFERENCES,
-    StripRow,
-    in_field_unit,
-    restoration_strip,
-    spread_stars,
-    write_png,
-)
+from psfdae.figures import StripRow, restoration_strip, spread_stars, write_png
 from psfdae.files import Product, ProductError, read_product
 from psfdae.method import Method
 from psfdae.metrics import mse
@@ -33,7 +26,8 @@ from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import bound_figures, curves
-from psfdae_paper.evaluation.figures import stamp_energy_map, template_map
+from psfdae_paper.evaluation.drawing import REFERENCES
+from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
 from psfdae_paper.evaluation.measure import COLUMNS, read_tables
 from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.evaluate import (

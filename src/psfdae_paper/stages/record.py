@@ -162,6 +162,7 @@ def clean_commit() -> str:
     ProductError
         If files that decide the products of a run differ from it, or git fails.
     """
+    # Pages, tests and tables may differ: they make no product.
     try:
         changed = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
         commit = git("rev-parse", "HEAD")
@@ -223,6 +224,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
     Times are in seconds, sizes in MB. `wall_s` is the time during which a job of `make reproduce`
     ran, `on_request_s` that of each target beyond it.
     """
+    # Jobs of `make reproduce`: the CPU time of all together and the largest memory of one.
     costs = job_costs(results)
     # Jobs of targets beyond `make reproduce`, such as the bounds.
     on_request = sorted(path for path in (results / ON_REQUEST).glob("*") if path.is_dir())
