@@ -13,11 +13,11 @@ import psfdae
 from image_training import SIZES
 from psfdae import PsfModel, StarFlag
 from psfdae.bright_stars import BrightStars, magnitude
-from psfdae.field_law import FieldSettings
-from psfdae.field_psf import FieldModel
 from psfdae.image.image_input import ImageInput
 from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
+from psfdae.methods.field_law import FieldSettings
+from psfdae.methods.field_spline import FieldModel
 from psfdae.noise import NoiseModel
 
 SIDE, SPACING = 12, 0.5

@@ -164,7 +164,7 @@ def test_an_image_of_the_tutorials_table_gives_what_it_says(
     small.stetson([(k, x + 1, y + 1) for k, (x, y) in enumerate(place)], tmp_path / "list.als")
     if not is_trained:
         monkeypatch.setattr(
-            from_stars, "_write_model", lambda a, b, *_: "\n".join(Stars.of(b, a).notes)
+            from_stars, "write_model", lambda a, b, *_: "\n".join(Stars.of(b, a).notes)
         )
     output = ""
     for option in ["", *re.findall("`(--[a-z]+[- ][^`]*)`", row[2])]:

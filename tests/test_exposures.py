@@ -12,8 +12,9 @@ from astropy.table import Table
 from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import PredictionError, Stars, load_model
-from psfdae.field_psf import _deformations, fit_field
 from psfdae.image.image_input import ImageInput
+from psfdae.methods.field_search import fit_field
+from psfdae.methods.field_spline import deformations
 from psfdae.model.exposures import exposure, for_exposures
 from psfdae.model.settings import from_words
 from psfdae.model.validation import validate
@@ -156,7 +157,7 @@ def test_deformations_are_the_slopes_of_the_splines():
     slopes = [-(x**2), -(y**2), -2 * x * y]
     curves = [x**2 / sigma**2 - 1, y**2 / sigma**2 - 1, x * y / sigma**2]
     wanted = np.stack([a * light / sigma**2 for a in (*slopes, *curves)])
-    found = _deformations(light[None], spacing)[:, 0]
+    found = deformations(light[None], spacing)[:, 0]
     largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
     off = (np.abs(found - wanted) / largest).max(axis=(1, 2))
     assert (off < [0.005] * 3 + [0.02] * 3).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import photutils
@@ -17,10 +18,10 @@ from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import MAX_NODE_AREA_PX2, OUTLIER_AXES, node_step
-from psfdae.field_psf import fit_field
 from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
+from psfdae.methods.field_law import PosteriorLimits, node_step
+from psfdae.methods.field_search import fit_field
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError
 from psfdae.moments import measure_shapes
@@ -220,9 +221,10 @@ def test_outlier_score_has_the_law_of_chi2_and_tells_blends(chosen, snr):
     field = chosen
     faint = Faint(400, snr)
     here, nowhere = faint.measured(field), field.measure(faint.stamps, faint.sigma)
+    axes = PosteriorLimits.outlier_axes
     for found in (here, nowhere):
-        assert np.median(found.outlier_score) == pytest.approx(OUTLIER_AXES, rel=0.25)
-        assert (found.outlier_score < OUTLIER_AXES + 8 * np.sqrt(2 * OUTLIER_AXES)).mean() > 0.98
+        assert np.median(found.outlier_score) == pytest.approx(axes, rel=0.25)
+        assert (found.outlier_score < axes + 8 * np.sqrt(2 * axes)).mean() > 0.98
     blend = 0.8 * faint.psf + 0.2 * np.roll(faint.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + faint.noise / 1000), faint.sigma, faint.position)
     if snr == 50:
@@ -241,32 +243,30 @@ def test_flux_and_sky_that_are_known_are_taken(field):
     assert restored == pytest.approx(known.psf, abs=2e-3)
 
 
-def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
+def test_stars_are_restored_in_groups_that_do_not_matter(field):
     each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
     given = [np.concatenate([getattr(stars, n) for stars in each]) for n in ("stamps", "sigma")]
     whole = field.measure(*given)
-    monkeypatch.setattr("psfdae.field_law.STARS_AT_ONCE", 13)
-    few = field.measure(*given)
+    few = replace(field, limits=PosteriorLimits(stars_at_once=13)).measure(*given)
     assert few.psf == pytest.approx(whole.psf, abs=1e-7)
     assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
-def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monkeypatch):
+def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr):
     faint = Faint(40, snr)
     found = faint.measured(field)
-    monkeypatch.setattr("psfdae.field_law.MIN_NODES", round(MAX_NODE_AREA_PX2 * 16))
-    every = faint.measured(field)
+    limits = PosteriorLimits(min_nodes=round(PosteriorLimits.max_node_area_px2 * 16))
+    every = faint.measured(replace(field, limits=limits))
     assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
     assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
     assert found.evidence == pytest.approx(every.evidence, abs=2e-3)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
-def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, snr, monkeypatch):
+def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, snr):
     """x − s (C + s)⁻¹ (x − m), with C as a whole, for flux, sky and centre that are known."""
-    monkeypatch.setattr("psfdae.field_law.AXES", SIDE**2)
-    field, faint = replace(field), Faint(30, snr)  # its nodes are made anew
+    field, faint = replace(field, limits=PosteriorLimits(min_axes=SIDE**2)), Faint(30, snr)
     flux, sky = np.full(30, 1000.0), np.full(30, 3.0)
     found = faint.measured(field, centre=faint.centre, fixed=True, flux=flux, sky=sky)
     at = faint.centre + field.listed[0]
@@ -276,7 +276,7 @@ def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, s
     for k, mean, stamp, psf, sigma in zip(
         near, means, faint.stamps, found.psf, found.sigma, strict=True
     ):
-        node, star = field._nodes[k], (stamp.ravel() - 3) / 1000
+        node, star = field.nodes[k], (stamp.ravel() - 3) / 1000
         inverse = np.linalg.inv(
             node.residual_modes.T @ node.residual_modes + np.diag(node.diagonal + s)
         )
@@ -295,7 +295,7 @@ def test_centres_are_as_likely_as_nodes_have_room_in_the_box(field):
     nearest = np.rint(places / 0.25).astype(int)
     edges = np.arange(-7.5, 8)
     counted = np.histogram2d(*nearest.T, bins=(edges, edges))[0]
-    found = np.exp(field._prior(np.full((1, 2), np.nan)))[0].reshape(15, 15)
+    found = np.exp(field.log_prior(np.full((1, 2), np.nan)))[0].reshape(15, 15)
     assert field.settings.centring_px == 1.5 and field.settings.step_px == 0.25
     for part in (slice(1, 2), slice(2, -2)):
         share = counted[part, 2:-2].sum() / len(places)
@@ -373,7 +373,8 @@ def test_list_of_the_training_is_known(field):
 def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, stars, monkeypatch):
     assert [node_step(fwhm, 0.25) for fwhm in (1.1, 1.7, 2.5)] == [1 / 8, 1 / 5, 0.25]
     assert field.step_px == 0.25
-    monkeypatch.setattr("psfdae.field_law.MAX_STEP_FWHM", 0.2 / size(stars.stamps).mean())
+    finer_step = partial(node_step, max_step_fwhm=0.2 / size(stars.stamps).mean())
+    monkeypatch.setattr("psfdae.methods.field.node_step", finer_step)
     finer = fitted(stars)
     assert finer.step_px == pytest.approx(0.18, abs=0.021)
     assert np.diff(np.unique(finer.places)) == pytest.approx(finer.step_px)

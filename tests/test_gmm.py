@@ -10,9 +10,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from psfdae import mixing
-from psfdae import mixture_law as module
 from psfdae.method import Needs, TrainingSet
 from psfdae.methods import gmm
+from psfdae.methods import mixture_law as module
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.model.bundle import BundleError
 from psfdae.model.packing import packed

@@ -13,7 +13,7 @@ commands follow from them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
@@ -312,21 +312,10 @@ class KnowsField(Protocol):
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
         """Return the PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
 
-    def facts(self) -> Mapping[str, str]:
-        """Return facts about the field that a user should know, by their titles."""
-
 
 @runtime_checkable
-class FreesFlux(Protocol):
-    """Method with a form for images whose flux and sky are estimates, and their sum is 1."""
-
-    def free_flux(self) -> Self:
-        """Return the form for images whose flux and sky are estimates."""
-
-
-@runtime_checkable
-class FindsFlux(FreesFlux, Protocol):
-    """Method that measures, in that form, the flux over that by which an image was divided."""
+class FindsFlux(Protocol):
+    """Method that measures the flux over that by which an image was divided, in its free form."""
 
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, object]:
         """Return this flux of images (n, d, d), shape (n,), and which clusters are near them.
@@ -344,23 +333,6 @@ class ScoresOutliers(Protocol):
 
         −2 ln of the probability density; for a normal law the square of Mahalanobis' distance.
         """
-
-
-@runtime_checkable
-class HasConditions(Protocol):
-    """Method with conditions that the arrays of any fit fulfil, to detect damaged files."""
-
-    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
-        """Yield the name of an array, what it must have in words, and whether it has it."""
-
-
-@runtime_checkable
-class GoesOn(Protocol):
-    """Method whose training on templates may start from a fit to the realisations."""
-
-    @classmethod
-    def continues(cls, config: Config) -> bool:
-        """Return True if the settings ask for this start."""
 
 
 class Method:
@@ -412,6 +384,28 @@ class Method:
         """Return the threads of a fit: the setting of that name, or 1 if there is none."""
         groups = cls.settings(config).values()
         return next((g.threads for g in groups if hasattr(g, "threads")), 1)
+
+    @classmethod
+    def continues(cls, config: Config) -> bool:
+        """Return True if training on templates starts from a fit to the realisations."""
+        return False
+
+    # What a fitted method knows besides the PSF of a star; most know nothing of it.
+
+    def free_flux(self) -> Self:
+        """Return the form for images whose flux and sky are estimates, and their sum is 1."""
+        return self
+
+    def facts(self) -> Mapping[str, str]:
+        """Return facts that a user should know, by their titles; no full stop ends them."""
+        return {}
+
+    def conditions(self) -> Iterable[tuple[str, str, ArrayLike]]:
+        """Return conditions that the arrays of any fit fulfil, to detect damaged files.
+
+        Each is the name of an array, what it must have in words, and whether it has it.
+        """
+        return ()
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
@@ -491,13 +485,3 @@ class Method:
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """Return a fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
-
-
-def with_free_flux(fitted: Method) -> Method:
-    """Return the form of a fit for estimated flux and sky, or the fit itself if it has none."""
-    return fitted.free_flux() if isinstance(fitted, FreesFlux) else fitted
-
-
-def facts_of(fitted: Method) -> list[str]:
-    """Return the facts that a fit knows about the field, in sentences without a full stop."""
-    return [*fitted.facts().values()] if isinstance(fitted, KnowsField) else []

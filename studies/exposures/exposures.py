@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import MARGIN_PX
-from psfdae.field_psf import fit_field, refit_field
+from psfdae.methods.field_law import MARGIN_PX
+from psfdae.methods.field_search import fit_field, refit_field
 from psfdae_paper.source import git_commit
 
 SIZE_PX, STAMP_PX, WIDE_PX, SAMPLES = 1000, 16, 32, 5

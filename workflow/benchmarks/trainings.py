@@ -14,7 +14,6 @@ from psfdae import fits
 from psfdae.belonging import STARS, require
 from psfdae.cli import program
 from psfdae.files import read_product, write_csv
-from psfdae.method import GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
 from psfdae.options import File, Folder
@@ -322,7 +321,7 @@ def own_fits(config, kind, dataset, references, product, results):
 def other_fits(config, kind, references, product, seed):
     """Fits that differ from the given ones by nothing but their seed."""
     by_reference = {}
-    goes_on = issubclass(kind, GoesOn) and kind.continues(config)
+    goes_on = kind.continues(config)
     for reference in references:
         if by_reference and kind.storage and not kind.storage.per_reference:
             by_reference[reference] = next(iter(by_reference.values()))  # one serves all

@@ -12,7 +12,6 @@ from snakemake.utils import validate
 from psfdae import fits
 from psfdae.cli import stage
 from psfdae.fits import suffix_of
-from psfdae.method import GoesOn
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
@@ -317,7 +316,6 @@ def histories_of(dataset):
 
 def start_of(method, w):
     """Fit to the realisations from which that to the templates goes on, if one does."""
-    goes_on = issubclass(method, GoesOn) and method.continues(dataset_config(w.dataset))
-    if not goes_on or w.get("reference") != "template":
+    if w.get("reference") != "template" or not method.continues(dataset_config(w.dataset)):
         return {}
     return {"start": files_of(method, w.dataset, w.split, "realisation")}

@@ -7,7 +7,6 @@ from typing import Annotated
 from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.cli import command
 from psfdae.image.errors import one_line
-from psfdae.method import KnowsField
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle, estimator, read_bundle
 from psfdae.options import File
@@ -61,9 +60,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
         method_facts = {"Network": f"kernels {kernels}; widths {widths}; {number_count} weights"}
     else:
         method_facts = {"Method": f"{method(info.method).look.label}; {number_count} numbers"}
-        fitted = estimator(bundle)
-        if isinstance(fitted, KnowsField):
-            method_facts |= fitted.facts()
+        method_facts |= estimator(bundle).facts()
     star_kind = {"simulated": "simulated stars", "stars": "stars of an image"}[info.source]
     return {
         "Name": info.name,

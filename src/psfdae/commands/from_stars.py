@@ -26,7 +26,7 @@ from psfdae.files import (
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
-from psfdae.method import Method, facts_of
+from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
@@ -183,8 +183,22 @@ def from_stars(
         with reserved_folder(files, sources, page, overwrite):
             sentence = write_model(settings, sources, files, licence, candidates, page)
         print(sentence)
-    # The command that applies the model to all stars of the image, or of the first exposure. A
-    # list for several images has stars of all of them: those off the image are left out.
+    print(f"next: {next_command(image, options, all_extensions, name, out)}")
+    return sentence
+
+
+def next_command(
+    image: tuple[Path, ...],
+    options: ImageStatements,
+    all_extensions: bool,
+    name: str | None,
+    out: Path,
+) -> str:
+    """Return the command that applies the model to all stars of the image, or first exposure.
+
+    Parameters are those of `from_stars`.
+    """
+    # A list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
     if several and options.catalogue:
         options = replace(options, on_image=True)
@@ -193,8 +207,7 @@ def from_stars(
     words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
     words += ["--all-extensions"] * all_extensions
     words += ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
-    print(f"next: {shlex.join(words)}")
-    return sentence
+    return shlex.join(words)
 
 
 def compared_methods(
@@ -350,7 +363,7 @@ def write_model(
     # The fit with all that predictions need: photometry, and errors from stars held out.
     print(f"packing {model_method.look.label}")
     model = pack_model(stars, fitted[model_method.name], files.name, licence)
-    for fact in facts_of(fitted[model_method.name]):
+    for fact in fitted[model_method.name].facts().values():
         print(f"{model_method.look.label}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")

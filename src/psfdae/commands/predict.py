@@ -125,18 +125,7 @@ def predict(
     except OSError as error:
         raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
-    instrument_note = loaded.other_instrument(observation.instrument, observation.colour_column)
-    lines = [
-        observation.summary(),
-        list_note,
-        instrument_note and f"{source.path}: {instrument_note}",
-    ]
-    if observation.shape and isinstance(loaded.method, KnowsField) and not loaded.wings:
-        lines.append(
-            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
-            f"{loaded.stamp_px} px; flux is the light in the stamp"
-        )
-    # Stars are flagged, never dropped.
+    lines = [observation.summary(), list_note, *notes_on_model(loaded, observation)]
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
@@ -182,6 +171,19 @@ def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
     assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
     return observation
+
+
+def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
+    """Return sentences on another instrument than the training's, and on light beyond stamps."""
+    notes = []
+    if difference := model.other_instrument(observation.instrument, observation.colour_column):
+        notes.append(f"{observation.path}: {difference}")
+    if observation.shape and isinstance(model.method, KnowsField) and not model.wings:
+        notes.append(
+            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
+            f"{model.stamp_px} px; flux is the light in the stamp"
+        )
+    return notes
 
 
 def check_targets(

@@ -251,15 +251,8 @@ def find_layers(
     # Without a statement, the map of the image's own file.
     if all(place is None for place in maps.values()):
         for kind in layers_of_file.keys() & NOISE_MAPS.keys():
-            noise = layers_of_file[kind]
-            # In a map of the file 0 is for bad pixels; it must have values for half of all.
-            with open_pixels(noise, in_pieces=False) as pixels:
-                good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
-            if good < 0.5:
-                notes.insert(0, f"not {noise.label} ({100 * good:.0f} % of its pixels are above 0)")
-            else:
-                layers = replace(layers, noise=NoiseMap(noise, kind))
-                notes.insert(0, f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}")
+            noise_map, note = noise_of_file(layers_of_file[kind], kind)
+            layers, notes = replace(layers, noise=noise_map), [note, *notes]
     if notes:
         line = f"{source.path}: uses {' and '.join(notes)}"
         if mask is not None and source.mask is None:
@@ -273,6 +266,18 @@ def find_layers(
                 )
         remarks.insert(0, line)
     return layers, remarks
+
+
+def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
+    """Return the map of noise of the image's own file, and words on its use.
+
+    In it 0 is for bad pixels. None if it has values for fewer than half of the pixels.
+    """
+    with open_pixels(noise, in_pieces=False) as pixels:
+        good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
+    if good < 0.5:
+        return None, f"not {noise.label} ({100 * good:.0f} % of its pixels are above 0)"
+    return NoiseMap(noise, kind), f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}"
 
 
 def mask_and_bits(

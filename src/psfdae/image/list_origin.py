@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from psfdae.image.detection import Sky
+from psfdae.image.stamps import central_pixel, cut_image
 from psfdae.moments import robust_scatter, windowed_centres
 
 TOLERANCE_PX = 0.1
@@ -37,19 +38,19 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     count : int
         Stars that say it.
     """
-    # Windows of 13 × 13 px, halfway between both origins, so that neither is nearer to the start.
-    reach = 6
-    pixel = np.floor(np.nan_to_num(listed - 0.5, nan=-1e9) + 0.5).astype(int)
-    farthest = np.array(sky.flat.shape)[::-1] - reach
-    inside = ((pixel >= reach) & (pixel < farthest)).all(axis=1)
-    pixel, listed = pixel[inside], listed[inside]
+    # Stamps of 13 × 13 px, halfway between both origins, so that neither is nearer to the start.
+    shape = sky.flat.shape
+    x, y = (listed - 0.5).T
+    is_cut = cut_image(sky.bad, shape, x, y, 13, 0)[2]
+    listed = listed[~is_cut]
     if len(listed) < fewest:
         return None
-    axis = np.arange(-reach, reach + 1)
-    window = pixel[:, 1, None, None] + axis[:, None], pixel[:, 0, None, None] + axis
-    stamps, noise, bad = sky.flat[window], sky.noise[window], sky.bad[window]
+    x, y = (listed - 0.5).T
+    stamps, noise, bad = (
+        cut_image(layer, shape, x, y, 13, 0)[0] for layer in (sky.flat, sky.noise, sky.bad)
+    )
     # Stars whose inner 5 × 5 pixels are good and stand 20 σ above the sky, the brightest 500.
-    core = np.s_[:, reach - 2 : reach + 3, reach - 2 : reach + 3]
+    core = np.s_[:, 4:9, 4:9]
     snr = stamps[core].sum(axis=(1, 2)) / (5 * np.median(noise, axis=(1, 2)))
     star = np.flatnonzero(~bad[core].any(axis=(1, 2)) & (snr > 20))
     star = star[np.argsort(-snr[star])][:500]
@@ -58,7 +59,7 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     # Centroids less positions, of stars that did not run to the end of their reach.
     window_px = np.full(len(star), 1.5)
     centre = windowed_centres(stamps[star], np.zeros((len(star), 2)), window_px, 10, 2.0)[:, ::-1]
-    offset = pixel[star] + centre - listed[star]
+    offset = central_pixel(listed[star] - 0.5) + centre - listed[star]
     offset = offset[(np.abs(centre) < 1.9).all(axis=1)]
     if len(offset) < fewest:
         return None

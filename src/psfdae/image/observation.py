@@ -293,53 +293,9 @@ class Observation:
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
                 if self.shape is None:
-                    yield self._stamps(part, *_cut_from_cube(self, part, pixels, mask))
+                    yield _with_stars(self, part, *_cut_from_cube(self, part, pixels, mask))
                 else:
-                    yield self._stamps(part, *_cut_from_image(self, part, pixels, noise))
-
-    def _stamps(
-        self,
-        part: slice,
-        data: np.ndarray,
-        masked: np.ndarray,
-        truncated: np.ndarray,
-        noise: np.ndarray,
-    ) -> Stamps:
-        """Return stamps (n, s, s) of a part of the stars with all that is known of these."""
-        # A pixel of +inf is saturated, one of NaN is not.
-        level = self.saturate
-        saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
-        # Pixels without a number are masked, and 0.
-        finite = np.isfinite(data)
-        if not finite.all():
-            data[~finite] = 0.0
-            masked |= ~finite
-        # Positions in the image; and in an image, centres from the middle of the central pixel.
-        unknown, stars = np.full(len(data), np.nan), self.stars.select(part)
-        x, y = (unknown, unknown) if self.positions is None else self.positions[part].T
-        listed = np.full((len(data), 2), np.nan)
-        raise_flag(stars.flags, StarFlag.TRUNCATED, truncated)
-        if self.shape is not None:
-            listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-            # A cosmic ray within a pixel of the position: it may be no star.
-            cosmic = cut_image(self._layers.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]
-            raise_flag(stars.flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
-        return Stamps(
-            data,
-            bad=masked,
-            saturated=saturated,
-            flags=stars.flags,
-            id=stars.id,
-            x=x,
-            y=y,
-            flux=stars.flux,
-            background=stars.background,
-            noise=noise,
-            gain=unknown if self.gain is None else np.full(len(data), self.gain),
-            magnitude=unknown,
-            colour=stars.colour,
-            listed=listed,
-        )
+                    yield _with_stars(self, part, *_cut_from_image(self, part, pixels, noise))
 
 
 def _cut_from_cube(
@@ -414,6 +370,51 @@ def _cut_from_image(
         _, sky_noise = sky_around(data, masked | ~np.isfinite(data), stamp_px)
         sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, layers.least_noise), np.nan)
     return data[:, stamp, stamp], masked[:, stamp, stamp], truncated, sky_noise
+
+
+def _with_stars(
+    observation: Observation,
+    part: slice,
+    data: np.ndarray,
+    masked: np.ndarray,
+    truncated: np.ndarray,
+    noise: np.ndarray,
+) -> Stamps:
+    """Return stamps (n, s, s) of a part of the stars with all that is known of these."""
+    # A pixel of +inf is saturated, one of NaN is not.
+    level = observation.saturate
+    saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
+    # Pixels without a number are masked, and 0.
+    finite = np.isfinite(data)
+    if not finite.all():
+        data[~finite] = 0.0
+        masked |= ~finite
+    # Positions in the image; and in an image, centres from the middle of the central pixel.
+    unknown, stars = np.full(len(data), np.nan), observation.stars.select(part)
+    x, y = (unknown, unknown) if observation.positions is None else observation.positions[part].T
+    listed = np.full((len(data), 2), np.nan)
+    raise_flag(stars.flags, StarFlag.TRUNCATED, truncated)
+    if observation.shape is not None:
+        listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
+        # A cosmic ray within a pixel of the position: it may be no star.
+        cosmic = cut_image(observation._layers.bad_pixels.cosmic, observation.shape, x, y, 3, 0)[0]
+        raise_flag(stars.flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
+    return Stamps(
+        data,
+        bad=masked,
+        saturated=saturated,
+        flags=stars.flags,
+        id=stars.id,
+        x=x,
+        y=y,
+        flux=stars.flux,
+        background=stars.background,
+        noise=noise,
+        gain=unknown if observation.gain is None else np.full(len(data), observation.gain),
+        magnitude=unknown,
+        colour=stars.colour,
+        listed=listed,
+    )
 
 
 def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observation:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psfdae.image.stamps import cut_image
 from psfdae.moments import FWHM_OF_SIGMA, robust_scatter, windowed_centres
 
 
@@ -104,10 +105,9 @@ def measure_size(
     light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(place.T)]
     brightest = place[np.argsort(-light, kind="stable")[:stars_max]]
     # Windows (n, s, s) about them; pixels off the image were not measured.
-    rows, columns = (brightest[:, i, None] + np.arange(2 * reach_px + 1) for i in (0, 1))
-    pixels = rows[:, :, None], columns[:, None, :]
-    windows = np.pad(clean, reach_px)[pixels]
-    measured = ~np.pad(bad, reach_px, constant_values=True)[pixels]
+    windows_at = (flat.shape, brightest[:, 1], brightest[:, 0], 2 * reach_px + 1, 0)
+    windows, inside, _ = cut_image(clean, *windows_at)
+    measured = inside & (cut_image(bad, *windows_at)[0] == 0)
     # The centre under a window as wide as the star, of which the first profile knows the width.
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):

@@ -18,35 +18,35 @@ from psfdae.files import ProductError
 from psfdae.joined import joined
 from psfdae.method import Method
 
-OWN = "psfdae.methods"
-
 
 def method(name: str) -> type[Method]:
-    """The method of a name.
+    """Return the class of the method of a name.
 
     Raises
     ------
     ProductError
         If there is none.
     """
-    found = _of_module(f"{OWN}.{name}") or _joined().get(name)
-    if found is None:
+    method_class = _of_module(f"{__name__}.{name}") or _joined().get(name)
+    if method_class is None:
         raise ProductError(f"no method {name!r}; there are {', '.join(k.name for k in known())}")
-    return found
+    return method_class
 
 
 @cache
 def known() -> tuple[type[Method], ...]:
     """Return all methods, the package's own first."""
-    own = [_of_module(f"{OWN}.{name}") for name in _modules(OWN)]
-    return (*filter(None, own), *_joined().values())
+    classes = [_of_module(f"{__name__}.{name}") for name in _modules(__name__)]
+    return (*filter(None, classes), *_joined().values())
 
 
 @cache
 def _joined() -> dict[str, type[Method]]:
     packages = [point.value for point in joined("methods")]
-    found = [_of_module(f"{package}.{name}") for package in packages for name in _modules(package)]
-    return {kind.name: kind for kind in found if kind}
+    classes = [
+        _of_module(f"{package}.{name}") for package in packages for name in _modules(package)
+    ]
+    return {method_class.name: method_class for method_class in classes if method_class}
 
 
 def _modules(package: str) -> list[str]:
@@ -57,9 +57,9 @@ def _of_module(module: str) -> type[Method] | None:
     """Return the method that a module defines; None if it defines none, or is absent."""
     if not (module.rpartition(".")[2].isidentifier() and find_spec(module)):
         return None
-    kinds = [k for k in vars(import_module(module)).values() if isinstance(k, type)]
-    own = [k for k in kinds if issubclass(k, Method) and k.__module__ == module]
-    return own[0] if own else None
+    classes = [value for value in vars(import_module(module)).values() if isinstance(value, type)]
+    methods = [c for c in classes if issubclass(c, Method) and c.__module__ == module]
+    return methods[0] if methods else None
 
 
 def groups_of(name: str, **options: object) -> tuple[str, ...]:

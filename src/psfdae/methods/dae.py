@@ -76,7 +76,7 @@ class Dae(Method):
 
     @classmethod
     def continues(cls, config: Config) -> bool:
-        """Whether a training on templates goes on from one on the realisations."""
+        """Return True if training on templates starts from the network trained on realisations."""
         return bool(config.train.continued_epochs)
 
     @classmethod
@@ -97,27 +97,32 @@ class Dae(Method):
 
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
-        sees = [data.images, data.references, data.fit, data.validation]
+        arrays = [data.images, data.references, data.fit, data.validation]
+        # Warm start: the network begins with the weights of one of the same layers.
         if isinstance(data.start, Dae):
-            known = data.start.network
-            found = (known.kernels, known.widths, data.start.scale)
-            wanted = (tuple(dae.kernels), tuple(dae.widths), dae.scale)
-            if found != wanted:
+            first = data.start.network
+            first_layers = (first.kernels, first.widths, data.start.scale)
+            layers = (tuple(dae.kernels), tuple(dae.widths), dae.scale)
+            if first_layers != layers:
                 raise FitError(
-                    f"dae.kernels, dae.widths, dae.scale = {wanted}: the network to go on from "
-                    f"has {found}"
+                    f"dae.kernels, dae.widths, dae.scale = {layers}: the network to go on from "
+                    f"has {first_layers}"
                 )
             epochs = max(1, round(train.continued_epochs * train.epochs))
             train = train.model_copy(update={"epochs": epochs})
-            sees += [value.numpy() for value in known.state_dict().values()]
-        seen = fingerprint(described, *sees)
+            arrays += [value.numpy() for value in first.state_dict().values()]
+        # A checkpoint of other settings or other data is not resumed.
+        digest = fingerprint(described, *arrays)
         with progress(train.epochs) as report:
             assert data.checkpoint is not None
-            done = train_dae(data, dae, train, data.seed, data.checkpoint, seen, report)
+            training = train_dae(data, dae, train, data.seed, data.checkpoint, digest, report)
         network = Network(dae.kernels, dae.widths)
-        network.load_state_dict(done.result)
+        network.load_state_dict(training.result)
         return cls(
-            channels_last(network).eval(), dae.scale, attempt=done.attempt, history=done.history
+            channels_last(network).eval(),
+            dae.scale,
+            attempt=training.attempt,
+            history=training.history,
         )
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Method `field`: a model of the PSF over the field, and the posterior of stars given this model.
 
-The distribution of the stars is in `psfdae.field_law`; here it is fitted to bright stars, stored,
-and applied to stamps. Equations are numbered as on the page docs/field_model.md.
+The distribution of the stars is in `psfdae.methods.field_law`, and the posterior of a star in
+`psfdae.methods.field_posterior`; here the distribution is fitted to bright stars, stored, and
+applied to stamps. Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -14,18 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import (
-    MARGIN_PX,
-    FieldLaw,
-    FieldSettings,
-    FieldStamps,
-    StarPosterior,
-    batches_of,
-    node_step,
-    phase_of,
-    phases_of,
-)
-from psfdae.field_psf import FieldFit, FieldModel, fit_field, refit_field
 from psfdae.method import (
     Estimate,
     FitError,
@@ -37,6 +26,18 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
+from psfdae.methods.field_fit import FieldFit
+from psfdae.methods.field_law import (
+    MARGIN_PX,
+    FieldLaw,
+    FieldSettings,
+    node_step,
+    phase_of,
+    phases_of,
+)
+from psfdae.methods.field_posterior import FieldStamps, StarPosterior, star_posterior
+from psfdae.methods.field_search import fit_field, refit_field
+from psfdae.methods.field_spline import FieldModel
 from psfdae.moments import measure_shapes, moving_matrices, robust_scatter
 from psfdae.noise import NoiseModel
 from psfdae.progress import steps
@@ -235,7 +236,7 @@ class FieldMixture(FieldLaw, Method):
         # Light that looks like sky.
         images += self.unknown_light * rng.normal(size=(count, 1, 1)) / images[0].size
         images /= images.sum(axis=(1, 2), keepdims=True)
-        return images, position, centre - self._list_offset
+        return images, position, centre - self.list_offset
 
     def fitted_flux_error(self) -> tuple[float, tuple[float, ...]]:
         """Standard error, over the flux, of a fit of the PSF to a star on a known sky.
@@ -312,10 +313,10 @@ class FieldMixture(FieldLaw, Method):
         -------
         ndarray, shape (n, m, m)
         """
-        terms = self._terms(position)[0]
+        terms = self.terms(position)[0]
         phase = (position - np.floor(position + 0.5))[:, 1::-1]
-        images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
-        centred = np.broadcast_to(self._list_offset, phase.shape)
+        images = self.model.images(terms, phase + self.list_offset, self.side, oversampling)
+        centred = np.broadcast_to(self.list_offset, phase.shape)
         total = self.model.images(terms, centred, self.side).sum(axis=(1, 2), keepdims=True)
         return np.asarray(images / total)
 
@@ -431,26 +432,28 @@ class FieldMixture(FieldLaw, Method):
         listed = np.full((count, 2), np.nan) if centre is None else centre
         if len(self.listed) and np.isfinite(self.listed).all():
             listed = listed + self.listed[0]
-        terms, position_known = self._terms(position, count)
+        terms, position_known = self.terms(position, count)
         sky_level = np.nan_to_num(sky)
         stars = FieldStamps(
             images=images - sky_level[:, None],
             noise=np.broadcast_to(noise, count),
             terms=terms,
             position_known=True,
-            log_prior=self._prior(listed),
+            log_prior=self.log_prior(listed),
             centre=None,
             flux=flux,
             sky_known=np.isfinite(sky),
             unit_per_electron=np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
             cell_sigma_px=np.full(count, self.cell_sigma_px),
+            unit=np.ones(count),
         )
         # Stars of known and unknown centre, and of known and unknown position, one after the other.
         centre_known = np.isfinite(listed).all(axis=1) & fixed
         posterior = StarPosterior.empty(count, images.shape[1])
         for has_centre, has_position in np.ndindex(2, 2):
             rows = np.flatnonzero((centre_known == has_centre) & (position_known == has_position))
-            for batch in batches_of(rows):
+            parts = -(-rows.size // self.limits.stars_at_once)
+            for batch in np.array_split(rows, parts) if parts else []:
                 selected = stars.select(batch)._replace(position_known=bool(has_position))
                 if has_centre:
                     # One node, the nearest one, which is taken to be at exactly this centre.
@@ -462,11 +465,11 @@ class FieldMixture(FieldLaw, Method):
                         log_prior=np.where(is_nearest, 0.0, -np.inf),
                         cell_sigma_px=np.zeros(len(batch)),
                     )
-                posterior.set(batch, self._posterior(selected))
+                posterior.set(batch, star_posterior(self, selected))
         measured = Measured(
-            flux=posterior.measurement[:, 0],
-            background=posterior.measurement[:, 1] + sky_level,
-            centre=posterior.measurement[:, 2:] - self._list_offset,
+            flux=posterior.flux,
+            background=posterior.sky + sky_level,
+            centre=posterior.centre - self.list_offset,
             covariance=posterior.covariance,
         )
         return Estimate(

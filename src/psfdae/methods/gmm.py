@@ -1,8 +1,9 @@
 """Method `gmm`: a Gaussian mixture of noise-free stars, whose posterior mean restores the PSF.
 
-The mixture is in `psfdae.mixture_law`; here it is fitted and stored. Equations are numbered as on
-the page docs/mixture.md. Where the training images have noise of their own, as bright stars do, its
-covariance is subtracted from S and every XᵀX, and eigenvalues that would be negative are 0 (eq. 3).
+The mixture is in `psfdae.methods.mixture_law`; here it is fitted and stored. Equations are numbered
+as on the page docs/mixture.md. Where the training images have noise of their own, as bright stars
+do, its covariance is subtracted from S and every XᵀX, and eigenvalues that would be negative are 0
+(eq. 3).
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
+from psfdae.methods.mixture_law import FLAT_VARIANCE, MixtureLaw
 from psfdae.mixing import FLUX_SIGMA
-from psfdae.mixture_law import FLAT_VARIANCE, MixtureLaw
 from psfdae.noise import NoiseModel
 from psfdae.progress import task
 from psfdae.rng import stream

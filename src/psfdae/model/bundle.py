@@ -32,7 +32,7 @@ from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.errors import Error, needed_by
 from psfdae.files import ProductError, atomic_path
 from psfdae.image.errors import one_line
-from psfdae.method import HasConditions, Method
+from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.error_model import ErrorModel
 from psfdae.model.flux_model import FluxModel
@@ -110,8 +110,7 @@ def estimator(bundle: Bundle) -> Method:
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
         fitted = method_class.unpack(bundle.weights, info)
-        conditions = fitted.conditions() if isinstance(fitted, HasConditions) else ()
-        for name, expected, is_fulfilled in conditions:
+        for name, expected, is_fulfilled in fitted.conditions():
             if not np.all(is_fulfilled):
                 raise ValueError(f"array {name!r} must have {expected}")
         if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:

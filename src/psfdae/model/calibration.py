@@ -24,7 +24,6 @@ from psfdae.method import (
     MeasuresStars,
     Method,
     ScoresOutliers,
-    with_free_flux,
 )
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle
@@ -177,7 +176,7 @@ class StarErrors:
         estimate = fitted.estimate(noisy, level, stars.position[star])
         # A method that scores stars by themselves does so in its form for estimated fluxes, as it
         # does for a user's stars.
-        score, free_flux = estimate.outlier_score, with_free_flux(fitted)
+        score, free_flux = estimate.outlier_score, fitted.free_flux()
         if score is None and isinstance(free_flux, ScoresOutliers):
             score = free_flux.outlier_score(noisy, level)
         error = stars.errors(estimate.psf, star, estimate.sigma).astype(np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.fits import described_by
-from psfdae.method import KnowsField, Method, with_free_flux
+from psfdae.method import KnowsField, Method
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
@@ -162,7 +162,7 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # Stars of the model's use have an unknown flux.
-            restorer = with_free_flux(judged)
+            restorer = judged.free_flux()
             # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):

@@ -19,7 +19,6 @@ from psfdae.figures import as_png
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import html_table
-from psfdae.method import facts_of
 from psfdae.model.report_checks import Check, check_stars, method_labels
 from psfdae.model.report_figures import chi2_figure, error_maps, errors_figure, shapes_figure
 
@@ -61,7 +60,7 @@ def quality_page(
     name, images = type(report.model.method).name, report.restored_by_snr
     # Checks of all stars come before the number of stars held out.
     *checks, held_out_check = report.checks()
-    facts = facts_of(report.model.method)
+    facts = report.model.method.facts().values()
     notes = [line for note in report.stars.notes for line in note.splitlines()]
     verdicts, flags = stars["verdict"], stars["flags"]
     # A star has one verdict, and may have several flags.

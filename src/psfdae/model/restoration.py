@@ -35,7 +35,6 @@ from psfdae.method import (
     Method,
     Packing,
     ScoresOutliers,
-    with_free_flux,
 )
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
@@ -125,7 +124,7 @@ class Restorer:
 
     def __init__(self, bundle: Bundle, method: Method) -> None:
         self.bundle, self.method = bundle, method
-        self.free_flux = with_free_flux(method)
+        self.free_flux = method.free_flux()
         packing = method.packing or Packing()
         # Stamps of more than 32 px come in smaller blocks.
         pixels = bundle.info.stamp_px**2

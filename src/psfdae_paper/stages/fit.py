@@ -13,7 +13,6 @@ from typing import Annotated
 import click
 
 from psfdae import fits
-from psfdae.method import GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model.star_sets import read_stars, training_set
 from psfdae.options import File, Folder
@@ -58,8 +57,7 @@ def fit(
     data = training_set(config, method_class, product, split, reference, checkpoint=checkpoint_path)
     # Warm start: a fit to templates begins with the result of one to the realisations.
     if start is not None:
-        can_start = issubclass(method_class, GoesOn) and method_class.continues(config)
-        if reference != "template" or not can_start:
+        if reference != "template" or not method_class.continues(config):
             raise click.UsageError(
                 "--start: only fits to templates by a method with a warm start take it"
             )

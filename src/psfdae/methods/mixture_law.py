@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from psfdae.method import Estimate
+from psfdae.methods.gaussians import ClusterAxes, NoisyCovariance, WoodburyInverse
 from psfdae.mixing import mixing_weights
 from psfdae.noise import NoiseModel
 
@@ -72,133 +73,6 @@ class Cluster(NamedTuple):
     position_whitening: np.ndarray
     common_factor: float
     residual_factor: float
-
-
-class ClusterAxes(NamedTuple):
-    """Eigenvectors of C_k in the leading w coordinates.
-
-    Attributes
-    ----------
-    vectors : ndarray, shape (w, w), float32
-        Columns, by descending variance.
-    variance : ndarray, shape (w,)
-        Variance along each.
-    total_variance : float
-        Sum of the variances.
-    """
-
-    vectors: np.ndarray
-    variance: np.ndarray
-    total_variance: float
-
-
-class AxesInverse(NamedTuple):
-    """G_k⁻¹ of a cluster for any noise variance s above `StarBatch.least_variance` (eq. 4).
-
-    Noise variances s of n stars are arrays of shape (n, 1).
-
-    Attributes
-    ----------
-    vectors : ndarray, shape (m, a), float32
-        Axes V, columns.
-    variance : ndarray, shape (a,)
-        Variance λ along each axis.
-    variance_beyond : float
-        Mean variance λ₀ beyond the axes in the m coordinates; infinite if nothing is beyond.
-    """
-
-    vectors: np.ndarray
-    variance: np.ndarray
-    variance_beyond: float
-
-    def _inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return 1/(λ + s) along the axes, (n, a), and 1/(λ₀ + s) beyond them, (n, 1)."""
-        variance = self.variance.astype(s.dtype)
-        return 1 / (variance + s), 1 / (s.dtype.type(self.variance_beyond) + s)
-
-    def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return the product of rows (n, m) with G⁻¹, (n, m)."""
-        along, beyond = self._inverse(s)
-        axes = rows @ self.vectors
-        # One product with the axes for both: V (λ + s)⁻¹ Vᵀ and the projection V Vᵀ of the rows.
-        both = np.vstack([along * axes, axes]) @ self.vectors.T
-        return np.asarray(both[: len(rows)] + beyond * (rows - both[len(rows) :]))
-
-    def squared_distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of each of the rows x (n, m), with its own noise, (n,)."""
-        along, beyond = self._inverse(s)
-        squares = np.square(rows @ self.vectors)
-        squares_beyond = np.square(rows).sum(axis=1) - squares.sum(axis=1)
-        return np.asarray((squares * along).sum(axis=1) + squares_beyond * beyond[:, 0])
-
-    def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
-        along, beyond = self._inverse(s)
-        row_axes, vector_axes = rows @ self.vectors, vector @ self.vectors
-        return np.asarray(
-            (along * row_axes) @ vector_axes
-            + beyond[:, 0] * (rows @ vector - row_axes @ vector_axes)
-        )
-
-    def squared_distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of every row x (r, m) for every noise variance, (n, r)."""
-        along, beyond = self._inverse(s)
-        squares = np.square(rows @ self.vectors).T
-        return np.asarray(
-            along @ squares + beyond * (np.square(rows).sum(axis=1) - squares.sum(axis=0))
-        )
-
-    def half_log_det(self, s: np.ndarray) -> np.ndarray:
-        """Return ½ ln det G for noise variances s (n,), in the m coordinates, (n,)."""
-        dimensions = len(self.vectors) - len(self.variance)
-        along = np.log(self.variance + s[:, None]).sum(axis=1)
-        beyond = dimensions * np.log(self.variance_beyond + s) if dimensions else 0.0
-        return np.asarray(0.5 * (along + beyond))
-
-
-class WoodburyInverse(NamedTuple):
-    """G_k⁻¹ for one noise variance, which takes far less to compute than axes (eq. 5).
-
-    Methods are those of `AxesInverse`; their argument s only says how many results are wanted.
-
-    Attributes
-    ----------
-    diagonal : ndarray, shape (m,)
-        D⁻¹, with G_k = D + UᵀU and a diagonal D.
-    rows : ndarray, shape (r, m), float32
-        L⁻¹ U D⁻¹, with L Lᵀ = 1 + U D⁻¹ Uᵀ; G_k⁻¹ is D⁻¹ less the products of these.
-    half_log : float
-        ½ ln det G_k.
-    """
-
-    diagonal: np.ndarray
-    rows: np.ndarray
-    half_log: float
-
-    def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return the product of rows (n, m) with G⁻¹, (n, m)."""
-        diagonal = self.diagonal.astype(rows.dtype)
-        return np.asarray(rows * diagonal - (rows @ self.rows.T) @ self.rows)
-
-    def squared_distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of each of the rows x (n, m), (n,)."""
-        explained = np.square(rows @ self.rows.T).sum(axis=1)
-        return np.asarray(np.square(rows) @ self.diagonal.astype(rows.dtype) - explained)
-
-    def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
-        return np.asarray(
-            rows @ (self.diagonal * vector) - (rows @ self.rows.T) @ (self.rows @ vector)
-        )
-
-    def squared_distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of every row x (r, m), the same for every s, (n, r)."""
-        distance = np.square(rows) @ self.diagonal - np.square(rows @ self.rows.T).sum(axis=1)
-        return np.asarray(np.repeat(distance[None], len(s), axis=0))
-
-    def half_log_det(self, s: np.ndarray) -> np.ndarray:
-        """Return ½ ln det G, the same for every s (n,), (n,)."""
-        return np.full(len(s), self.half_log)
 
 
 class StarBatch(NamedTuple):
@@ -376,12 +250,8 @@ class MixtureLaw:
                 if self._restores_images:
                     mean += ((flux[part] - 1.0) / mean.shape[1])[:, None]
             psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (mean, mean_sigma))
-        return Estimate(
-            psf,
-            sigma if with_sigma else None,
-            evidence,
-            flux if self.flux_sigma else None,
-        )
+        flux_or_none = flux if self.flux_sigma else None
+        return Estimate(psf, sigma if with_sigma else None, evidence, flux_or_none)
 
     def _weights(self, batch: StarBatch, near: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the weight of each cluster for each image, (n, K), and the evidence (eq. 6)."""
@@ -454,7 +324,7 @@ class MixtureLaw:
 
     def _pairs(
         self, batch: StarBatch, is_near: np.ndarray, width: int
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, AxesInverse | WoodburyInverse]]:
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, NoisyCovariance]]:
         """Yield each cluster with the images to which it is near, (n, K) of bool.
 
         Yields
@@ -467,7 +337,7 @@ class MixtureLaw:
             Their whitened positions less that of the cluster.
         residual : ndarray, shape (r, width)
             Their leading coordinates less the cluster's mean at this position (eq. 9).
-        inverse : AxesInverse or WoodburyInverse
+        inverse : NoisyCovariance
             G_k⁻¹.
         """
         leading = np.ascontiguousarray(batch.coordinates[:, :width])
@@ -497,7 +367,7 @@ class MixtureLaw:
         ln_grid = np.log(batch.least_variance) + np.linspace(0.0, NOISE_BIN, 41)
         for k, rows, offset, residual, inverse in self._pairs(batch, is_near, width):
             cluster, s = self._clusters[k], batch.noise_variance[rows]
-            distance2 = inverse.squared_distance(residual[:, :m], s)
+            distance2 = inverse.mahalanobis2(residual[:, :m], s)
             half_log_det = inverse.half_log_det(np.exp(ln_grid))
             if width > m:
                 variance = self.variance[m:width]
@@ -611,16 +481,12 @@ class MixtureLaw:
             residual_factor=float(1 / total),
         )
 
-    def _inverse(self, k: int, batch: StarBatch) -> AxesInverse | WoodburyInverse:
+    def _inverse(self, k: int, batch: StarBatch) -> NoisyCovariance:
         """Return G_k⁻¹ for the noise of some images, in the leading coordinates."""
         s, width = batch.least_variance, self._modelled_count(batch.least_variance)
         if batch.common_variance is not None:
             return self._woodbury_inverses(width, batch.common_variance)[k]
-        axes = self._axes(k, width)
-        width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
-        dimensions = width - len(variance)
-        beyond = (axes.total_variance - variance.sum()) / dimensions if dimensions else np.inf
-        return AxesInverse(axes.vectors[:, : len(variance)], variance, float(beyond))
+        return self._axes(k, width).inverse(LEAST_VARIANCE * s)
 
     def _woodbury_inverses(self, width: int, s: float) -> list[WoodburyInverse]:
         """Return G_k⁻¹ of all clusters for one noise variance; those of the last one are kept."""
@@ -635,16 +501,10 @@ class MixtureLaw:
             clusters = [self._clusters[k] for k in numbers]
             common = np.array([[cluster.common_factor] for cluster in clusters])
             factor = np.array([[cluster.residual_factor] for cluster in clusters])
-            # Eq. 5: D, U, U D⁻¹, L, ½ ln det G and L⁻¹ U D⁻¹.
+            # D and U of G_k = D + UᵀU.
             diagonal = common * self.variance[:width] + s
             rows = np.stack([c.residuals[:, :width] for c in clusters])
-            rows = rows * np.sqrt(factor)[..., None]
-            weighted = rows / diagonal[:, None]
-            lower = np.linalg.cholesky(np.eye(size) + weighted @ rows.transpose(0, 2, 1))
-            half_log = 0.5 * np.log(diagonal).sum(axis=1)
-            half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-            solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
-            parts = map(WoodburyInverse, 1.0 / diagonal, solved, half_log)
+            parts = WoodburyInverse.of_stack(diagonal, rows * np.sqrt(factor)[..., None])
             inverses |= dict(zip(numbers, parts, strict=True))
         self._inverse_cache.clear()
         self._inverse_cache[width, s] = [inverses[k] for k in range(len(self.count))]
@@ -658,12 +518,7 @@ class MixtureLaw:
             rows = cluster.residuals[:, :width].astype(np.float64)
             covariance = cluster.residual_factor * (rows.T @ rows)
             covariance[np.diag_indices(width)] += cluster.common_factor * self.variance[:width]
-            variance, vectors = np.linalg.eigh(covariance)
-            self._axes_cache[k, width] = ClusterAxes(
-                np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
-                np.maximum(variance[::-1], 0.0),
-                float(np.trace(covariance)),
-            )
+            self._axes_cache[k, width] = ClusterAxes.of(covariance)
         return self._axes_cache[k, width]
 
     def _distinct_count(self, s: float) -> int:
@@ -716,7 +571,7 @@ class MixtureLaw:
             leading = cluster.common_factor * self.cross[:, :m]
             by_residuals = cluster.residual_factor * cluster.reference_residuals.T
             leading = leading + by_residuals @ cluster.residuals[:, :m]
-        explained = self._inverse(k, batch).squared_distances(leading, s)
+        explained = self._inverse(k, batch).mahalanobis2_of_all(leading, s)
         explained += (1.0 / (self.variance[m:] + s)) @ self._squares[:, m:].T
         if self._restores_images:
             return np.asarray(np.maximum(1.0 - s * explained, 0.0))

@@ -1,0 +1,345 @@
+"""The PSF as splines whose coefficients are polynomials in the position in the field.
+
+What a detector shows of a star whose centre lies at u from a pixel is f(u; x, y), pixel included
+(Anderson & King 2000, PASP 112, 1360; eq. 1 of docs/field_model.md),
+
+    f(u; q) = Σ_k p_k(q) Σ_ij c_kij B(u_row/h − i) B(u_col/h − j),
+
+a sum of cubic B-splines B with the distance h of their knots. The terms p_k are monomials of the
+position q in the field, and of magnitude and colour of the star. Here are the model itself
+(`FieldModel`), and least squares for its coefficients c and for flux and centre of stars, which
+`psfdae.methods.field_fit` puts together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isqrt
+
+import numpy as np
+
+from psfdae.moments import cubic_splines
+
+SLOPE_PX = 0.02
+"""Half of the distance in pixels of two images whose difference is a slope."""
+
+STAR_TERMS = 2
+"""Number of terms, powers from the first on, of the magnitude and of the colour."""
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """A PSF at every place of a field.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (K, N, N)
+        Of the splines, for each of the K terms of the polynomial.
+    low, high : ndarray, shape (2,) to (4,)
+        Range of x and y, and then of magnitude and colour: the PSF does not change with one that
+        has the same ends, or is not there. Beyond a range the PSF is that of its end.
+    spacing : float
+        Of the knots, in pixels.
+    """
+
+    coefficients: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    spacing: float
+
+    @property
+    def order(self) -> int:
+        """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
+        of_place = len(self.coefficients) - STAR_TERMS * len(self.of_star)
+        return (isqrt(8 * of_place + 1) - 3) // 2
+
+    @property
+    def of_star(self) -> np.ndarray:
+        """Numbers of the coordinates beyond x and y with which the PSF changes."""
+        return np.asarray(2 + np.flatnonzero(self.high[2:] > self.low[2:]))
+
+    def terms(self, position: np.ndarray) -> np.ndarray:
+        """Terms of the polynomial, shape (n, K).
+
+        At positions (n, 4) of x, y, magnitude and colour, of which the last ones may be left out of
+        a model that does not change with them.
+        """
+        return field_terms(position, self.low, self.high, self.order)
+
+    def images(
+        self, terms: np.ndarray, centre: np.ndarray, side: int, oversampling: int = 1
+    ) -> np.ndarray:
+        """The field with the star `centre` (n, 2) (row, column) px off the middle, (n, m, m).
+
+        Pixels are every 1/oversampling, that at m//2 = oversampling · (side//2) is the middle;
+        m is side, and one more if oversampled, so that both edges are there. Values are
+        those of whole pixels.
+        """
+        count = side if oversampling == 1 else oversampling * side + 1
+        axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
+        splines = np.tensordot(terms, self.coefficients, 1)
+        return draw_splines(splines, axis, centre, self.spacing)
+
+    def on_lattice(
+        self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
+    ) -> np.ndarray:
+        """Return images (n, r c, m, m) of stars at all pairs of rows (r,) and columns (c,)."""
+        splines = np.tensordot(terms, self.coefficients, 1)
+        axis = np.arange(side) - side // 2
+        down, across = (
+            cubic_splines(axis - at[:, None], splines.shape[-1], self.spacing)
+            for at in (rows, columns)
+        )
+        half = np.tensordot(splines, across, ((2,), (2,)))  # (n, knots, c, m)
+        images = np.tensordot(down, half, ((2,), (1,)))  # (r, m, n, c, m)
+        images = images.transpose(2, 0, 3, 1, 4)
+        return np.asarray(images.reshape(len(terms), -1, side, side))
+
+
+def knots_of(frame_px: int, spacing: float) -> int:
+    """Return the number of knots along a side of a frame, the outermost ½ pixel beyond its edge."""
+    return max(round((frame_px + 1) / spacing), 3) + 1
+
+
+def spacing_of(frame_px: int, knots: int) -> float:
+    """Return the distance of so many knots in pixels."""
+    return (frame_px + 1) / (knots - 1)
+
+
+def field_terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
+    """Return monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
+
+    Powers of other coordinates whose range has two ends are the last terms. What is not known is
+    taken for the middle of its range.
+    """
+    width = np.where(high > low, high - low, 1.0)
+    scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
+    scaled = np.nan_to_num(scaled)
+    x, y, *star_columns = scaled.T
+    powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
+    terms = [x**a * y**b for a, b in powers]
+    counted = (column for column, ends in zip(star_columns, (high > low)[2:], strict=True) if ends)
+    terms += [column**power for column in counted for power in range(1, STAR_TERMS + 1)]
+    return np.stack(terms, axis=1)
+
+
+def draw_splines(
+    splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Return images (n, m, m) on an axis (m,) of coefficients (n, N, N) with centres (n, 2)."""
+    rows, columns = (
+        cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
+    )
+    return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
+
+
+def adjust_stars(
+    splines: np.ndarray,
+    data: np.ndarray,
+    weight: np.ndarray,
+    centre: np.ndarray,
+    axis: np.ndarray,
+    spacing: float,
+    steps: int,
+    sky: bool = False,
+    max_offset_px: float = 1.5,
+    max_step_px: float = 0.3,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps.
+
+    Parameters
+    ----------
+    splines : ndarray, shape (n, N, N)
+        Coefficients of the field at the places of the stars.
+    data, weight : ndarray, shape (n, s, s)
+        Images and 1/variance of their pixels.
+    centre : ndarray, shape (n, 2)
+        First centres (row, column).
+    axis : ndarray, shape (s,)
+        Coordinates of the pixels along a side, in pixels.
+    spacing : float
+        Distance of the knots in pixels.
+    steps : int
+        Number of steps.
+    sky : bool
+        A constant is fitted as well.
+    max_offset_px, max_step_px : float
+        Largest coordinate of a centre, and largest change in one step, in pixels.
+
+    Returns
+    -------
+    flux : ndarray, shape (n,)
+    centre : ndarray, shape (n, 2)
+    residual : ndarray, shape (n, s, s)
+        In units of the flux.
+    """
+    count, flat = len(data), data.reshape(len(data), -1, 1)
+    for _ in range(steps):
+        design = image_design(splines, centre, axis, spacing, sky)
+        weighted = design * weight.reshape(count, 1, -1)
+        parameters = np.linalg.solve(weighted @ design.transpose(0, 2, 1), weighted @ flat)[..., 0]
+        flux = parameters[:, 0]
+        move = np.clip(parameters[:, 1:3] / flux[:, None], -max_step_px, max_step_px)
+        centre = np.clip(centre + move, -max_offset_px, max_offset_px)
+    level = parameters[:, 3, None, None] if sky else 0.0
+    star_images = draw_splines(splines, axis, centre, spacing)
+    return flux, centre, (data - level) / flux[:, None, None] - star_images
+
+
+def image_design(
+    splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
+) -> np.ndarray:
+    """Return the change of images (n, 3 or 4, P) with flux, row, column and, if asked, sky."""
+    # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
+    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
+    place, knots = axis - centre[..., None], splines.shape[-1]
+    rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
+    down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
+    along = splines @ columns.transpose(0, 2, 1)
+    image_across = rows @ splines @ across.transpose(0, 2, 1)
+    parts = [rows @ along, -down @ along, -image_across]
+    parts += [np.ones_like(image_across)] * sky
+    return np.stack(parts, axis=1).reshape(len(centre), len(parts), -1)
+
+
+def solve_splines(
+    terms: np.ndarray,
+    data: np.ndarray,
+    weight: np.ndarray,
+    splines: tuple[np.ndarray, np.ndarray],
+    penalty: np.ndarray,
+    ridge: np.ndarray,
+    start: np.ndarray | None,
+    tolerance: float,
+) -> np.ndarray:
+    """Return coefficients (K, N, N) of weighted least squares with penalties (eq. 2).
+
+    They minimise Σ w (d − f)² + Σ_k η_k |D c_k|² + Σ ρ c², with the second differences D.
+
+    Parameters
+    ----------
+    terms : ndarray, shape (n, K)
+        Terms of the field at the places of the stars.
+    data, weight : ndarray, shape (n, s, s)
+        Images d of flux 1, and 1/variance w of their pixels.
+    splines : (ndarray, ndarray), shape (n, s, N)
+        B-splines of the rows and of the columns of each image.
+    penalty : ndarray, shape (K, 1, 1)
+        Weight η of the squared second differences.
+    ridge : ndarray, shape (K, N, N)
+        Weight ρ of the squared coefficients.
+    start : ndarray, shape (K, N, N), or None
+        First coefficients of the iterations; 0 without.
+    tolerance : float
+        Residual, over the right-hand side, at which the conjugate gradients stop.
+    """
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    shape, knots = ridge.shape, ridge.shape[-1]
+    difference = np.diff(np.eye(knots), 2, axis=0)
+    bend = difference.T @ difference
+    # Normal equations (Σ tᵀ w t + penalty) c = Σ tᵀ w d, solved by conjugate gradients. The
+    # gradients stop at a part of 1e-4: single precision is enough for their products.
+    single = (terms, data, weight, *splines)
+    terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
+    rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
+
+    def normal(flat: np.ndarray) -> np.ndarray:
+        c = flat.reshape(shape)
+        fields = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
+        image = rows @ fields @ columns_t
+        back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
+        smooth = penalty * (bend @ c + c @ bend) + ridge * c
+        return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
+
+    projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
+    # Preconditioner: the terms of a knot are solved for together, as they are far from orthogonal.
+    curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
+    pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+    blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
+    blocks += np.eye(shape[0]) * (6 * penalty.ravel() + ridge.reshape(shape[0], -1).T)[:, None, :]
+    inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
+
+    def nearly(flat: np.ndarray) -> np.ndarray:
+        return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
+
+    coefficients, _ = cg(
+        LinearOperator(size, matvec=normal, dtype=float),
+        (terms.T @ projection).ravel(),
+        None if start is None else start.ravel(),
+        rtol=tolerance,
+        maxiter=150,
+        M=LinearOperator(size, matvec=nearly, dtype=float),
+    )
+    return np.asarray(coefficients).reshape(shape)
+
+
+def deform_splines(
+    prior: FieldModel,
+    terms: np.ndarray,
+    data: np.ndarray,
+    weight: np.ndarray,
+    splines: tuple[np.ndarray, np.ndarray],
+    deformation_sigma: float = 0.3,
+) -> np.ndarray:
+    """Return splines of another exposure, stretched and blurred as its stars show it.
+
+    Their fluxes may be wrong: what is proportional to a star says nothing of its shape.
+
+    Parameters
+    ----------
+    prior : FieldModel
+        Field of the first exposure.
+    terms, data, weight, splines
+        Stars of the other exposure, see `solve_splines`.
+    deformation_sigma : float
+        Standard deviation of the stretch of a PSF between exposures, and of its blur in px².
+
+    Returns
+    -------
+    ndarray, shape (K, N, N)
+    """
+    rows, columns_t = splines[0], splines[1].transpose(0, 2, 1)
+
+    def in_sigma(coefficients: np.ndarray) -> np.ndarray:
+        image = rows @ np.tensordot(terms, coefficients, 1) @ columns_t
+        return np.asarray((image * np.sqrt(weight)).reshape(len(terms), -1))
+
+    scaled_data = (np.sqrt(weight) * data).reshape(len(terms), -1)
+    coefficients = prior.coefficients
+    # Three Gauss-Newton steps.
+    for _ in range(3):
+        # Images of the deformations and the data, all without their part along the star itself.
+        changes, star = deformations(coefficients, prior.spacing), in_sigma(coefficients)
+        star /= np.linalg.norm(star, axis=1, keepdims=True)
+        shapes = np.stack([*map(in_sigma, changes), scaled_data])
+        shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
+        shapes = shapes.reshape(len(shapes), -1)
+        # Normal equations with a prior of the deformations about 0.
+        products = shapes @ shapes.T
+        normal = products[:-1, :-1] + np.eye(len(changes)) / deformation_sigma**2
+        coefficients = coefficients + np.tensordot(
+            np.linalg.solve(normal, products[:-1, -1]), changes, 1
+        )
+    return np.asarray(coefficients)
+
+
+def deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
+    """Return changes of splines (K, N, N) by stretching and blurring them, along three axes each.
+
+    Shape (6, K, N, N): a change of one is that of r → r (1 − a), or of a² added to the variance.
+    """
+    place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
+
+    def slope(values: np.ndarray, axis: int) -> np.ndarray:
+        """Return the slope of a polynomial through five knots."""
+        one_apart, two_apart = (
+            np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2)
+        )
+        return np.asarray((8.0 * one_apart - two_apart) / (12.0 * spacing))
+
+    along_y, along_x = (slope(coefficients, axis) for axis in (1, 2))
+    yy, xy, xx = slope(along_y, 1), slope(along_y, 2), slope(along_x, 2)
+    x, y = place, place[:, None]
+    stretched = (x * along_x, y * along_y, x * along_y + y * along_x)
+    return np.stack([*stretched, xx, yy, xy])
