@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from psfdae import load_model
 from psfdae.cli import main
-from psfdae.model import packing
+from psfdae.model import calibration
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, example_field
 
@@ -32,8 +32,8 @@ WORDS = [
 def few_draws():
     """Errors of models are measured at three levels of noise, on few noisy images."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("NODES", 3), ("FEW_STARS", 40)):
-            patch.setattr(packing, name, value)
+        for name, value in (("NODES", 3), ("MIN_IMAGES", 40)):
+            patch.setattr(calibration, name, value)
         yield
 
 

@@ -9,7 +9,7 @@ import torch
 
 from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.files import read_product
-from psfdae.model.bundle import OPTIONAL
+from psfdae.model.error_model import ErrorModel
 from psfdae.networks.dae import build_dae
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
@@ -52,13 +52,16 @@ def with_network(bundle):
     """The bundle with a network of random weights in place of its method."""
     shape = Architecture(kernels=(5, 3, 5), widths=(4, 4))
     network = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
-    told = bundle.info.model_dump(exclude={"method", "reference", "misfit"})
-    told |= {"dae": shape, "image_scale": 256.0}
+    told = bundle.info.model_dump(exclude={"misfit"})
+    told |= {"method": "dae", "dae": shape, "image_scale": 256.0}
+    errors = bundle.errors
+    unscaled = ErrorModel.uncalibrated(errors.noise, errors.half_width68)
+    limit = errors.distance_limit
     return replace(
         bundle,
         info=BundleInfo(**told),
         weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
-        **dict.fromkeys(OPTIONAL),
+        errors=replace(unscaled, ratio95=errors.ratio95, distance_limit=limit),
     )
 
 

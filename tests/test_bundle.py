@@ -64,11 +64,11 @@ def test_what_was_written_is_read_and_written_again_with_the_same_bytes(handmade
     again = read_bundle(file)
     assert again.info == handmade.info
     assert again.sha256 == handmade.sha256
-    assert again.distance_limit == handmade.distance_limit
+    assert again.errors.distance_limit == handmade.errors.distance_limit
     for name, values in handmade.weights.items():
         assert (again.weights[name] == values).all()
-    for name in ("noise_nodes", "error68", "rms"):
-        assert (getattr(again, name) == getattr(handmade, name)).all()
+    tables = handmade.errors.arrays()
+    assert all((table == tables[name]).all() for name, table in again.errors.arrays().items())
     path, mask = tmp_path / "again.psf.safetensors", os.umask(0)
     os.umask(mask)
     write_bundle(again, path)
@@ -98,7 +98,7 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
     newer = with_text(file.read_bytes(), lambda text: text.update(format_version=7, info="other"))
     path.write_bytes(newer)
     line = command_line.refused("describe", path)
-    assert f"{path}: format 7" in line and "format 3" in line
+    assert f"{path}: format 7" in line and "format 1" in line
 
 
 @pytest.mark.parametrize(
@@ -118,15 +118,15 @@ def test_changed_description_is_refused(file, tmp_path, change):
 @pytest.mark.parametrize(
     "change",
     [
-        {"error68": np.zeros((2, 16, 16))},
-        {"noise_nodes": np.arange(3.0, 0.0, -1.0)},
+        {"half_width68": np.zeros((2, 16, 16))},
+        {"noise": np.arange(8.0, 0.0, -1.0)},
         {"distance_limit": np.nan},
     ],
 )
 def test_arrays_that_do_not_fit_are_not_written(handmade, tmp_path, change):
     path = tmp_path / "x.psf.safetensors"
     with pytest.raises(BundleError, match=r"x\.psf\.safetensors: "):
-        write_bundle(replace(handmade, **change), path)
+        write_bundle(replace(handmade, errors=replace(handmade.errors, **change)), path)
     assert list(tmp_path.iterdir()) == []
 
 

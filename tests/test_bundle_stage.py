@@ -14,16 +14,15 @@ from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.methods import groups_of
-from psfdae.model import packing
 from psfdae.model.bundle import (
     BundleError,
-    brightest,
     estimator,
-    mahalanobis,
     read_bundle,
     shipped_path,
     write_bundle,
 )
+from psfdae.model.calibration import HeldOutStars, StarErrors, crossed_coverage
+from psfdae.model.error_model import at_noise, brightest, mahalanobis
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
@@ -133,17 +132,19 @@ def fresh_stars():
     return gaussians(1500, 99), np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), 1500)), rng
 
 
-def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
+def covered(error, noise, nodes, maps):
+    """Part of the errors (n, d, d) within the half-widths at the noise of each star."""
+    return (np.abs(error) <= at_noise(noise, nodes, maps)).mean()
+
+
+def test_half_width_covers_fresh_stars(tiny):
     config = load_stage(stage.bundle.stage.settings.reads, TINY)
     images, noise, rng = fresh_stars()
     noisy = noise_model(config).draw(images, noise / 4.98, rng)
     error = estimator(tiny).predict(noisy) - images
-    covered = packing.coverage(error, noise, tiny.noise_nodes, tiny.error68)
-    assert covered == pytest.approx(0.6827, abs=0.05)
     for part in np.array_split(np.argsort(noise), 3):
-        within = packing.coverage(error[part], noise[part], tiny.noise_nodes, tiny.error68)
+        within = covered(error[part], noise[part], tiny.errors.noise, tiny.errors.half_width68)
         assert within == pytest.approx(0.6827, abs=0.05)
-    assert packing.coverage(error, noise, tiny.noise_nodes, tiny.rms) > covered + 0.05
     for row in tiny.info.metrics:
         assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
 
@@ -225,7 +226,7 @@ def test_errors_of_some_stars_are_those_stars_errors():
     star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
     error = np.arange(10.0)[None, :, None, None] + np.zeros((2, 10, 4, 4))
     distance = 100.0 + np.arange(20.0).reshape(2, 10)
-    some = packing.Errors(np.array([1.0, 2.0]), error, star, distance).of(
+    some = StarErrors(np.array([1.0, 2.0]), error, star, distance).of(
         np.array([False, True, False, False, True])
     )
     assert some.star.tolist() == [1, 4, 1, 4]
@@ -238,12 +239,10 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     rng, star = np.random.default_rng(0), np.tile(np.arange(400), 10)
     scale = np.where(star % 2, 3.0, 1.0)[:, None, None]
     error = rng.normal(size=(1, 4000, 8, 8)) * scale
-    errors = packing.Errors(np.array([0.01]), error, star, np.zeros((1, 4000)))
-    fresh = rng.normal(size=(400, 8, 8)) * scale[:400]
-    halves = packing.crossed_maps(errors, len(fresh))
-    found = packing.crossed_coverage(halves, errors.nodes, fresh, 0.01)
-    expected = (0.9973 + 0.2611) / 2
-    wanted = {"coverage68": expected, "coverage_rms": expected, "coverage95": (1 + 0.4865) / 2}
+    errors = StarErrors(np.array([0.01]), np.abs(error), star, np.zeros((1, 4000)))
+    fresh = np.abs(rng.normal(size=(400, 8, 8)) * scale[:400])
+    found = crossed_coverage(errors)(fresh, 0.01)
+    wanted = {"coverage68": (0.9973 + 0.2611) / 2, "coverage95": (1 + 0.4865) / 2}
     assert found == pytest.approx(wanted, abs=0.01)
 
 
@@ -307,7 +306,7 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     rows = [row | {"coverage68": 0.5} for row in tiny.info.metrics]
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
-    with pytest.raises(BundleError, match=r"error68 contains 50\.0%"):
+    with pytest.raises(BundleError, match=r"half-widths contain 50\.0%"):
         stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
 
 
@@ -318,11 +317,11 @@ def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_two_thirds_
     zero = np.zeros((2000, 8, 8), np.float32)
     own_noise = np.full(zero.shape, own)
     of = NoiseModel(1.0, 1e4), np.zeros((2000, 4)), np.zeros(2000), own_noise
-    stars = packing.HeldOutStars(zero, rng.normal(0, own, zero.shape), *of)
+    stars = HeldOutStars(zero, rng.normal(0, own, zero.shape), *of)
     psf = rng.normal(0, error, zero.shape)
     few = np.arange(40)
     errors, distance = stars.errors(psf[few], few)[None], np.ones((1, few.size))
-    width = packing.Errors(np.ones(1), errors, few, distance).half_width
+    width = StarErrors(np.ones(1), errors, few, distance).half_width
     assert width.min() > 0 and 0.1 * own < width.mean() < 0.7 * own
-    covered = packing.coverage(stars.errors(psf), np.ones(2000), np.ones(1), width)
-    assert covered == pytest.approx(0.72, abs=0.05)
+    within = covered(stars.errors(psf), np.ones(2000), np.ones(1), width)
+    assert within == pytest.approx(0.72, abs=0.05)

@@ -8,8 +8,8 @@ from psfdae.errors import Error
 from psfdae.image.image_input import ImageInput
 from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag
+from psfdae.model.calibration import StarErrors
 from psfdae.model.crowded import photometry
-from psfdae.model.packing import Errors
 from psfdae.model.settings import from_words
 from small_field import GAIN, READ, SKY, image_of, moffat, ring
 
@@ -73,8 +73,8 @@ def test_limit_of_outliers_knows_how_many_stars_it_rests_on():
         star = np.resize(np.arange(12), 600)
         scores = np.stack([of_star[star] * rng.uniform(0.95, 1.05, 600) for _ in range(2)])
         nodes = np.array([0.01, 0.02])
-        errors = Errors(nodes, np.zeros((2, 600, 2, 2), np.float32), star, scores, scores)
-        beyond.append((rng.chisquare(12, 1000) > errors.strange_limit()[0]).mean())
+        errors = StarErrors(nodes, np.zeros((2, 600, 2, 2), np.float32), star, scores, scores)
+        beyond.append((rng.chisquare(12, 1000) > errors.outlier_limit()[0]).mean())
     assert np.mean(beyond) < 0.01 and np.median(beyond) < 0.005
 
 

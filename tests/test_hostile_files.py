@@ -94,7 +94,7 @@ def model_with(name, change):
         bundle = with_network(bundle) if name.startswith(("dae/", "flux/")) else bundle
         arrays = bundles.bundle_arrays(bundle)
         arrays[name] = np.asarray(change(arrays[name]))
-        return bundles.bundle_bytes(bundle.info.described(), arrays)
+        return bundles.bundle_bytes(bundle.info, arrays)
 
     return changed
 

@@ -14,7 +14,7 @@ import psfdae
 from docs_pages import blocks, read
 from image_training import FIELD, MIXTURE, SIZES, few_draws
 from psfdae.methods import method
-from psfdae.model import packing
+from psfdae.model.calibration import COVERAGE
 from psfdae.model.settings import DATASET_CHOICE, from_words, of_config, settings_model
 from psfdae_paper.configuration.compose import load_stage
 
@@ -80,7 +80,7 @@ def test_errors_of_held_out_stars_are_as_large_as_said(training):
     assert (table.flux_bias.abs() < 3 * table.flux_bias_stderr + 0.01).all()
     assert table.flux_pull.between(0.6, 1.7).all()  # of ten stars
     for name in ("flux", "centre", "psf"):
-        off, doubt = table[f"{name}_within"] - packing.COVERAGE, 3 * table[f"{name}_within_stderr"]
+        off, doubt = table[f"{name}_within"] - COVERAGE, 3 * table[f"{name}_within_stderr"]
         assert (off > -doubt - 0.04).all(), name
         # Errors of centres are too large at S/N 50 where 38 stars are learnt from: 84 % are within.
         assert (off < doubt + (0.16 if name == "centre" else 0.04)).all(), name

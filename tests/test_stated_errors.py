@@ -12,9 +12,10 @@ from command_line import psfdae as command
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_search import excess_scatter
+from psfdae.model.calibration import with_model_errors
 from psfdae.model.crowded import star_flags
 from psfdae.model.fitting import described, fitted_to
-from psfdae.model.packing import StarFacts, with_model_errors, with_wings, without_errors
+from psfdae.model.packing import uncalibrated, with_wings
 from psfdae.model.wings import wings_of_stars
 from small_field import GAIN, READ, SKY, noisy
 
@@ -57,8 +58,7 @@ def fitted(seed):
     stars = psfdae.Stars.from_image(image, place, **camera)
     field = fitted_to(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
-    facts = StarFacts.of(stars.product, "realisation", settings, of_fit)
-    made = without_errors(field, facts, "realisation", "field", "")
+    made, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
     bundle = with_model_errors(psfdae.PsfModel(made), field, 1)
     wings = wings_of_stars(psfdae.PsfModel(bundle), stars.observation.with_margin(2))
     return psfdae.PsfModel(with_wings(bundle, wings))
@@ -114,7 +114,7 @@ def test_no_errors_of_the_model_where_numbers_are_known(models):
     found = models[0].predict(stamps, fixed=True, **given)
     assert (found.background_error == 0).all()
     assert (found.x_error == 0).all()
-    errors = models[0].bundle.model_errors
+    errors = models[0].bundle.errors.measured
     assert (found.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
 
 

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import isfinite
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 1
 """Version of the format, raised when an older psfdae could not read what a newer one writes."""
-
-NETWORK_KEYS = ("dae", "image_scale")
-"""Keys that only the description of a network has."""
-
-METHOD_KEYS = ("method", "reference")
-"""Keys that only the description of another method has."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -35,7 +28,9 @@ class _Described(BaseModel):
 class Architecture(_Described):
     """Shape of the network: kernel sizes of its layers, and channels between them."""
 
-    kernels: Annotated[tuple[Kernel, ...], Field(min_length=2, max_length=100)]
+    kernels: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=31)], ...], Field(min_length=2, max_length=100)
+    ]
     widths: Annotated[tuple[Width, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -66,7 +61,6 @@ class BundleInfo(_Described):
     area A (King 1983, PASP 95, 163) of the typical star of the training.
     """
 
-    format_version: Count = FORMAT_VERSION
     psfdae_version: str
     name: Annotated[str, Field(min_length=1, max_length=255)]
     licence: str
@@ -74,14 +68,14 @@ class BundleInfo(_Described):
     stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)]
     pixel_scale_arcsec: Positive
     pixel_lambda_d: Positive | None = Field(description="None where the optics are unknown")
-    normalisation: Literal["flux"] = Field("flux", description="stamps have the flux 1")
     image_scale: Positive | None = Field(
         None, description="factor from normalised stamps to the network's"
     )
-    # 0-based (row, column) in stamps of side d, without jitter.
-    framing: str = "brightest pixel at (d/2, d/2)"
-    jitter_px: Annotated[int, Field(ge=0)]
+    jitter_px: Annotated[int, Field(ge=0)] = Field(
+        description="the brightest pixel is within this of (d/2, d/2), row and column from 0"
+    )
     subpixel: bool = Field(description="stars lay anywhere in their pixels")
+    kappa: Positive = Field(description="noise at the noise level λ = 1 of the training")
     noise_min: Positive
     noise_max: Positive
     snr_min: Positive
@@ -94,38 +88,21 @@ class BundleInfo(_Described):
     training_stars: Count
     source: Literal["simulated", "stars"]
     dae: Architecture | None = None
-    method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)] = "dae"
-    reference: Literal["realisation", "template"] | None = Field(
-        None, description="What is restored, if the method serves both"
-    )
-    misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+    method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+    reference: Literal["realisation", "template"] = Field(description="what is restored")
+    misfit: Annotated[float, Field(ge=0)] = Field(
         0.0, description="what the method takes for noise besides where it finds the flux"
     )
     config: dict[str, Any] = Field(description="resolved configuration of all stages; wings")
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
 
     @model_validator(mode="after")
-    def _of_its_format(self) -> BundleInfo:
-        """Refuse keys of a network for another method and the reverse, and a missing κ."""
-        needed = NETWORK_KEYS if self.dae or self.method == "dae" else METHOD_KEYS
-        stated = {*NETWORK_KEYS, *METHOD_KEYS} & self.model_fields_set
-        if stated != {*needed} or any(getattr(self, key) is None for key in needed):
-            raise ValueError(f"a model of {self.method} has {' and '.join(needed)}")
-        if not (self.dae or (self.kappa > 0 and isfinite(self.kappa))):
-            raise ValueError("config.train.noise.kappa: must be above 0, methods are given λ by it")
+    def _is_network_or_not(self) -> BundleInfo:
+        """Refuse a network without its shape and scale, and another method with one of them."""
+        is_network = self.method == "dae"
+        if {self.dae is not None, self.image_scale is not None} != {is_network}:
+            raise ValueError("a network, and no other method, has dae and image_scale")
         return self
-
-    @property
-    def kappa(self) -> float:
-        """Noise at the noise level λ = 1 of the training.
-
-        Where it is not stated: 1 for a network, which needs no λ, and 0, which is refused, for
-        other methods.
-        """
-        try:
-            return float(self.config["train"]["noise"]["kappa"])
-        except (LookupError, TypeError, ValueError):
-            return 1.0 if self.dae else 0.0
 
     @property
     def adapted(self) -> str | None:
@@ -143,8 +120,3 @@ class BundleInfo(_Described):
             return bool(self.config["stars"]["telescope"]["assumed"])
         except (LookupError, TypeError):
             return False
-
-    def described(self) -> dict[str, Any]:
-        """Return the description as a file of this format has it."""
-        absent = {*(METHOD_KEYS if self.dae else NETWORK_KEYS)}
-        return self.model_dump(mode="json", exclude=absent if self.misfit else absent | {"misfit"})

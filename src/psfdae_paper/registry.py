@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psfdae.model.bundle import SUFFIX, Bundle, write_bundle
-from psfdae.model.packing import StarFacts, without_errors
+from psfdae.model.packing import uncalibrated
 from psfdae.model.star_sets import read_stars
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.tracking import MODEL, TrackedRun
@@ -86,9 +86,8 @@ def bundle_of(run: TrackedRun) -> Bundle:
     # Groups of settings that tell which stars a fit was trained on, and with which noise.
     groups = ("seed", "noise", "parts")
     config = part(groups, {group: described[group] for group in groups})
-    facts = StarFacts.of(product, run.reference, config, described)
-    fitted = method_class.load(place, run.reference)
-    return without_errors(fitted, facts, run.reference, registered_name(run), "not stated")
+    fitted, name = method_class.load(place, run.reference), registered_name(run)
+    return uncalibrated(fitted, product, run.reference, config, described, name, "not stated")[0]
 
 
 def registered_name(run: TrackedRun) -> str:

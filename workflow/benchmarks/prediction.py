@@ -206,7 +206,7 @@ def quality(result, truth, flux, expected, case):
 
     `coverage95` is of `UNCERT` times `ratio95`.
     """
-    from psfdae.model.bundle import brightest
+    from psfdae.model.error_model import brightest
 
     good = np.isfinite(result.psf).all(axis=(1, 2))
     psf, width = result.psf[good], result.uncertainty[good]
@@ -250,24 +250,23 @@ def refuse(bundle, stars):
 
 def covered(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
-    from psfdae.model import packing
-    from psfdae.model.bundle import brightest, estimator
+    from psfdae.model.bundle import estimator
+    from psfdae.model.calibration import HeldOutStars, calibrated
+    from psfdae.model.error_model import brightest
     from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     settings = part(("seed", "noise", "parts"), trained)
     noise, rng = star_sets.noise_model(settings), stream(seed, "coverage", bundle.info.name)
-    reference = bundle.info.reference or trained.get("reference")
+    reference = bundle.info.reference
     test = star_sets.split_stars(product, trained["split"], settings).test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     is_odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    halves = [
-        packing.HeldOutStars.of(product, reference, noise, test[half]) for half in (is_odd, ~is_odd)
-    ]
+    halves = [HeldOutStars.of(product, reference, noise, test[half]) for half in (is_odd, ~is_odd)]
     cells = {}
     for judges, judged in (halves, halves[::-1]):
-        model = packing.calibrated(bundle, fitted, judges, seed)[0]
+        model = calibrated(bundle, fitted, judges, seed)[0]
         for tested in bundle.info.metrics:
             level = tested["noise_level"]
             flux = float(noise.flux(level))

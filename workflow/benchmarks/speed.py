@@ -144,7 +144,8 @@ def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.bundle_info import Architecture, BundleInfo
     from psfdae.files import read_product
-    from psfdae.model.bundle import OPTIONAL, read_bundle, write_bundle
+    from psfdae.model.bundle import read_bundle, write_bundle
+    from psfdae.model.error_model import ErrorModel
     from psfdae.model.flux_model import FluxModel
     from psfdae.model.packing import leading
     from psfdae.noise import noise_equivalent_px
@@ -152,13 +153,14 @@ def untrained_bundle(tree, stars, out):
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])
     network, factor = random_network(dae, max(dae["widths"]), side)
-    errors = np.ones((len(shipped.noise_nodes), side, side), np.float32)
+    nodes = shipped.errors.noise
     about = {
-        **shipped.info.model_dump(exclude={"method", "reference", "misfit"}),
+        **shipped.info.model_dump(exclude={"misfit"}),
         "stamp_px": side,
         "pixel_scale_arcsec": tree["telescope"]["pixel_scale_arcsec"],
         "image_scale": factor,
         "noise_equivalent_px": noise_equivalent_px(model.mean),
+        "method": "dae",
         "dae": Architecture(kernels=dae["kernels"], widths=dae["widths"]),
     }
     bundle = replace(
@@ -166,9 +168,7 @@ def untrained_bundle(tree, stars, out):
         info=BundleInfo(**about),
         weights={k: v.contiguous().numpy() for k, v in network.state_dict().items()},
         flux_model=leading(model, shipped.info.components),
-        error68=errors,
-        rms=errors,
-        **dict.fromkeys(OPTIONAL),
+        errors=ErrorModel.uncalibrated(nodes, np.ones((len(nodes), side, side), np.float32)),
     )
     write_bundle(bundle, out)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from psfdae.bundle_info import BundleInfo
+from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.cli import command
 from psfdae.image.errors import one_line
 from psfdae.methods import method
@@ -19,9 +19,8 @@ METRIC_COLUMNS = {
     "mse": ("MSE", ".2e"),
     "gain": ("gain", ".3g"),
     "ssim": ("SSIM", ".4f"),
-    "coverage68": ("in error68", ".1%"),
+    "coverage68": ("in 68 %", ".1%"),
     "coverage95": ("in 95 %", ".1%"),
-    "coverage_rms": ("in rms", ".1%"),
 }
 """Heading and number format of each column of the table of errors, by the name of the metric."""
 
@@ -54,7 +53,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     # A network is described by its layers; another method by its name and by what its fit knows
     # about the field, such as the order of the polynomial.
     number_count = sum(array.size for array in bundle.weights.values())
-    normalisation = f"{info.normalisation} 1"
+    normalisation = "flux 1"
     if info.dae:
         normalisation += f"; the network sees it × {info.image_scale:g}"
         kernels, widths = (" ".join(map(str, v)) for v in (info.dae.kernels, info.dae.widths))
@@ -65,11 +64,11 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     star_kind = {"simulated": "simulated stars", "stars": "stars of an image"}[info.source]
     return {
         "Name": info.name,
-        "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",
+        "Format": f"{FORMAT_VERSION}, written {info.created} by psfdae {info.psfdae_version}",
         "Licence": info.licence,
         "SHA-256": bundle.sha256,
         "Stamp": f"{info.stamp_px} × {info.stamp_px} px of {scale}",
-        "Framing": f"{info.framing}, ± {info.jitter_px} px"
+        "Framing": f"brightest pixel at (d/2, d/2), ± {info.jitter_px} px"
         + (", any sub-pixel position" if info.subpixel else ""),
         "Normalisation": normalisation,
         "S/N": f"{info.snr_min:.3g} to {info.snr_max:.3g}",
@@ -78,7 +77,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
         "Trained on": f"{info.training_stars} {star_kind}, SHA-256 {info.training_sha256[:16]}…",
         **({"Adapted to": f"{info.adapted}, after its training"} if info.adapted else {}),
         **({"Light beyond the stamp": str(bundle.wings)} if bundle.wings else {}),
-        "Distance limit": f"{bundle.distance_limit:.3g} in {info.components} components",
+        "Distance limit": f"{bundle.errors.distance_limit:.3g} in {info.components} components",
     }
 
 

@@ -252,7 +252,7 @@ class FieldMixture(FieldLaw, Method):
         error : float
             RMS over the field; 0 of a fit that was stored.
         growth : tuple of 6 floats, or of none
-            How the variance grows with the place, see `psfdae.model.bundle.ModelErrors`: towards
+            How the variance grows with the place (`psfdae.model.error_model.ModelErrors`): towards
             the edge of the field, fewer stars say what the PSF is.
         """
         from scipy.optimize import nnls

@@ -16,18 +16,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from itertools import combinations
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from psfdae.bundle_info import FORMAT_VERSION
 from psfdae.files import atomic_path
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
 from psfdae.image.stamps import StarFlag
-from psfdae.image.tables import as_fits, fits_values, html_table, star_table
+from psfdae.image.tables import COLUMNS, as_fits, fits_values, html_table, star_table
 from psfdae.version import __version__
 
 if TYPE_CHECKING:
@@ -41,12 +41,35 @@ if TYPE_CHECKING:
 class Prediction:
     """PSFs of n stars and what was measured on the way; every star has its row.
 
+    Columns with a number for each star are attributes, arrays of shape (n,): `prediction.flux`.
+    Their list, with units and meanings, is `psfdae.image.tables.COLUMNS`, and the page on
+    `psfdae predict` explains them.
+
     Attributes
     ----------
-    id : ndarray, shape (n,)
-        By the star list, else the number of the star.
-    x, y : ndarray, shape (n,), float64
-        Place in the image by the list, 0-based; NaN where unknown.
+    columns : dict of str to ndarray, shape (n,)
+        Columns by name, in the order of that list. Among them are
+
+        - `id`, `x`, `y`: by the star list; places from 0, NaN where unknown
+        - `flux`, `flux_error`: flux inside the stamp, in the unit of the stamps; the error is NaN
+          where the flux was given
+        - `flux_total`, `flux_total_error`: with the light beyond the stamp (`PsfModel.wings`); NaN
+          if the model knows none
+        - `background`, `noise`: sky level, without the light of the star's wings if the model
+          knows it, and RMS of the sky noise in a pixel
+        - `snr`: of a filter matched to the star as restored, √Σ psf² / noise
+        - `ratio95`, `ratio95_bright`: `uncertainty` times this holds 95 % of the errors, in the
+          brightest pixels the second one
+        - `chi2`: mean of (residual / σ)² over the used pixels, divided by what is expected of it
+        - `distance`: from the training set (`psfdae.model.error_model.mahalanobis`)
+        - `outlier_score`: −2 ln of the probability density of the star by the model's own law of
+          stars, in its leading components; NaN where it has no law
+        - `fwhm_px`, `ellipticity`, `position_angle_deg`: of the PSF (`psfdae.moments`)
+        - `x_fit`, `y_fit`: centre of the star, in the image where the star was cut from one, else
+          in its stamp; NaN if the model's method measures none, and so are its errors, that of the
+          sky, and the correlations `corr_*` of two errors each
+        - `shift_x`, `shift_y`: pixels by which the stamp was moved to centre the star
+        - `flags`: sum of `psfdae.StarFlag`s, uint16
     psf : ndarray, shape (n, d, d), float32
         Noise-free image of the star without sky, in the unit of the stamps: the PSF
         times the flux. NaN where there is no usable flux (flag NO_FLUX).
@@ -55,49 +78,11 @@ class Prediction:
         were not used.
     uncertainty : ndarray, shape (n, d, d), float32
         Half-width that holds 68.27 % of the errors of `psf` at this S/N, of the brightest
-        pixels (`psfdae.model.bundle.brightest`) and of the others, as found on test stars.
-    ratio95, ratio95_bright : ndarray, shape (n,), float64
-        `uncertainty` times this holds 95 % of the errors, in the brightest pixels the second one.
-    flux, flux_error : ndarray, shape (n,), float64
-        Flux inside the stamp, in the unit of the stamps; the error is NaN where the
-        flux was given.
-    flux_total, flux_total_error : ndarray, shape (n,), float64
-        With the light beyond the stamp (`PsfModel.wings`); NaN if the model knows none.
-    background, noise : ndarray, shape (n,), float64
-        Sky level, without the light of the star's wings if the model knows it, and RMS of the sky
-        noise in a pixel.
-    snr : ndarray, shape (n,), float64
-        Of a filter matched to the star as restored, √Σ psf² / noise: flux / (noise √A), with
-        its own noise-equivalent area A.
-    chi2 : ndarray, shape (n,), float64
-        Mean of (residual / σ)² over the used pixels, divided by what is expected of it, which is
-        below 1 where the restored star follows its own noise; σ² is noise² and, if the gain is
-        known, the star's own photon noise. Stars that a model has learnt from have less than 1.
-    distance : ndarray, shape (n,), float64
-        Mahalanobis distance from the training set (`psfdae.model.bundle.mahalanobis`).
-    outlier_score : ndarray, shape (n,), float64
-        −2 ln of the probability density of the star by the model's own law of stars, in its leading
-        components: the square of a Mahalanobis distance. NaN where it has no law.
-    fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
-        Of the PSF (`psfdae.moments`).
-    x_fit, y_fit : ndarray, shape (n,), float64
-        Centre of the star, 0-based: in the image where the star was cut from one, else in
-        its stamp. NaN if the model's method measures none, and so all that follows.
-    x_error, y_error, background_error : ndarray, shape (n,), float64
-        Standard errors.
-    corr_* : ndarray, shape (n,), float64
-        Correlations of two errors each.
-    shift_x, shift_y : ndarray, shape (n,), int16
-        Pixels by which the stamp was moved along columns and rows to centre the star.
-    flags : ndarray, shape (n,), uint16
-        Sum of `psfdae.StarFlag`s.
-    ra, dec : ndarray, shape (n,), float64, or None
-        ICRS coordinates in degrees of (x_fit, y_fit), or of (x, y) where these are NaN; None if
-        the image has no WCS.
+        pixels (`psfdae.model.error_model.brightest`) and of the others, as found on test stars.
     list_columns : Table or None
         n rows of further columns of the star list.
     unit : str
-        Of the stamps; "" where nothing says it.
+        Unit of the stamps; "" where nothing says it.
 
     Examples
     --------
@@ -115,45 +100,38 @@ class Prediction:
     (['id', 'x', 'y', 'flux', 'flux_error'], Unit("adu"))
     """
 
-    id: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    ra: np.ndarray | None = None
-    dec: np.ndarray | None = None
-    flux: np.ndarray
-    flux_error: np.ndarray
-    flux_total: np.ndarray
-    flux_total_error: np.ndarray
-    background: np.ndarray
-    noise: np.ndarray
-    snr: np.ndarray
-    ratio95: np.ndarray
-    ratio95_bright: np.ndarray
-    chi2: np.ndarray
-    distance: np.ndarray
-    outlier_score: np.ndarray
-    fwhm_px: np.ndarray
-    ellipticity: np.ndarray
-    position_angle_deg: np.ndarray
-    x_fit: np.ndarray
-    y_fit: np.ndarray
-    x_error: np.ndarray
-    y_error: np.ndarray
-    background_error: np.ndarray
-    corr_flux_background: np.ndarray
-    corr_flux_y: np.ndarray
-    corr_flux_x: np.ndarray
-    corr_background_y: np.ndarray
-    corr_background_x: np.ndarray
-    corr_y_x: np.ndarray
-    shift_x: np.ndarray
-    shift_y: np.ndarray
-    flags: np.ndarray
+    columns: dict[str, np.ndarray]
     psf: np.ndarray
     residual: np.ndarray
     uncertainty: np.ndarray
     list_columns: Table | None = None
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        # The order of the list, whatever the order in which columns were computed.
+        ordered = {name: self.columns[name] for name in COLUMNS if name in self.columns}
+        object.__setattr__(self, "columns", ordered)
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        """Return a column by its name."""
+        # Unpickling asks for attributes before there are any.
+        columns: dict[str, np.ndarray] = self.__dict__.get("columns", {})
+        if name not in columns:
+            raise AttributeError(f"Prediction has no column {name!r}")
+        return columns[name]
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.columns]
+
+    @property
+    def ra(self) -> np.ndarray | None:
+        """ICRS right ascension of the fitted centre, or of (x, y), in degrees; None without WCS."""
+        return self.columns.get("ra")
+
+    @property
+    def dec(self) -> np.ndarray | None:
+        """ICRS declination of the fitted centre, or of (x, y), in degrees; None without a WCS."""
+        return self.columns.get("dec")
 
     def __len__(self) -> int:
         return len(self.psf)
@@ -179,60 +157,37 @@ class Prediction:
         list come last (`psfdae.image.tables.star_table`).
         """
         # FITS has no unsigned integers.
-        columns = self.columns() | {"flags": self.flags.astype(np.int32)}
+        columns = self.columns | {"flags": self.flags.astype(np.int32)}
         return star_table(columns, self.unit, self.list_columns)
 
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return the arrays with one value for each star, shape (n,), by their names."""
-        return {name: values for name, values in self._arrays().items() if values.ndim == 1}
-
-    def _arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays, shape (n, ...), by their names."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-
     def of(self, rows: slice) -> Self:
-        """Those of some stars."""
-        parts: dict[str, Any] = {name: values[rows] for name, values in self._arrays().items()}
-        if self.list_columns is not None:
-            parts["list_columns"] = self.list_columns[rows]
-        return replace(self, **parts)
+        """Return the predictions of some of the stars."""
+        cubes: dict[str, Any] = {name: getattr(self, name)[rows] for name in CUBES}
+        return replace(
+            self,
+            columns={name: values[rows] for name, values in self.columns.items()},
+            list_columns=None if self.list_columns is None else self.list_columns[rows],
+            **cubes,
+        )
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """One prediction of the stars of several."""
+        """Return one prediction of the stars of several, one after the other."""
+        first = parts[0]
         if len(parts) == 1:
-            return parts[0]
-        columns: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in parts[0]._arrays()
-        }
-        if parts[0].list_columns is not None:
+            return first
+        list_columns = None
+        if first.list_columns is not None:
             from astropy.table import vstack
 
-            columns["list_columns"] = vstack([part.list_columns for part in parts])
-        return replace(parts[0], **columns)
-
-
-def measured_of(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns from centres (row, column) and the covariance of `psfdae.method.Measured`.
-
-    A number that is known has the error 0, and correlates with nothing.
-    """
-    errors = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
-    names = ("flux", "background", "y", "x")
-    columns = {"y_fit": centre[:, 0], "x_fit": centre[:, 1]}
-    columns |= {f"{name}_error": errors[:, i] for i, name in enumerate(names) if i}
-    for i, j in combinations(range(4), 2):
-        product = errors[:, i] * errors[:, j]
-        share = covariance[:, i, j] / np.where(product > 0, product, 1.0)
-        columns[f"corr_{names[i]}_{names[j]}"] = np.where(product > 0, share, 0.0)
-    return columns
-
-
-def unmeasured(count: int) -> dict[str, np.ndarray]:
-    """Columns of `measured_of`, all NaN, for a method that measures nothing."""
-    return dict.fromkeys(measured_of(np.zeros((0, 2)), np.zeros((0, 4, 4))), np.full(count, np.nan))
+            list_columns = vstack([part.list_columns for part in parts])
+        columns = {
+            name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
+        }
+        cubes: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in CUBES
+        }
+        return replace(first, columns=columns, list_columns=list_columns, **cubes)
 
 
 CUBES: dict[str, tuple[str, str]] = {
@@ -244,32 +199,39 @@ CUBES: dict[str, tuple[str, str]] = {
 
 
 class PredictionFile:
-    """A file that is open and as long as it will be; `prediction_file` makes it."""
+    """File that is open and has its full length from the start; `prediction_file` makes it.
 
-    def __init__(self, file: IO[bytes], primary: Header, example: Prediction, count: int):
+    Parameters
+    ----------
+    file : binary file
+    primary : bytes
+        Primary header.
+    example : Prediction
+        Prediction of some of the stars, which says the types of the columns.
+    count : int
+        Number of all stars.
+    """
+
+    def __init__(self, file: IO[bytes], primary: bytes, example: Prediction, count: int) -> None:
         self._file = file
         side, unit = example.psf.shape[-1], example.unit or "adu"
         table = as_fits(example.to_table(), "STARS")
         self._row = table.data.dtype.newbyteorder(">")
-        self._offset: dict[str, int] = {}
-        file.write(_text(primary))
-        for name, (extension, about) in CUBES.items():
-            header = _cube_header(extension, about, count, side, unit)
-            self._append(name, header, 4 * count * side**2)
-        self._append("stars", _with_flags(table.header, count), count * self._row.itemsize)
+        headers = {name: _cube_header(*CUBES[name], count, side, unit) for name in CUBES}
+        # Bytes of a star in each data unit, and where the unit starts.
+        self._star_bytes = dict.fromkeys(CUBES, 4 * side**2) | {"stars": self._row.itemsize}
+        self._start: dict[str, int] = {}
+        file.write(primary)
+        for name, header in {**headers, "stars": _table_header(table.header, count)}.items():
+            file.write(header.tostring().encode("ascii"))
+            self._start[name] = file.tell()
+            # A data unit ends with a whole block; its stars are written later.
+            blocks = -(-count * self._star_bytes[name] // BLOCK_BYTES)
+            file.seek(self._start[name] + blocks * BLOCK_BYTES)
         file.truncate(file.tell())
-
-    def _append(self, name: str, header: Header, size: int) -> None:
-        """Write the header of a data unit, remember where it starts, and go to its end."""
-        self._file.write(_text(header))
-        self._offset[name] = self._file.tell()
-        self._file.seek(self._offset[name] + -(-size // BLOCK_BYTES) * BLOCK_BYTES)
 
     def write(self, start: int, prediction: Prediction) -> None:
         """Write the stars from number `start` on."""
-        for name in CUBES:
-            cube = getattr(prediction, name)
-            self._put(name, start * cube[0].nbytes if len(cube) else 0, cube.astype(">f4"))
         table = prediction.to_table()
         rows = np.zeros(len(table), dtype=self._row)
         for name in table.colnames:
@@ -277,69 +239,78 @@ class PredictionFile:
             # FITS keeps truth values as the letters T and F.
             is_truth = values.dtype.kind == "b"
             rows[name] = np.where(values, ord("T"), ord("F")) if is_truth else values
-        self._put("stars", start * self._row.itemsize, rows)
-
-    def _put(self, name: str, place: int, values: np.ndarray) -> None:
-        self._file.seek(self._offset[name] + place)
-        self._file.write(values.tobytes())
+        cubes = {name: getattr(prediction, name).astype(">f4") for name in CUBES}
+        for name, values in {**cubes, "stars": rows}.items():
+            self._file.seek(self._start[name] + start * self._star_bytes[name])
+            self._file.write(values.tobytes())
 
 
 @contextmanager
 def prediction_file(
     path: Path, bundle: Bundle, example: Prediction, count: int, cards: Sequence[Card], history: str
 ) -> Iterator[PredictionFile]:
-    """A `PredictionFile` for so many stars that gets its name if the block succeeds.
+    """Open a `PredictionFile` for so many stars that gets its name if the block succeeds.
 
-    `example` is that of some of the stars, which says the types of the columns; `cards` are
-    further provenance.
+    Parameters
+    ----------
+    path : Path
+    bundle : Bundle
+        Model of the predictions.
+    example : Prediction
+        Prediction of some of the stars, which says the types of the columns.
+    count : int
+        Number of stars.
+    cards : sequence of Card
+        Further provenance for the primary header.
+    history : str
+        The command.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        primary = _primary_header(bundle, cards, history)
-        yield PredictionFile(file, primary, example, count)
+        yield PredictionFile(file, _primary_header(bundle, cards, history), example, count)
 
 
-def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Header:
+def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> bytes:
+    """Return the primary header: the model, further cards, and the command."""
     from astropy.io import fits
 
     info, header = bundle.info, fits.PrimaryHDU().header
     header["EXTEND"] = True
-    own: list[Card] = [
+    model_cards: list[Card] = [
         ("CREATOR", f"psfdae {__version__}", "program that made this file"),
         ("PSFMODEL", info.name, "model bundle"),
         ("PSFSHA", bundle.sha256, ""),
-        ("PSFFORM", info.format_version, "format of the bundle"),
+        ("PSFFORM", FORMAT_VERSION, "format of the bundle"),
         ("STAMPPX", info.stamp_px, "[pix] side of the stamps"),
         ("NOISEAPX", info.noise_equivalent_px, "[pix] noise-equivalent area of a typical star"),
         ("SNRMIN", info.snr_min, "least S/N of the training"),
         ("SNRMAX", info.snr_max, "largest S/N of the training"),
-        ("DISTMAX", bundle.distance_limit, "largest distance that raises no flag"),
+        ("DISTMAX", bundle.errors.distance_limit, "largest distance that raises no flag"),
+        *(bundle.wings.cards() if bundle.wings else []),
     ]
-    own += bundle.wings.cards() if bundle.wings else []
     with warnings.catch_warnings():
         # A long value leaves no room for its comment, which astropy reports.
         warnings.simplefilter("ignore", fits.verify.VerifyWarning)
-        for key, value, comment in (*own, *cards):
-            header[key] = (
-                ascii_line(value) if isinstance(value, str) else value,
-                ascii_line(comment),
-            )
+        for key, value, comment in (*model_cards, *cards):
+            text = ascii_line(value) if isinstance(value, str) else value
+            header[key] = (text, ascii_line(comment))
         header["HISTORY"] = ascii_line(history)
-        header.tostring()
-    return header
+        encoded: bytes = header.tostring().encode("ascii")
+    return encoded
 
 
-def _cube_header(name: str, about: str, count: int, stamp_px: int, unit: str) -> Header:
+def _cube_header(name: str, meaning: str, count: int, stamp_px: int, unit: str) -> Header:
+    """Return the header of a cube of n images of a side, in the unit of the stamps."""
     from astropy.io import fits
 
     header = fits.ImageHDU(np.zeros((1, stamp_px, stamp_px), np.float32), name=name).header
     header["NAXIS3"] = count
     header["BUNIT"] = (ascii_line(unit), "as in the input")
-    header["COMMENT"] = about
+    header["COMMENT"] = meaning
     header["COMMENT"] = "The star is about pixel (d/2, d/2), 0-based."
     return header
 
 
-def _with_flags(header: Header, count: int) -> Header:
+def _table_header(header: Header, count: int) -> Header:
     """Return the header of a table of so many stars, with the meaning of their flags."""
     header["NAXIS2"] = count
     for flag in StarFlag:
@@ -347,9 +318,3 @@ def _with_flags(header: Header, count: int) -> Header:
         header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name
         header["COMMENT"] = f"{int(flag)} {flag.name}: {flag.meaning}"
     return header
-
-
-def _text(header: Header) -> bytes:
-    """A header as it stands in the file."""
-    encoded: bytes = header.tostring().encode("ascii")
-    return encoded

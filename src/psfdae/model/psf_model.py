@@ -9,21 +9,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
 from psfdae.image.camera import other_instruments
-from psfdae.image.containers import parts_of_array, sigma_of
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.method import KnowsField, Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
-from psfdae.model.field_psfs import FieldPsfs, PredictionError, real_numbers
+from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.prediction import Prediction
 from psfdae.model.restoration import Restorer
+from psfdae.model.stamp_arrays import stamps_of_arrays
 from psfdae.model.wings import Wings
 from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, one_thread_each, side_by_side
@@ -177,55 +177,17 @@ class PsfModel(FieldPsfs):
         PredictionError
             If shapes or types do not fit.
         """
-        values, masked, sigma, unit = _unpacked(stamps)
-        if noise is None and sigma is not None:
-            noise = np.nanmedian(sigma, axis=(-2, -1))
-        facts = {"flux": flux, "background": background, "noise": noise, "gain": gain}
-        facts = {name: _without_unit(name, value, unit) for name, value in facts.items()}
-        if masked is not None:
-            bad = masked if bad is None else masked | np.asarray(bad, dtype=bool)
+        # A margin below 0 leaves no side that fits.
+        side = self.stamp_px + 2 * margin if margin >= 0 else 0
+        numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
-        stars = self._stamps(values, margin, facts, masks, position, centre)
+        stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
+        # Blocks of stars, side by side.
         blocks = self.restorer.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
         with one_thread_each():
             parts = side_by_side(lambda block: self.restorer.restore(block, fixed), blocks, threads)
         return replace(Prediction.joined(parts), unit=unit)
-
-    def _stamps(
-        self,
-        stamps: ArrayLike,
-        margin: int,
-        facts: Mapping[str, ArrayLike | None],
-        masks: Mapping[str, ArrayLike | None],
-        position: ArrayLike | None,
-        centre: ArrayLike | None,
-    ) -> Stamps:
-        """Return the arguments of `predict` as stamps, checked."""
-        data = real_numbers("stamps", stamps)
-        is_single = data.ndim == 2
-        data = data[None] if is_single else data
-        side = self.info.stamp_px + 2 * margin
-        if margin < 0 or data.ndim != 3 or data.shape[1:] != (side, side):
-            size = "×".join(str(n) for n in data.shape)
-            raise PredictionError(
-                f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
-            )
-        finite = np.isfinite(data)
-        x, y, mag, colour = _numbers("position", position, len(data), 4).T
-        return Stamps(
-            data=data if finite.all() else np.where(finite, data, 0),
-            bad=_mask("bad", masks["bad"], data, is_single) | ~finite,
-            saturated=_mask("saturated", masks["saturated"], data, is_single),
-            flags=np.zeros(len(data), dtype=np.uint16),
-            id=np.arange(len(data)),
-            x=x,
-            y=y,
-            magnitude=mag,
-            colour=colour,
-            listed=_numbers("centre", centre, len(data), 2)[:, ::-1],
-            **{name: _per_star(name, value, len(data)) for name, value in facts.items()},
-        )
 
     def stream(
         self, observation: Observation, threads: int | None = None, fixed: bool = False
@@ -251,13 +213,14 @@ class PsfModel(FieldPsfs):
                 x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
                 y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
                 sky = observation.on_sky(x, y)
-                ra, dec = (None, None) if sky is None else sky
-                list_rows = None if list_columns is None else list_columns[rows]
-                unit = observation.unit
-                yield (
-                    stamps,
-                    replace(prediction, ra=ra, dec=dec, list_columns=list_rows, unit=unit),
+                columns = {} if sky is None else dict(zip(("ra", "dec"), sky, strict=True))
+                on_sky = replace(
+                    prediction,
+                    columns=prediction.columns | columns,
+                    list_columns=None if list_columns is None else list_columns[rows],
+                    unit=observation.unit,
                 )
+                yield stamps, on_sky
                 advance(len(prediction))
 
     @property
@@ -281,7 +244,7 @@ class PsfModel(FieldPsfs):
         Standard errors over the flux (n,) of stars on a known sky.
         """
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
-        errors = self.bundle.model_errors
+        errors = self.bundle.errors.measured
         fitted_error = errors.fitted_flux * errors.flux_factor(place)
         return np.asarray(np.hypot(fitted_error, error / (1.0 + light)))
 
@@ -308,10 +271,8 @@ class PsfModel(FieldPsfs):
         difference : str
             Empty if all that both headers and lists name is the same.
         """
-        stars = self.info.config.get("stars")
-        stars = stars if isinstance(stars, Mapping) else {}
-        trained_on = stars.get("instrument")
-        trained_on = dict(trained_on) if isinstance(trained_on, Mapping) else {}
+        stars = self.info.config.get("stars", {})
+        trained_on = dict(stars.get("instrument", {}))
         if colour_column and "colour_column" in stars:
             key = "the column of colours"
             trained_on[key] = stars["colour_column"]
@@ -372,66 +333,3 @@ class PsfModel(FieldPsfs):
                 f"{self.info.name!r} was trained on {model_scale:.6g} arcsec{assumed} "
                 f"(tolerance {100 * SCALE_TOLERANCE:g} %){advice}"
             )
-
-
-def _unpacked(
-    stamps: Any,
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
-    """Return numbers, mask, σ and unit of stamps in any container; None, None, "" without them."""
-    if hasattr(stamps, "uncertainty") and hasattr(stamps, "mask"):  # an NDData
-        mask = stamps.mask if stamps.mask is None else np.asarray(stamps.mask, dtype=bool)
-        unit = "" if stamps.unit is None else str(stamps.unit)
-        return np.asarray(stamps.data), mask, sigma_of(stamps), unit
-    if hasattr(stamps, "fileinfo"):  # an HDU, or a list of them
-        raise PredictionError(
-            f"{type(stamps).__name__} in place of stamps: its array is its attribute data; "
-            "psfdae.Stars.from_image takes images in FITS files"
-        )
-    values, mask, unit = parts_of_array(stamps)
-    return values, mask, None, unit
-
-
-def _without_unit(name: str, value: Any, unit: str) -> Any:
-    """Return a quantity as numbers in the unit of the stamps, or electrons per that for a gain."""
-    if not hasattr(value, "to_value"):
-        return value
-    stamp_unit = unit or "ct"
-    if name == "gain":
-        stamp_unit = f"electron / ({stamp_unit})"
-    try:
-        return value.to_value(stamp_unit)
-    except (ValueError, TypeError):
-        raise PredictionError(
-            f"{name} in {value.unit}, but that of the stamps is {stamp_unit or 'none'}"
-        ) from None
-
-
-def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, is_single: bool) -> np.ndarray:
-    """Return a mask of the shape of the stamps (n, s, s); of a single one, it may be (s, s)."""
-    if mask is None:
-        return np.zeros(data.shape, dtype=bool)
-    array = np.asarray(mask, dtype=bool)
-    array = array[None] if is_single else array
-    if array.shape != data.shape:
-        raise PredictionError(f"{name} of shape {array.shape}, but stamps of shape {data.shape}")
-    return array
-
-
-def _numbers(name: str, values: ArrayLike | None, count: int, max_columns: int) -> np.ndarray:
-    """Return two numbers per star, or up to `max_columns` (n, max_columns); NaN where unknown."""
-    numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
-    if numbers.shape not in [(count, columns) for columns in range(2, max_columns + 1)]:
-        raise PredictionError(
-            f"{name} of shape {numbers.shape}, expected ({count}, 2)"
-            + f" to ({count}, {max_columns})" * (max_columns > 2)
-        )
-    missing = np.full((count, max_columns - numbers.shape[1]), np.nan)
-    return np.hstack([numbers, missing], dtype=np.float64)
-
-
-def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
-    """Return one number per star, (n,), NaN where it is not known."""
-    numbers = real_numbers(name, np.nan if value is None else value).astype(np.float64)
-    if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
-        raise PredictionError(f"{name} of shape {numbers.shape}, expected one for {count} stamps")
-    return np.broadcast_to(numbers, (count,))

@@ -4,7 +4,7 @@ Each star goes through three steps, and no star influences another one:
 
 1. `Restorer._centred`: the star is moved to the middle of its stamp, and its flux, sky and noise
    are found by the mean PSF of the training (`psfdae.model.photometry`).
-2. The method restores its PSF: `Restorer._by_own_fluxes` for a method that measures flux, sky and
+2. The method restores its PSF: `restored_by_measurement` for a method that measures flux, sky and
    centre itself (`psfdae.methods.field`), `Restorer._by_photometry` for all others.
 3. `Restorer._prediction`: half-widths of the errors, χ², light beyond the stamp, shape and flags.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,10 +36,11 @@ from psfdae.method import (
     Packing,
     ScoresOutliers,
 )
-from psfdae.model.bundle import Bundle, ModelErrors, at_noise, brightest, mahalanobis
+from psfdae.model.bundle import Bundle
+from psfdae.model.error_model import ErrorModel, mahalanobis
 from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
 from psfdae.model.photometry import Photometer, Photometry
-from psfdae.model.prediction import Prediction, measured_of, unmeasured
+from psfdae.model.prediction import Prediction
 from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
 
@@ -93,8 +94,11 @@ class RestoredStars(NamedTuple):
     has_no_flux : ndarray of bool, shape (n,)
     outlier_score : ndarray, shape (n,)
         How unlike all training stars a star is; NaN where the method has no score.
-    centre_columns : dict of ndarray
-        Columns of `Prediction` on centres; empty unless the method measures stars.
+    centre : ndarray, shape (n, 2)
+        Centre (row, column) by the method, in the image if the stars are those of one, else in
+        their stamps; NaN unless the method measures stars.
+    covariance : ndarray, shape (n, 4, 4)
+        Covariance of flux, sky, row and column; NaN unless the method measures stars.
     """
 
     psf: np.ndarray
@@ -102,7 +106,8 @@ class RestoredStars(NamedTuple):
     photometry: Photometry
     has_no_flux: np.ndarray
     outlier_score: np.ndarray
-    centre_columns: dict[str, np.ndarray]
+    centre: np.ndarray
+    covariance: np.ndarray
 
 
 class Restorer:
@@ -152,7 +157,8 @@ class Restorer:
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
             centred = [self._centred(part, fixed) for part in parts]
             if isinstance(self.method, MeasuresStars):
-                restored = [self._by_own_fluxes(part, self.method) for part in centred]
+                errors = self.bundle.errors
+                restored = [restored_by_measurement(part, self.method, errors) for part in centred]
             else:
                 restored = self._by_photometry(centred)
             predictions = map(self._prediction, centred, restored)
@@ -193,82 +199,6 @@ class Restorer:
 
     # Step 2: the method.
 
-    def _by_own_fluxes(self, centred: CentredStars, method: MeasuresStars) -> RestoredStars:
-        """Restore stars with the fluxes that the method measures in place of the photometry.
-
-        The photometry repairs bad pixels and tells the noise.
-        """
-        stars, photometry = centred.stars, centred.photometry
-        stamps, bad, border_level = centred.stamps, centred.bad, centred.border_level
-        has_flux = np.isfinite(stars.flux)
-        is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
-        # Stamps above the level of their border, with bad pixels as the photometry repaired them.
-        level = border_level[:, None, None]
-        repaired = (
-            photometry.images * photometry.flux[:, None, None]
-            + photometry.background[:, None, None]
-        )
-        repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
-        data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
-        # Stamps without anything to measure: bad, constant, or beyond any number.
-        modulus = np.abs(data).max(axis=(1, 2))
-        has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
-        is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
-        is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
-        data = np.where(is_unusable[:, None, None], 0.0, data)
-        # σ² of a pixel: that of the sky, and the mean of the star's photons.
-        noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
-        photons = np.maximum(photometry.flux, 0.0) / stars.gain / stamps[0].size
-        noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
-        flux = np.where(has_flux, stars.flux, photometry.flux)
-        star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
-        place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
-        estimate = method.measure(
-            data,
-            noise,
-            place,
-            stars.listed - centred.shift,
-            centred.has_exact_centre,
-            flux=stars.flux,
-            sky=stars.background - border_level,
-            gain=stars.gain,
-        )
-        measured = estimate.measured
-        assert measured is not None and estimate.sigma is not None
-        errors = self.bundle.model_errors
-        place_factor = errors.flux_factor(np.stack([stars.x, stars.y], axis=1))
-        covariance = _with_model_errors(measured.covariance, measured.flux, errors, place_factor)
-        flux_error = np.sqrt(covariance[:, 0, 0])
-        flux = np.where(has_flux, stars.flux, measured.flux)
-        has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
-        flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
-        raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
-        is_faint = ~has_flux & ~has_no_flux & (flux < FAINT_SNR * flux_error)
-        raise_flag(flags, StarFlag.FAINT, is_faint)
-        raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
-        # The same photometry with the method's fluxes and skies.
-        unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
-        images = (data - measured.background[:, None, None]) / unit
-        sky = border_level + measured.background
-        photometry = replace(
-            photometry,
-            flux=np.where(is_unusable, np.nan, flux),
-            flux_error=np.where(has_flux | is_unusable, np.nan, flux_error),
-            background=np.where(is_unusable, photometry.background, sky),
-            images=np.where(has_no_flux[:, None, None], 0.0, images).astype(np.float32),
-            flags=flags,
-        )
-        # The pixel at the middle of the stamp as it was given, in the image if that is known.
-        middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
-        middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
-        columns = measured_of(middle + centred.shift + measured.centre, covariance)
-        columns = {name: np.where(has_no_flux, np.nan, v) for name, v in columns.items()}
-        estimate.psf[has_no_flux] = estimate.sigma[has_no_flux] = np.nan
-        score = np.full(len(has_no_flux), np.nan)
-        if self.bundle.strange_limit is not None and estimate.outlier_score is not None:
-            score[~has_no_flux] = estimate.outlier_score[~has_no_flux]
-        return RestoredStars(estimate.psf, estimate.sigma, photometry, has_no_flux, score, columns)
-
     def _by_photometry(self, centred: Sequence[CentredStars]) -> list[RestoredStars]:
         """Restore stars with the fluxes of the photometry, which the method may correct.
 
@@ -279,45 +209,36 @@ class Restorer:
         info = self.bundle.info
         photometry = Photometry.joined([part.photometry for part in centred])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
-        mean_psf = self.bundle.flux_model.mean.reshape(photometry.images.shape[1:])
-
-        def normalised_images() -> tuple[np.ndarray, np.ndarray]:
-            """Return images of flux 1, and their noise; a mean PSF for stars without flux."""
-            images = photometry.images
-            if has_no_flux.any():
-                images = np.where(has_no_flux[:, None, None], mean_psf, images)
-                images = images.astype(photometry.images.dtype)
-            noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
-            return images, np.where(has_no_flux, info.noise_max, noise)
-
+        has_flux = ~has_no_flux
         # Factors of the fluxes, within what a correction may be.
         near_clusters: dict[str, Any] = {}
-        is_free = ~has_no_flux & np.concatenate(
+        is_free = has_flux & np.concatenate(
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
         if is_free.any() and isinstance(self.free_flux, FindsFlux):
-            images, noise = normalised_images()
+            images, noise = self._normalised(photometry, has_no_flux)
             level = np.hypot(noise, info.misfit) / info.kappa
             factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
             photometry = photometry.with_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
         psf, sigma = np.full_like(photometry.images, np.nan), None
-        score = np.full(len(has_no_flux), np.nan)
+        score = np.full(len(has_flux), np.nan)
         # Stars of a catalogue that reaches far beyond the image have all no flux.
-        if not has_no_flux.all():
-            images, noise = normalised_images()
-            estimate = self.method.estimate(images, noise / info.kappa, **near_clusters)
+        if has_flux.any():
+            images, noise = self._normalised(photometry, has_no_flux)
+            level = noise / info.kappa
+            estimate = self.method.estimate(images, level, **near_clusters)
             psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
-            for array in (psf, sigma):
-                if array is not None:
-                    array[has_no_flux] = np.nan
-            if self.bundle.strange_limit is not None:
-                clusters = {name: v[~has_no_flux] for name, v in near_clusters.items()}
-                level = noise[~has_no_flux] / info.kappa
+            psf[has_no_flux] = np.nan
+            if sigma is not None:
+                sigma[has_no_flux] = np.nan
+            if self.bundle.errors.outlier_limit is not None:
                 assert isinstance(self.free_flux, ScoresOutliers)
-                images = images[~has_no_flux]
-                score[~has_no_flux] = self.free_flux.outlier_score(images, level, **clusters)
-        # The parts again.
+                clusters = {name: values[has_flux] for name, values in near_clusters.items()}
+                score[has_flux] = self.free_flux.outlier_score(
+                    images[has_flux], level[has_flux], **clusters
+                )
+        # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred)])
         return [
             RestoredStars(
@@ -326,72 +247,83 @@ class Restorer:
                 photometry.part(rows),
                 has_no_flux[rows],
                 score[rows],
-                {},
+                np.full((rows.stop - rows.start, 2), np.nan),
+                np.full((rows.stop - rows.start, 4, 4), np.nan),
             )
             for rows in (slice(*pair) for pair in pairwise(ends))
         ]
+
+    def _normalised(
+        self, photometry: Photometry, has_no_flux: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return images (n, d, d) of flux 1 and their noise (n,); a mean PSF where is no flux."""
+        images = photometry.images
+        if has_no_flux.any():
+            mean_psf = self.bundle.flux_model.mean.reshape(images.shape[1:])
+            images = np.where(has_no_flux[:, None, None], mean_psf, images).astype(images.dtype)
+        noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
+        return images, np.where(has_no_flux, self.bundle.info.noise_max, noise)
 
     # Step 3: errors and flags.
 
     def _prediction(self, centred: CentredStars, restored: RestoredStars) -> Prediction:
         """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
-        bundle, info = self.bundle, self.bundle.info
+        info, errors = self.bundle.info, self.bundle.errors
         stars, flags, photometry = centred.stars, centred.flags, restored.photometry
-        psf, sigma, measures_stars = restored.psf, restored.sigma, bool(restored.centre_columns)
+        psf, sigma = restored.psf, restored.sigma
+        measures_stars = isinstance(self.method, MeasuresStars)
+        # Noise over the flux: the unit of the training, on which errors and limits depend.
         noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
         snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
-        flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
-        distance = mahalanobis(photometry.images, noise, bundle.flux_model, info.components)
+        distance = mahalanobis(photometry.images, noise, self.bundle.flux_model, info.components)
+        # PSFs, their errors and what is left of the stamps, in the unit of the stamps.
         flux = photometry.flux.astype(np.float32)[:, None, None]
-        half_width, ratio95, flux_error_scale = _error_widths(bundle, psf, sigma, noise, stars)
-        uncertainty = flux * half_width
+        half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
         psf *= flux
         residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
         residual[~photometry.used] = np.nan
+        flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
+        chi2 = _chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
+        # A method that measures stars has the star's photons in its errors. It knows the noise of
+        # bright stars, and comes ever nearer to the star itself: it has no upper limit of the S/N.
+        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
+        photons = np.where(measures_stars, 0.0, photons)
+        flux_error = np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons)
+        # Flags beside those of centring, photometry and method.
+        is_unlike = errors.is_unlike_training(noise, distance, restored.outlier_score)
         flags |= photometry.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
-        # A method that measures stars knows their noise, and comes ever nearer to the star itself.
         is_bright = snr > info.snr_max * SNR_TOLERANCE
         raise_flag(flags, StarFlag.SNR_HIGH, (not measures_stars) & is_bright)
-        is_unlike = distance > bundle.distance_limit
-        if bundle.strange_limit is not None:
-            limit = np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
-            is_unlike |= restored.outlier_score > limit
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
-        chi2 = _chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
-        # Photons of the star, unless they are in the errors of the method already.
-        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
-        if measures_stars:
-            photons[:] = 0.0
-        centres: dict[str, Any] = restored.centre_columns or unmeasured(len(stars))
-        flux_error = np.sqrt((flux_error_scale * photometry.flux_error) ** 2 + photons)
+        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
+        columns = {
+            "id": stars.id,
+            "x": stars.x,
+            "y": stars.y,
+            "flux": photometry.flux,
+            "flux_error": flux_error,
+            "noise": photometry.noise,
+            "snr": snr,
+            "ratio95": ratio95[:, 0],
+            "ratio95_bright": ratio95[:, 1],
+            "chi2": chi2,
+            "distance": distance,
+            "outlier_score": restored.outlier_score,
+            "fwhm_px": shapes.fwhm_px,
+            "ellipticity": shapes.ellipticity,
+            "position_angle_deg": shapes.position_angle_deg,
+            "shift_x": centred.shift[:, 1],
+            "shift_y": centred.shift[:, 0],
+            "flags": flags,
+        }
+        columns |= self._total_fluxes(stars, photometry, flux_error)
+        columns |= _centre_columns(restored.centre, restored.covariance)
         return Prediction(
-            id=stars.id,
-            x=stars.x,
-            y=stars.y,
-            psf=psf,
-            residual=residual,
-            uncertainty=uncertainty,
-            ratio95=ratio95[:, 0],
-            ratio95_bright=ratio95[:, 1],
-            flux=photometry.flux,
-            flux_error=flux_error,
-            **self._total_fluxes(stars, photometry, flux_error),
-            noise=photometry.noise,
-            snr=snr,
-            chi2=chi2,
-            distance=distance,
-            outlier_score=restored.outlier_score,
-            fwhm_px=shapes.fwhm_px,
-            ellipticity=shapes.ellipticity,
-            position_angle_deg=shapes.position_angle_deg,
-            shift_x=centred.shift[:, 1],
-            shift_y=centred.shift[:, 0],
-            flags=flags,
-            **centres,
+            columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
         )
 
     def _total_fluxes(
@@ -413,69 +345,133 @@ class Restorer:
         return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
 
 
-def _error_widths(
-    bundle: Bundle, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how wide the errors of PSFs of flux 1 are.
+def restored_by_measurement(
+    centred: CentredStars, method: MeasuresStars, errors: ErrorModel
+) -> RestoredStars:
+    """Restore stars with the fluxes that the method measures in place of the photometry.
 
-    All depends on which of noise, flux and sky of a star were estimated.
+    The photometry repairs bad pixels and tells the noise.
 
     Parameters
     ----------
-    bundle : Bundle
-    psf : ndarray, shape (n, d, d)
-    sigma : ndarray, shape (n, d, d), or None
-        By the method.
-    noise : ndarray, shape (n,)
-        Pixel RMS over the flux.
-    stars : Stamps
-        Flux, sky and noise as they were given; NaN where they were estimated.
+    centred : CentredStars
+    method : MeasuresStars
+    errors : ErrorModel
+        Errors of measured stars due to errors of the model, which are added to those of the method.
+    """
+    stars, photometry, border_level = centred.stars, centred.photometry, centred.border_level
+    data, noise, is_unusable = _measurable_stamps(centred)
+    has_flux = np.isfinite(stars.flux)
+    # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
+    # that of its flux.
+    flux = np.where(has_flux, stars.flux, photometry.flux)
+    star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
+    place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
+    estimate = method.measure(
+        data,
+        noise,
+        place,
+        stars.listed - centred.shift,
+        centred.has_exact_centre,
+        flux=stars.flux,
+        sky=stars.background - border_level,
+        gain=stars.gain,
+    )
+    # Errors of the method, by noise, and those of its model add up.
+    measured = estimate.measured
+    assert measured is not None and estimate.sigma is not None
+    covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
+    flux_error = np.sqrt(covariance[:, 0, 0])
+    # A flux that was given counts if the photometry could use it, another one above its error.
+    flux = np.where(has_flux, stars.flux, measured.flux)
+    is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
+    has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
+    flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
+    raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
+    is_faint = ~has_flux & ~has_no_flux & (flux < FAINT_SNR * flux_error)
+    raise_flag(flags, StarFlag.FAINT, is_faint)
+    raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
+    # The same photometry with the method's fluxes and skies.
+    unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
+    images = (data - measured.background[:, None, None]) / unit
+    sky = border_level + measured.background
+    photometry = replace(
+        photometry,
+        flux=np.where(is_unusable, np.nan, flux),
+        flux_error=np.where(has_flux | is_unusable, np.nan, flux_error),
+        background=np.where(is_unusable, photometry.background, sky),
+        images=np.where(has_no_flux[:, None, None], 0.0, images).astype(np.float32),
+        flags=flags,
+    )
+    # Centres count from the middle of the stamp as it was given: its pixel in the image if that is
+    # known.
+    middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
+    middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
+    centre = middle + centred.shift + measured.centre
+    score = estimate.outlier_score
+    score = np.full(len(flux), np.nan) if score is None else score.copy()
+    for array in (estimate.psf, estimate.sigma, centre, covariance, score):
+        array[has_no_flux] = np.nan
+    return RestoredStars(
+        estimate.psf, estimate.sigma, photometry, has_no_flux, score, centre, covariance
+    )
+
+
+def _measurable_stamps(centred: CentredStars) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stamps above the level of their border, repaired, with their noise.
 
     Returns
     -------
-    half_width : ndarray, shape (n, d, d)
-        Of the interval that holds 68 % of the errors.
-    ratio95 : ndarray, shape (n, 2)
-        Its factor for 95 %, of faint and of bright pixels.
-    flux_error_scale : ndarray, shape (n,)
-        Factor of the error of the flux.
+    data : ndarray, shape (n, d, d), float64
+        0 in stamps that are unusable.
+    noise : ndarray, shape (n,)
+        Standard deviation of a pixel.
+    is_unusable : ndarray of bool, shape (n,)
+        True if a stamp has nothing to measure: bad, constant, or beyond any number.
     """
-    rows = np.arange(len(noise))
-    # Errors of stars of known flux and sky, at this noise, in units of the method's σ.
-    half_width = at_noise(noise, bundle.noise_nodes, bundle.error68)
-    if sigma is not None:
-        half_width = half_width * sigma
-    ratio = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
-    ratio95 = np.stack([ratio, ratio], axis=1)
-    if (scales := bundle.scales(noise)) is None:
-        return half_width, ratio95, np.ones(len(noise))
-    # Factors of the case: nothing, the flux, or flux and sky estimated; the noise known or not.
-    estimates_noise, estimates_flux, estimates_sky = (
-        np.isnan(values) for values in (stars.noise, stars.flux, stars.background)
+    photometry, stamps, bad = centred.photometry, centred.stamps, centred.bad
+    # Bad pixels as the photometry repaired them, or the level of the border where it could not.
+    is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
+    level = centred.border_level[:, None, None]
+    repaired = (
+        photometry.images * photometry.flux[:, None, None] + photometry.background[:, None, None]
     )
-    case = np.where(estimates_sky, 2, estimates_flux.astype(int))
-    scale68, scale95 = (table[rows, estimates_noise.astype(int), case] for table in scales[:2])
-    faint_scale, bright_scale = scale68.T.astype(np.float32)[:, :, None, None]
-    half_width = half_width * np.where(brightest(psf), bright_scale, faint_scale)
-    flux_error_scale = np.where(estimates_flux & estimates_sky, scales[2], np.ones(len(noise)))
-    return half_width, ratio95 * scale95 / scale68, flux_error_scale
+    repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
+    data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
+    # Stamps need as many good pixels as the photometry asks for, and any contrast.
+    modulus = np.abs(data).max(axis=(1, 2))
+    has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
+    is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
+    is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
+    data = np.where(is_unusable[:, None, None], 0.0, data)
+    # σ² of a pixel: that of the sky, and the mean of the star's photons.
+    noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
+    photons = np.maximum(photometry.flux, 0.0) / centred.stars.gain / stamps[0].size
+    noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
+    return data, noise, is_unusable
 
 
-def _with_model_errors(
-    covariance: np.ndarray, flux: np.ndarray, errors: ModelErrors, place_factor: np.ndarray
-) -> np.ndarray:
-    """Return covariances (n, 4, 4) of flux, sky, row and column with the errors of the model too.
+def _centre_columns(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns on centres, and on errors beside that of the flux.
 
-    These are `place_factor` (n,) times those of the field. A number that is known, whose
-    variance is almost 0, stays so.
+    Parameters
+    ----------
+    centre : ndarray, shape (n, 2)
+        (row, column), or NaN.
+    covariance : ndarray, shape (n, 4, 4)
+        Covariance of flux, sky, row and column, or NaN. A number that is known has the error 0,
+        and correlates with nothing.
     """
-    unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
-    model_sigma = np.concatenate([unit * [errors.flux, errors.sky], zeros + errors.centre], axis=1)
-    model_sigma *= place_factor[:, None]
-    variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
-    known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
-    model_sigma[np.sqrt(variance) < known_sigma] = 0.0
-    return np.asarray(covariance + model_sigma[:, :, None] ** 2 * np.eye(4))
+    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+    names = ("flux", "background", "y", "x")
+    columns = {"y_fit": centre[:, 0], "x_fit": centre[:, 1]}
+    columns |= {f"{name}_error": sigma[:, i] for i, name in enumerate(names) if i}
+    # ρ_ij = C_ij / (σ_i σ_j).
+    for i, j in combinations(range(4), 2):
+        product = sigma[:, i] * sigma[:, j]
+        correlation = covariance[:, i, j] / np.where(product > 0, product, 1.0)
+        columns[f"corr_{names[i]}_{names[j]}"] = np.where(product == 0, 0.0, correlation)
+    return columns
 
 
 def _chi2(

@@ -18,9 +18,10 @@ from psfdae.image.tables import shown_with_digits
 from psfdae.method import Method
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
+from psfdae.model.calibration import COVERAGE
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.flux_model import signal_to_noise
-from psfdae.model.packing import COVERAGE, checksum
+from psfdae.model.packing import checksum
 from psfdae.model.plot import psf_map
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.report import checks_html, quality_page
@@ -469,7 +470,7 @@ def _predict_all(
     )
     # Batches of a stream: columns and PSFs are joined, residuals are kept for few stars only.
     for _, prediction in itertools.chain.from_iterable(streams):
-        for name, values in prediction.columns().items():
+        for name, values in prediction.columns.items():
             columns.setdefault(name, []).append(values)
         psfs.append(prediction.psf)
         in_batch = (shown >= count) & (shown < count + len(prediction))

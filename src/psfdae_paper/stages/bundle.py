@@ -127,12 +127,12 @@ def ship(
         print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
     source = min(errors, key=errors.__getitem__)
     packed = read_bundle(source)
-    # The stated 68 % errors must contain 68 ± 5 % of the errors at every noise level.
+    # The stated half-widths must contain 68 ± 5 % of the errors at every noise level.
     low, high = 0.63, 0.73
     for row in packed.info.metrics:
         if not low <= row.get("coverage68", 0.0) <= high:
             raise BundleError(
-                f"{source}: at noise level {row.get('noise_level', 0.0):g} error68 contains "
+                f"{source}: at noise level {row.get('noise_level', 0.0):g} half-widths contain "
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     # Its stars are simulated: it has the licence of the package.
