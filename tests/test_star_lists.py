@@ -107,6 +107,13 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
     assert next(observation.chunks(100)).id[0] == 100
 
 
+def test_a_votable_opens_no_address(tmp_path, image):
+    path = tmp_path / "s.vot"
+    path.write_text('<VOTABLE><STREAM href="file:///etc/hostname"/></VOTABLE>')
+    with pytest.raises(Error, match="data are not in it"):
+        ImageInput(image, catalogue=path).open(16)
+
+
 @pytest.mark.parametrize("form", [daophot, stetson, regions])
 def test_lists_that_count_from_1(tmp_path, image, place, form):
     listed = [(k + 5, x + 1, y + 1) for k, (x, y) in enumerate(place)]

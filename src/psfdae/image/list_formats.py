@@ -125,9 +125,14 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
 
 
 def votable(path: Path, content: bytes) -> Table:
-    """Read the only table with rows of a VOTable."""
+    """Read the only table with rows of a VOTable.
+
+    Data that lie elsewhere are refused: astropy would open any address that a file names.
+    """
     from astropy.io.votable import parse
 
+    if re.search(rb"<!ENTITY|<(?:\w+:)?STREAM\b[^>]*\bhref", content):
+        raise ObservationError(path, "a VOTable whose data are not in it; write them into it")
     # Tables of other things than stars may be there without rows.
     with reading(path):
         tables = [

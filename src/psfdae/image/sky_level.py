@@ -193,8 +193,13 @@ def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarra
     """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
     from photutils.background import Background2D
 
-    meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
-    level, sigma = meshes.background_mesh, meshes.background_rms_mesh
+    # Squares of the pixels of an image in a very small or large unit would be 0 or infinite.
+    good = {"where": ~bad, "initial": 0.0}
+    largest = max(float(image.max(**good)), -float(image.min(**good)))
+    unit = 1.0 if largest == 0.0 or 1e-9 < largest < 1e15 else largest
+    values = image if unit == 1.0 else image / unit
+    meshes = Background2D(values, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
+    level, sigma = unit * meshes.background_mesh, unit * meshes.background_rms_mesh
     neighbours = _of_neighbours(level)
     # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
     # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself

@@ -354,8 +354,10 @@ def wings_of(
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
     unit_sigma = float(sigma.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
-    even_variance = uniform_filter(np.square(sigma / unit_sigma), stamp_px, mode="nearest")
-    even_sigma = unit_sigma * np.sqrt(even_variance)
+    variance = np.square(sigma / unit_sigma)
+    even_variance = uniform_filter(variance, stamp_px, mode="nearest")
+    # A mean is not below the least value, but for the rounding of running sums.
+    even_sigma = unit_sigma * np.sqrt(np.maximum(even_variance, variance.min()))
     # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
     # of A is (F s h_k, 1)/σ of a pixel and d its residual over σ; the same in blocks of a stamp.
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
