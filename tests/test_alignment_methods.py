@@ -10,7 +10,7 @@ from torch import nn
 from psfdae.networks.training import train
 from psfdae_paper.alignment.emulator import StampEmulator
 from psfdae_paper.alignment.likelihood import (
-    Likelihood,
+    StateLikelihood,
     StateOptics,
     bound_covariances,
     deviance_and_information,
@@ -231,7 +231,7 @@ def test_noise_free_parameters_are_recovered(model, scene3, noise, movable):
     images, _ = optics(parameters)
     flux = 1 + parameters[:, 4::3] if movable else np.ones((2, 9))
     assert images.sum(axis=(2, 3)) == pytest.approx(flux)
-    likelihood = Likelihood(optics, noise, 0.002, images)
+    likelihood = StateLikelihood(optics, noise, 0.002, images)
     settings = scene3.fit.model_copy(update={"iterations": 25, "tolerance": 1e-7})
     fit = likelihood.maximise(optics.parameters_of(truth + 0.08), settings)
     assert fit.converged.all()
@@ -245,7 +245,7 @@ def test_scatter_of_the_fit_is_the_bound(model, scene3, noise, states, stamps, m
     optics = StateOptics(model, _optics(scene3, movable))
     level, truth = 2e-4, states[:20]
     images = noise.draw(stamps[:20], level, np.random.default_rng(7))
-    fit = Likelihood(optics, noise, level, images).maximise(
+    fit = StateLikelihood(optics, noise, level, images).maximise(
         optics.parameters_of(truth + 0.01), scene3.fit
     )
     covariances = bound_covariances(optics, noise, [level], truth, [movable])[0, 0]
@@ -291,7 +291,7 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, scene3, noise, mova
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt), tilt])
     images, _ = optics(optics.parameters_of(truth))
-    likelihood = Likelihood(optics, noise, 0.002, images)
+    likelihood = StateLikelihood(optics, noise, 0.002, images)
     settings = scene3.fit.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
     twin = optics.parameters_of(twin_states(model, truth))

@@ -22,7 +22,7 @@ from psfdae.model.bundle import (
     write_bundle,
 )
 from psfdae.model.flux_model import FluxModel, robust_flux
-from psfdae.networks.dae import build_dae, predict
+from psfdae.networks.dae import build_dae, run_network
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_network_of_a_bundle_is_the_one_that_was_packed(file, handmade, gaussian
     shape = handmade.info.dae
     model = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
     estimate = estimator(read_bundle(file)).predict(gaussian_stars)
-    assert (estimate == predict(model, gaussian_stars, 256.0)).all()
+    assert (estimate == run_network(model, gaussian_stars, 256.0)).all()
 
 
 def test_completed_covariance_measures_fluxes_as_the_whole_one(gaussian_stars):

@@ -10,7 +10,7 @@ import pytest
 
 from psfdae.bright_stars import LEAST_SKY, BrightStars
 from psfdae.image.stamps import cut, sky_around
-from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, signal_to_noise
+from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, stamp_snr
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
 from psfdae.moments import shift_stamps, windowed_centres
 from psfdae.noise import NoiseModel, noise_equivalent_px
@@ -63,16 +63,16 @@ def test_signal_to_noise_is_that_of_king_s_area():
     rng = np.random.default_rng(2)
     noisy = flux * star + rng.normal(0, noise, (400, 16, 16))
     expected = flux / (noise * np.sqrt(noise_equivalent_px(star[0])))
-    measured = signal_to_noise(noisy, np.full(400, noise))
+    measured = stamp_snr(noisy, np.full(400, noise))
     assert measured.mean() == pytest.approx(expected, rel=3e-4)
     assert measured.std() == pytest.approx(1.0, abs=0.15)  # its error is one unit
-    assert (signal_to_noise(noisy, np.zeros(400)) == 0).all()
+    assert (stamp_snr(noisy, np.zeros(400)) == 0).all()
 
 
 def test_area_of_a_star_follows_from_its_signal_to_noise():
     """A = (F / (σ S/N))² is King's 1/Σp², where noise is low."""
     stars, noise = bright_stars([[0.2, 0.4], [0.0, -0.3]]), np.array([0.3, 0.7])
-    measured = replace(stars, noise=noise, snr=signal_to_noise(stars.stamps, noise))
+    measured = replace(stars, noise=noise, snr=stamp_snr(stars.stamps, noise))
     area = [noise_equivalent_px(image / image.sum()) for image in stars.stamps]
     assert measured.area() == pytest.approx(area, rel=1e-3)
 

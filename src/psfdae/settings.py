@@ -3,7 +3,7 @@
 A group of settings is a class. Its keys are read from keywords, from words `group.key=value` of
 a command line or from YAML; each wrong one is named with its value and the allowed range.
 
-Plain mappings go into `validate`, and checked, immutable groups come out. `deciding`, `leaves` and
+Plain mappings go into `validated_settings`, and checked, immutable groups come out. `deciding`, `leaves` and
 `as_overrides` turn groups into mappings and texts again.
 """
 
@@ -51,7 +51,7 @@ class ConfigError(Error, ValueError):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
+def validated_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
     """Check a configuration tree against a pydantic model.
 
     Parameters

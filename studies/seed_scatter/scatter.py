@@ -23,7 +23,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 from psfdae.files import read_product
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
-from psfdae.networks.dae import DaeTraining, predict
+from psfdae.networks.dae import DaeTraining, run_network
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 
@@ -118,7 +118,7 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: s
         for weights, state in states.items():
             model.load_state_dict(state)
             for level, images in zip(levels, noisy, strict=True):
-                error = predict(model, images, training.factor) - truth
+                error = run_network(model, images, training.factor) - truth
                 mean = error.mean(axis=0)
                 rows.append(
                     [

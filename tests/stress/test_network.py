@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.stats import binom
 
-from psfdae.networks.dae import Dae, predict, train_dae
+from psfdae.networks.dae import DaeNetwork, run_network, train_dae
 from psfdae.networks.training import TrainingError
 from stress.bench import THREADS
 
@@ -97,8 +97,8 @@ def fate(bench, *settings):
     except Exception as error:  # which one is the question
         return type(error).__name__
     config = narrow(bench)
-    model = Dae(config.kernels, config.widths)
+    model = DaeNetwork(config.kernels, config.widths)
     model.load_state_dict(outcome.result)
     finite = all(torch.isfinite(value).all() for value in outcome.result.values())
-    alive = finite and predict(model, bench.seidel.images[:20], bench.factor).any()
+    alive = finite and run_network(model, bench.seidel.images[:20], bench.factor).any()
     return LIVE if alive else "a dead network"

@@ -126,7 +126,7 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.networks.dae import predict
+    from psfdae.networks.dae import run_network
     from psfdae.threads import one_thread_each, side_by_side
 
     side, factor, network = model.stamp_px, model.info.image_scale, model.method.network
@@ -137,7 +137,7 @@ def bare_rate(model, stamps, threads, way):
     blocks = rounds * np.array_split(images, range(size, len(images), size))
 
     def apply(images):
-        return predict(network, images, factor, size)
+        return run_network(network, images, factor, size)
 
     if way == "shared":
         threads_before = torch.get_num_threads()

@@ -66,11 +66,11 @@ def network(dae, size, threads):
     """`predict` with a random network, as every stage calls it."""
     import torch
 
-    from psfdae.networks.dae import predict
+    from psfdae.networks.dae import run_network
 
     torch.set_num_threads(threads)
     model, factor = random_network(dae, *size)
-    return lambda images: predict(model, images, factor, len(images))
+    return lambda images: run_network(model, images, factor, len(images))
 
 
 def time_networks(dae, sizes, batches, threads, repeats):

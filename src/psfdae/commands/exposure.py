@@ -13,7 +13,7 @@ from psfdae.options import File
 
 
 @command("exposure")
-def exposure(
+def exposure_command(
     image: Annotated[File, {"argument": True}],
     options: ImageStatements,
     overwrite: Annotated[bool, "Replace a file that exists."] = False,

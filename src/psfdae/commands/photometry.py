@@ -35,7 +35,7 @@ class PhotometryError(Error, ValueError):
 
 
 @command("photometry")
-def photometry(
+def photometry_command(
     image: Annotated[File, {"argument": True}],
     options: ImageStatements,
     zero_point: Annotated[float | None, "Magnitude of a flux of 1."] = None,

@@ -41,7 +41,7 @@ def write_list(observation: Observation, path: Path) -> None:
 
 
 @command("predict")
-def predict(
+def predict_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
     options: ImageStatements,
     all_extensions: Annotated[

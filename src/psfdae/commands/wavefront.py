@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @command("wavefront")
-def wavefront(
+def wavefront_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
     options: ImageStatements,
     telescope: Annotated[File, "YAML file of the telescope, as in config/telescope."],

@@ -17,7 +17,7 @@ import numpy as np
 
 from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
-from psfdae.image.list_formats import read_table
+from psfdae.image.list_formats import read_list_table
 from psfdae.image.position_columns import (
     CONVENTIONS,
     ColumnError,
@@ -297,7 +297,7 @@ def read_catalogue(path: Path) -> Catalogue:
     ObservationError
         If the file cannot be read, or has no stars.
     """
-    return _catalogue(path, read_table(path))
+    return _catalogue(path, read_list_table(path))
 
 
 def as_catalogue(star_list: StarList) -> Catalogue:

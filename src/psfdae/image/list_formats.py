@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 
-def read_table(path: Path) -> Table:
+def read_list_table(path: Path) -> Table:
     """Read the table of stars of a file.
 
     Raises

@@ -27,7 +27,7 @@ from psfdae.image.star_criteria import (
     misfit,
     piled_up,
     sharper_than_stars,
-    signal_to_noise,
+    stamp_snr,
     wider_than_stars,
 )
 from psfdae.moments import FWHM_OF_SIGMA, shift_stamps, windowed_centres
@@ -262,7 +262,7 @@ def measure_stamps(
     centring = settings.centring_px or 0.0
     peak, is_centred = brightest_pixels(light, reach_px, centring)
     flux = cut(light, side, peak).sum(axis=(1, 2))
-    snr = signal_to_noise(cut(light, side), noise)
+    snr = stamp_snr(cut(light, side), noise)
     # A star that is smoothed to be centred has its brightest pixel anywhere.
     if centring:
         highest_light = cut(light, side).max((1, 2))
@@ -408,7 +408,7 @@ def completed(
         light = filled[incomplete]
         peak = brightest_pixels(light, search_px, centring_px)[0]
         flux = cut(light, stamp_px, peak).sum(axis=(1, 2))
-        snr = signal_to_noise(cut(light, stamp_px), stars.noise[incomplete])
+        snr = stamp_snr(cut(light, stamp_px), stars.noise[incomplete])
         usable = (flux > 0) & (snr > 0)
         missing[incomplete[~usable]] = 1.0
         row = incomplete[usable]

@@ -17,7 +17,7 @@ from psfdae.moments import robust_scatter
 # Brightness.
 
 
-def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def stamp_snr(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
 
     For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with

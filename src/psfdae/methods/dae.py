@@ -26,7 +26,7 @@ from psfdae.settings import Config, deciding
 
 if TYPE_CHECKING:
     from psfdae.bundle_info import BundleInfo
-    from psfdae.networks.dae import Dae as Network
+    from psfdae.networks.dae import DaeNetwork
     from psfdae.settings import Evaluation
 
 WEIGHTS = "dae.safetensors"
@@ -40,7 +40,7 @@ class Dae(Method):
 
     Parameters
     ----------
-    network : Network
+    network : DaeNetwork
     scale : "mean", "none" or float
         Of images for the network: as the setting, or the factor itself.
     batch : int
@@ -65,7 +65,7 @@ class Dae(Method):
 
     def __init__(
         self,
-        network: Network,
+        network: DaeNetwork,
         scale: Literal["mean", "none"] | float,
         batch: int = 256,
         attempt: int = 0,
@@ -90,8 +90,7 @@ class Dae(Method):
         FitError
             If it is to go on from a network of another shape or scale of images.
         """
-        from psfdae.networks.dae import Dae as Network
-        from psfdae.networks.dae import train_dae
+        from psfdae.networks.dae import DaeNetwork, train_dae
         from psfdae.networks.training import fingerprint, progress
         from psfdae.networks.weights import channels_last
 
@@ -116,7 +115,7 @@ class Dae(Method):
         with progress(train.epochs) as report:
             assert data.checkpoint is not None
             training = train_dae(data, dae, train, data.seed, data.checkpoint, digest, report)
-        network = Network(dae.kernels, dae.widths)
+        network = DaeNetwork(dae.kernels, dae.widths)
         network.load_state_dict(training.result)
         return cls(
             channels_last(network).eval(),
@@ -127,9 +126,9 @@ class Dae(Method):
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
-        from psfdae.networks.dae import predict
+        from psfdae.networks.dae import run_network
 
-        return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
+        return run_network(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
 
     def factor(self, stamp_px: int) -> float:
         """Return the factor from images of sum 1 to those that the network sees."""
@@ -151,18 +150,23 @@ class Dae(Method):
         """Read a network; the two files must be of the same training."""
         import torch
 
-        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.dae import DaeNetwork
         from psfdae.networks.weights import with_weights
-        from psfdae.settings import validate
+        from psfdae.settings import validated_settings
 
         described, batch = cls.described(place), 256
         settings = from_tree(
-            place / CONFIG, described, "dae", make=lambda tree: validate(DaeSettings, tree)
+            place / CONFIG,
+            described,
+            "dae",
+            make=lambda tree: validated_settings(DaeSettings, tree),
         )
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)
             batch = evaluation.batch
-        network = with_weights(lambda: Network(settings.kernels, settings.widths), place / WEIGHTS)
+        network = with_weights(
+            lambda: DaeNetwork(settings.kernels, settings.widths), place / WEIGHTS
+        )
         return cls(network, settings.scale, batch)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -182,11 +186,11 @@ class Dae(Method):
         """The network of a bundle, which takes as many images at once as memory should hold."""
         import torch
 
-        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.dae import DaeNetwork
         from psfdae.networks.weights import channels_last
 
         assert info.dae is not None and info.image_scale is not None
-        network = Network(info.dae.kernels, info.dae.widths)
+        network = DaeNetwork(info.dae.kernels, info.dae.widths)
         network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
         batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
         return cls(channels_last(network).eval(), float(info.image_scale), batch)

@@ -87,7 +87,7 @@ class FieldStamps(NamedTuple):
         return np.asarray(np.square(self.noise / self.unit)[:, None])
 
 
-class Photometry(NamedTuple):
+class MatchedFluxes(NamedTuple):
     """First measurement of n stars, by the matched filter of the mean PSF (eq. 16).
 
     Attributes
@@ -252,7 +252,7 @@ def star_posterior(law: FieldLaw, stars: FieldStamps) -> StarPosterior:
     )
 
 
-def _matched_filter(law: FieldLaw, stars: FieldStamps) -> Photometry:
+def _matched_filter(law: FieldLaw, stars: FieldStamps) -> MatchedFluxes:
     """Return fluxes by a matched filter, and the nodes that are probable by it (eq. 16)."""
     # ln of the likelihood ratio of a star of flux F against none: (F ⟨x,m⟩ − ½ F² ⟨m,m⟩) / s.
     filters, square = law.filters
@@ -273,7 +273,7 @@ def _matched_filter(law: FieldLaw, stars: FieldStamps) -> Photometry:
     threshold = np.clip(tempered.max(axis=1) - 8.0, ranked[:, largest], ranked[:, fewest])
     is_nearby = np.isfinite(score) & (tempered >= threshold[:, None])
     is_nearby[rows, best] = True
-    return Photometry(flux[rows, best], is_nearby, 1.0 / np.sqrt(square[best]))
+    return MatchedFluxes(flux[rows, best], is_nearby, 1.0 / np.sqrt(square[best]))
 
 
 def _projected(law: FieldLaw, stars: FieldStamps, is_nearby: np.ndarray) -> Pairs:

@@ -87,7 +87,7 @@ class _ToOneChannel(torch.autograd.Function):
         return by_image, by_weight.flip(2, 3).transpose(0, 1), grad.sum().view(1)
 
 
-class Dae(nn.Module):
+class DaeNetwork(nn.Module):
     """Denoising autoencoder on single-channel images.
 
     Parameters
@@ -124,13 +124,13 @@ def build_dae(
     widths: Sequence[int],
     init: Literal["linear", "he", "default"],
     generator: torch.Generator,
-) -> Dae:
+) -> DaeNetwork:
     """Return a fresh network whose weights come from `generator` alone.
 
     Parameters
     ----------
     kernels, widths : sequences of int
-        Kernel sizes and channels, as in `Dae`.
+        Kernel sizes and channels, as in `DaeNetwork`.
     init : "linear", "he" or "default"
         "he" and "linear" draw N(0, 2/fan_in) with zero biases (He et al. 2015, arXiv:1502.01852);
         `begin_linear` then changes the latter. "default" is PyTorch's uniform distribution
@@ -139,10 +139,10 @@ def build_dae(
 
     Returns
     -------
-    Dae
+    DaeNetwork
         With the weights in the order in memory that makes convolutions fastest.
     """
-    model = channels_last(Dae(kernels, widths))
+    model = channels_last(DaeNetwork(kernels, widths))
     # In the order of the layers, weights before biases, because the draws depend on it.
     with torch.no_grad():
         for layer in model.layers:
@@ -159,7 +159,11 @@ def build_dae(
 
 @torch.no_grad()
 def begin_linear(
-    model: Dae, noisy: np.ndarray, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
+    model: DaeNetwork,
+    noisy: np.ndarray,
+    references: np.ndarray,
+    weight: np.ndarray,
+    pixels: np.ndarray,
 ) -> None:
     """Turn a freshly drawn network into about the best linear estimator that its kernels allow.
 
@@ -171,7 +175,7 @@ def begin_linear(
 
     Parameters
     ----------
-    model : Dae
+    model : DaeNetwork
         Network of `build_dae`; its weights are changed in place.
     noisy, references : ndarray, shape (n, d, d)
         Images as the network sees them, and the noise-free images that it is to return.
@@ -211,7 +215,11 @@ def begin_linear(
 
 
 def _fit_last_layer(
-    model: Dae, images: torch.Tensor, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
+    model: DaeNetwork,
+    images: torch.Tensor,
+    references: np.ndarray,
+    weight: np.ndarray,
+    pixels: np.ndarray,
 ) -> None:
     """Fit the weights and the bias of the last layer to the references by least squares.
 
@@ -220,7 +228,7 @@ def _fit_last_layer(
 
     Parameters
     ----------
-    model : Dae
+    model : DaeNetwork
         Network whose other layers are set; the last one is changed in place.
     images : torch.Tensor, shape (n, 1, d, d)
         Images as the network sees them.
@@ -294,12 +302,14 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
 
 
 @torch.inference_mode()
-def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> np.ndarray:
+def run_network(
+    model: DaeNetwork, noisy: np.ndarray, factor: float, batch: int = 256
+) -> np.ndarray:
     """Estimate the PSFs of noisy star images.
 
     Parameters
     ----------
-    model : Dae
+    model : DaeNetwork
         The network.
     noisy : ndarray, shape (n, d, d)
         Flux-normalised images.
@@ -343,7 +353,7 @@ class DaeTraining(Training):
         Number of restarts after a dead network.
     """
 
-    model: Dae
+    model: DaeNetwork
     settings: Train
 
     def __init__(
@@ -470,7 +480,7 @@ class DaeTraining(Training):
         # Every star with several draws of noise, which are the same in all epochs.
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
-        estimate = predict(self.model, noisy, self.factor)
+        estimate = run_network(self.model, noisy, self.factor)
         zero_part = 1.0 - estimate.any(axis=(1, 2)).mean()
         if zero_part > 0.5:
             raise DeadNetworkError(f"{zero_part:.0%} of the outputs are zero after epoch {epoch}")

@@ -69,7 +69,7 @@ def wavefront(
     # Telescope and stamps, read or converted where they are files or arrays.
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
-    stamps = stars if isinstance(stars, Stamps) else stamps_of_arrays(stars, noise, gain)
+    stamps = stars if isinstance(stars, Stamps) else sensed_stamps(stars, noise, gain)
     # A field angle for each star: aberrations change over the field.
     angle = np.asarray(field_deg, float)
     if angle.shape != (len(stamps), 2) or not np.isfinite(angle).all():
@@ -90,7 +90,7 @@ def wavefront(
     return Wavefronts(search, stamps, angle, modes, state)
 
 
-def stamps_of_arrays(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
+def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
     """Return stamps of arrays, of which only noise and gain may be known.
 
     Raises

@@ -187,7 +187,7 @@ def expected_abs_error(covariances: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Likelihood:
+class StateLikelihood:
     """Poisson likelihood of noisy stamps at one noise level λ, which the fit knows.
 
     Attributes
@@ -243,7 +243,7 @@ class Likelihood:
 
 
 def refit_twins(
-    likelihood: Likelihood, fit: Peaks, model: QuadraticModel, settings: Fit
+    likelihood: StateLikelihood, fit: Peaks, model: QuadraticModel, settings: Fit
 ) -> tuple[Peaks, np.ndarray]:
     """Fit again from the twins of fitted states, and take the more likely of both fits.
 
@@ -251,7 +251,7 @@ def refit_twins(
 
     Parameters
     ----------
-    likelihood : Likelihood
+    likelihood : StateLikelihood
     fit : Peaks
         Result of the first fit; left unchanged.
     model : QuadraticModel

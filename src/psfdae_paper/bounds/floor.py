@@ -82,7 +82,7 @@ class Comparison:
         return self.difference < -(2.0 * self.stderr + self.tolerance * self.bound)
 
 
-def compare(
+def compare_errors(
     errors: np.ndarray,
     bounds: np.ndarray,
     field: np.ndarray,

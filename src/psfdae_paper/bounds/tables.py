@@ -22,7 +22,7 @@ from psfdae_paper.bounds.estimates import (
     stamp_model,
     weigh_bank,
 )
-from psfdae_paper.bounds.floor import RELATIVE_TOLERANCE, Comparison, compare, local_error
+from psfdae_paper.bounds.floor import RELATIVE_TOLERANCE, Comparison, compare_errors, local_error
 from psfdae_paper.bounds.posterior import Bank, Likelihood, exact_posterior, extrapolate
 from psfdae_paper.bounds.tight import MAX_SPARSE_FRACTION, calibration
 from psfdae_paper.configuration.schema import Config
@@ -320,7 +320,7 @@ def compare_methods(
                 estimated &= paired.mse.notna()
             is_judged = (is_floor or is_tight) and (~estimated).mean() <= MAX_SPARSE_FRACTION
             paired = paired[estimated]
-            comparison = compare(
+            comparison = compare_errors(
                 paired["mse"].to_numpy(),
                 paired["mse_bound"].to_numpy(),
                 paired["field"].to_numpy(),

@@ -34,7 +34,7 @@ from psfdae.noise import mixed_levels
 from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
-from psfdae.settings import deciding, validate
+from psfdae.settings import deciding, validated_settings
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import (
@@ -293,9 +293,9 @@ def network_predictor(
         require(path, described, ("name",), {"name": name}, "the command")
     # It describes training and network, and is checked as settings are.
     training = f"train_{from_tree(path, described, 'name')}"
-    trained = from_tree(path, described, training, make=partial(validate, NetworkTrain))
+    trained = from_tree(path, described, training, make=partial(validated_settings, NetworkTrain))
     kind = NETWORKS[trained.network]
-    settings = from_tree(path, described, trained.network, make=partial(validate, kind))
+    settings = from_tree(path, described, trained.network, make=partial(validated_settings, kind))
     torch.set_num_threads(config.evaluation.threads)
     model = with_weights(lambda: empty_network(settings, fields, side), folder / WEIGHTS)
     mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
@@ -371,7 +371,7 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
     reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
     choice=CHOICE,
 )
-def fit(
+def fit_alignment_method(
     config: Config,
     test_set: TestSet,
     level: Annotated[float, AboveZero, "Noise level λ."],
@@ -389,7 +389,7 @@ def fit(
     states are fitted once more with both unknown.
     """
     from psfdae_paper.alignment.emulator import StampEmulator
-    from psfdae_paper.alignment.likelihood import Likelihood, StateOptics, refit_twins
+    from psfdae_paper.alignment.likelihood import StateLikelihood, StateOptics, refit_twins
 
     limit_threads(1)
     # States to fit, states for the emulator, the model of the wavefront, and the network.
@@ -416,7 +416,7 @@ def fit(
     for method in methods:
         # Flux and place of the stars are known, or parameters of the fit, too.
         optics = StateOptics(wavefronts, operator(movable=method.unknown_flux), emulator)
-        exact = Likelihood(optics, noise_model(config), level, stamps)
+        exact = StateLikelihood(optics, noise_model(config), level, stamps)
         # The emulator can compute stars at their given position only.
         fast = exact if method.unknown_flux else replace(exact, stamps=emulator)
         first_fit = fast.maximise(optics.parameters_of(start), config.fit)

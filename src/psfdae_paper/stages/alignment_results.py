@@ -208,7 +208,7 @@ def tables(
 
 
 @command("alignment paper-tables")
-def paper_tables(
+def alignment_paper_tables(
     errors: ErrorTable,
     correlation: ErrorTable,
     out: Annotated[Folder, "Folder for CSV and Markdown files."],

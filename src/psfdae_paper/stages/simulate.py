@@ -303,7 +303,7 @@ def write_image(
 
 
 @command("example-field")
-def example_field(
+def write_example_field(
     catalogue: Annotated[File, "CSV file for the star list."],
     seed: Annotated[int, click.IntRange(min=0)] = 1,
     side: Annotated[int, click.IntRange(min=100), "Pixels along a side."] = FieldRecipe.side_px,
