@@ -90,7 +90,7 @@ def predict_command(
             }
             for name, image_options in options_by_image(stars, options).items()
         }
-        run_for_images(predict, jobs, stars)
+        run_for_images(predict_command, jobs, stars)
         return ""
     # Check all that can be checked without reading pixels: inputs, outputs, and the model.
     source = ImageInput(

@@ -152,14 +152,14 @@ class Dae(Method):
 
         from psfdae.networks.dae import DaeNetwork
         from psfdae.networks.weights import with_weights
-        from psfdae.settings import validated_settings
+        from psfdae.settings import parse_settings
 
         described, batch = cls.described(place), 256
         settings = from_tree(
             place / CONFIG,
             described,
             "dae",
-            make=lambda tree: validated_settings(DaeSettings, tree),
+            make=lambda tree: parse_settings(DaeSettings, tree),
         )
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)

@@ -27,7 +27,7 @@ from psfdae.settings import (
     Parts,
     Seed,
     Stamp,
-    validate,
+    parse_settings,
 )
 
 DATASET_CHOICE = "dataset=from_stars"
@@ -134,7 +134,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
         except yaml.YAMLError:
             raise ConfigError(f"{word}: {text!r} is no value") from None
         tree[group] = value if is_group else {**tree.get(group, {}), name: value}
-    return validate(settings_model(), tree)
+    return parse_settings(settings_model(), tree)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def of_config(config: Group | Mapping[str, Any]) -> Settings:
         if name in tree:
             keys, value = _keys(name), tree[name]
             settings[name] = {k: v for k, v in value.items() if k in keys} if keys else value
-    return validate(settings_model(), settings)
+    return parse_settings(settings_model(), settings)
 
 
 def with_keywords(
@@ -194,7 +194,7 @@ def with_keywords(
             names = ", ".join(key for keys in group_keys.values() for key in sorted(keys))
             raise ConfigError(f"{name}: unknown setting; there are {names}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
-    return validate(settings_model(), tree)
+    return parse_settings(settings_model(), tree)
 
 
 def _keys(group: str) -> set[str]:

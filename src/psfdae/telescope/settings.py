@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
 from psfdae.reading import read_yaml
-from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, validated_settings
+from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, parse_settings
 from psfdae.telescope.aberrations import Jitter, OmitsLateKeys, Raytraced, Seidel, Zernike
 
 
@@ -160,7 +160,7 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     # Errors of files that it includes name those.
     tree = composed_tree(Path(path))
     try:
-        return validated_settings(OwnTelescope, tree)
+        return parse_settings(OwnTelescope, tree)
     except ConfigError as error:
         # Every line of the message names the file.
         lines = str(error).splitlines()

@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
-from psfdae.settings import NEUTRAL, ConfigError, Group, validated_settings
+from psfdae.settings import NEUTRAL, ConfigError, Group, parse_settings
 from psfdae_paper.configuration import alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import stage_model, with_derived_values
@@ -158,7 +158,7 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
     """Check a composed configuration; raises ConfigError like `load`."""
     # A dataset has all groups; scene 3 reads only some, and none of stars.
     if not _is_alignment(tree):
-        return validated_settings(whole_config(), tree)
+        return parse_settings(whole_config(), tree)
     _require_known_groups(tree)
     return part(alignment.GROUPS, tree)
 
@@ -200,7 +200,7 @@ def load_file(model: type[Model], path: Path) -> Model:
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
     return _with_file_name(
-        path, lambda: validated_settings(model, tree if isinstance(tree, dict) else {})
+        path, lambda: parse_settings(model, tree if isinstance(tree, dict) else {})
     )
 
 
@@ -306,7 +306,7 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
 
 def _checked(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
     """Return checked groups; type checkers take them for a whole `Config`, as stages state it."""
-    return cast(Config, validated_settings(stage_model(reads, whole_config()), groups))
+    return cast(Config, parse_settings(stage_model(reads, whole_config()), groups))
 
 
 def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:

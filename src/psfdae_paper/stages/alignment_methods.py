@@ -34,7 +34,7 @@ from psfdae.noise import mixed_levels
 from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
-from psfdae.settings import deciding, validated_settings
+from psfdae.settings import deciding, parse_settings
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import (
@@ -293,9 +293,9 @@ def network_predictor(
         require(path, described, ("name",), {"name": name}, "the command")
     # It describes training and network, and is checked as settings are.
     training = f"train_{from_tree(path, described, 'name')}"
-    trained = from_tree(path, described, training, make=partial(validated_settings, NetworkTrain))
+    trained = from_tree(path, described, training, make=partial(parse_settings, NetworkTrain))
     kind = NETWORKS[trained.network]
-    settings = from_tree(path, described, trained.network, make=partial(validated_settings, kind))
+    settings = from_tree(path, described, trained.network, make=partial(parse_settings, kind))
     torch.set_num_threads(config.evaluation.threads)
     model = with_weights(lambda: empty_network(settings, fields, side), folder / WEIGHTS)
     mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []

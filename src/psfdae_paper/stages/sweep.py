@@ -21,7 +21,7 @@ from psfdae.files import write_text
 from psfdae.method import FitError
 from psfdae.options import File, Folder
 from psfdae.reading import read_json
-from psfdae.settings import validated_settings
+from psfdae.settings import parse_settings
 from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
@@ -142,9 +142,7 @@ def point(
     # A trial gets its values from the results of earlier trials; the configuration with these
     # values is checked again.
     if trial is not None:
-        space = {
-            name: validated_settings(Axis, axis) for name, axis in trial.search["space"].items()
-        }
+        space = {name: parse_settings(Axis, axis) for name, axis in trial.search["space"].items()}
         earlier_results = [
             read_json(task.folder.parent / name / "result.json") for name in trial.earlier_points
         ]
@@ -152,7 +150,7 @@ def point(
         values = adaptive.ask(space, trial.search, trial.slot, earlier_results)
         trial_keys = changes(space, values)
         tree = with_values(config.model_dump(), trial_keys)
-        config, keys = validated_settings(type(config), tree), {**keys, **trial_keys}
+        config, keys = parse_settings(type(config), tree), {**keys, **trial_keys}
     # No file of an earlier training may stay beside the new ones.
     module = import_module(module_of(model))
     for name in (*module.files_of(model), *TABLES.values(), "cost.json", "result.json"):
