@@ -3,8 +3,8 @@
 A group of settings is a class. Its keys are read from keywords, from words `group.key=value` of
 a command line or from YAML; each wrong one is named with its value and the allowed range.
 
-Plain mappings go into `parse_settings`, and checked, immutable groups come out. `deciding`, `leaves`
-and `as_overrides` turn groups into mappings and texts again.
+Plain mappings go into `parse_settings`, and checked, immutable groups come out. `deciding`,
+`leaves` and `as_overrides` turn groups into mappings and texts again.
 """
 
 from __future__ import annotations

@@ -194,8 +194,8 @@ def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarra
     from photutils.background import Background2D
 
     # Squares of the pixels of an image in a very small or large unit would be 0 or infinite.
-    good = {"where": ~bad, "initial": 0.0}
-    largest = max(float(image.max(**good)), -float(image.min(**good)))
+    highest, lowest = (float(f(image, initial=0.0, where=~bad)) for f in (np.max, np.min))
+    largest = max(highest, -lowest)
     unit = 1.0 if largest == 0.0 or 1e-9 < largest < 1e15 else largest
     values = image if unit == 1.0 else image / unit
     meshes = Background2D(values, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
