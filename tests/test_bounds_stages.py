@@ -90,7 +90,7 @@ def test_bank_holds_none_of_the_stars(scene_1):
 
 def test_bounds_of_scene_1(scene_1):
     table = pd.read_csv(scene_1 / "bounds.csv")
-    assert list(table.columns) == bounds.COLUMNS
+    assert list(table.columns) == bounds.tables.COLUMNS
     assert set(table.n) == {STARS}
     assert set(table.metric) == {"mse"}
     assert sorted(set(zip(table.reference, table.method, strict=True))) == [

@@ -11,9 +11,11 @@ import bz2
 import gzip
 import io
 import lzma
+import os
 import re
 import shutil
 import tempfile
+import weakref
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -89,15 +91,16 @@ class PlainFile:
         What messages call it.
     path : Path
         What is opened. A temporary copy exists as long as this object.
+    is_copy : bool
     """
 
     name: Path
     path: Path
-    _copy: Any = None
+    is_copy: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a temporary copy by its content."""
-        if self._copy is None:
+        if not self.is_copy:
             return type(self), (self.name, self.path)
         return temporary_file, (self.name, io.BytesIO(self.path.read_bytes()))
 
@@ -125,11 +128,17 @@ def plain_file(path: Path) -> PlainFile:
 
 def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
     """Return a FITS file of this content, which exists as long as the object that is returned."""
-    # The file goes with the object that holds it.
-    copy = tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits")  # noqa: SIM115
-    shutil.copyfileobj(content, copy)
-    copy.flush()
-    return PlainFile(name, Path(copy.name), copy)
+    with tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits", delete=False) as copy:
+        shutil.copyfileobj(content, copy)
+    plain, process = PlainFile(name, Path(copy.name), is_copy=True), os.getpid()
+
+    def remove(path: Path) -> None:
+        # A process that was forked from this one has the object, but not the file.
+        if os.getpid() == process:
+            path.unlink(missing_ok=True)
+
+    weakref.finalize(plain, remove, plain.path)
+    return plain
 
 
 def open_hdus(file: PlainFile, as_stored: bool = False, **options: Any) -> HDUList:
