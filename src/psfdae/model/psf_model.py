@@ -241,11 +241,13 @@ class PsfModel(FieldPsfs):
     def flux_error(self, place: np.ndarray) -> np.ndarray:
         """Return what model and wings make of the errors of stars at places (n, 2), x and y.
 
-        Standard errors over the flux (n,) of stars on a known sky.
+        Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
+        middle of the field, they are not below those of the whole field: there the errors of the
+        map, which no field knows, are as large as those of the PSF.
         """
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         errors = self.bundle.errors.measured
-        fitted_error = errors.fitted_flux * errors.flux_factor(place)
+        fitted_error = errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0)
         return np.asarray(np.hypot(fitted_error, error / (1.0 + light)))
 
     @property
