@@ -10,7 +10,7 @@ from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae_paper.bounds.estimates import stamp_model
-from psfdae_paper.bounds.floor import compare, local_error
+from psfdae_paper.bounds.floor import compare_errors, local_error
 from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
@@ -261,12 +261,12 @@ def test_floor_of_a_linear_gaussian_problem():
 def test_comparison_is_paired_and_tolerant():
     rng = np.random.default_rng(9)
     field, bound = np.arange(400) % 20, rng.exponential(1.0, 400)
-    equal = compare(bound, bound, field)
+    equal = compare_errors(bound, bound, field)
     assert (equal.efficiency, equal.difference, equal.beaten) == (1.0, 0.0, False)
-    shifted = compare(bound + 0.1, bound, field)
+    shifted = compare_errors(bound + 0.1, bound, field)
     assert shifted.difference == pytest.approx(0.1)
     assert shifted.stderr < 1e-12  # the stars' own scatter is common to both
     assert not shifted.beaten
-    assert not compare(0.96 * bound, bound, field).beaten
-    assert compare(0.8 * bound, bound, field).beaten
-    assert np.isnan(compare(bound, 0 * bound, field).efficiency)
+    assert not compare_errors(0.96 * bound, bound, field).beaten
+    assert compare_errors(0.8 * bound, bound, field).beaten
+    assert np.isnan(compare_errors(bound, 0 * bound, field).efficiency)
