@@ -146,7 +146,8 @@ def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     for rows, threads in ((1024, 1), (256, 3)):
         monkeypatch.setattr(psf_model, "MAX_STARS_READ", rows)
         out = folder / f"rows{rows}_{threads}.fits"
-        stage.predict_command(folder / "cube.fits", stage.ImageStatements(), threads=threads, out=out)
+        statements = stage.ImageStatements()
+        stage.predict_command(folder / "cube.fits", statements, threads=threads, out=out)
         files.append(out.read_bytes())
     assert files[0] == files[1]
 
