@@ -316,6 +316,8 @@ def histories_of(dataset):
 
 def start_of(method, w):
     """Fit to the realisations from which that to the templates goes on, if one does."""
-    if w.get("reference") != "template" or not method.continues(dataset_config(w.dataset)):
+    if w.get("reference") != "template" or not method.continues(
+        dataset_config(w.dataset)
+    ):
         return {}
     return {"start": files_of(method, w.dataset, w.split, "realisation")}
