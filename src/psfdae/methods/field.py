@@ -243,9 +243,8 @@ class FieldMixture(FieldLaw, Method):
 
         Of a star m' of another field, the model m finds the flux Σ m m' / Σ m². The variance is the
         sum of two: by fields of other noise, and by fields of other stars, which has what
-        neighbours do to their stars, too. With one of them alone, 91 % of the bright stars of
-        simulated fields are within 1.96 errors, with both 93 %: no field has what the polynomial
-        cannot follow.
+        neighbours do to their stars, too. Either alone is too small for bright stars
+        (`tests/test_stated_errors.py`): no field has what the polynomial cannot follow.
 
         Returns
         -------

@@ -242,8 +242,8 @@ class PsfModel(FieldPsfs):
         """Return what model and wings make of the errors of stars at places (n, 2), x and y.
 
         Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
-        middle of the field, they are not below those of the whole field: there the errors of the
-        map, which no field knows, are as large as those of the PSF.
+        middle of the field, they are not below those of the whole field: a map of the sky has
+        errors there as well, which no field knows.
         """
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         errors = self.bundle.errors.measured

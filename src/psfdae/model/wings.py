@@ -227,7 +227,7 @@ def star_tents(
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     light = np.where(np.isfinite(outer_share), flux * wings.scale(outer_share), np.nan)
     has_light = np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1)
-    # The wings of more than the thousand brightest stars are below the noise.
+    # In a crowded image, the thousand brightest stars have most of the light of all wings.
     lit_stars = np.flatnonzero(has_light)
     brightest = lit_stars[np.argsort(-light[lit_stars])[:1000]]
     # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
@@ -477,12 +477,12 @@ def _wings_beside(
     earlier: Wings | None = None,
 ) -> Wings | None:
     """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
+    from scipy.ndimage import uniform_filter
+
     wings = earlier
     # Galaxies, blends and saturated stars say nothing of the wings of stars: in 5 × 5 px about a
     # star, most pixels are good, and their residuals are within twice σ, which has what the PSF may
     # be off by.
-    from scipy.ndimage import uniform_filter
-
     residual, bad = without_stars - sky.level, sky.bad
     squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
     mean_square = uniform_filter(squares, 5, mode="constant")
