@@ -28,6 +28,7 @@ progress.show_with(terminal.bar)
 
 if TYPE_CHECKING:
     from psfdae.errors import Error
+    from psfdae.image.detected_stars import detect
     from psfdae.image.stamps import StarFlag
     from psfdae.model.field_psfs import PredictionError
     from psfdae.model.fitting import fit
@@ -47,6 +48,7 @@ _MODULES = {
     "StarFlag": "image.stamps",
     "Stars": "model.stars",
     "Wavefronts": "sensing.results",
+    "detect": "image.detected_stars",
     "fit": "model.fitting",
     "load_model": "model.psf_model",
     "read_telescope": "telescope.settings",
@@ -64,6 +66,7 @@ __all__ = [
     "Stars",
     "Wavefronts",
     "__version__",
+    "detect",
     "fit",
     "load_model",
     "read_telescope",

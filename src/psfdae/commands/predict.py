@@ -23,11 +23,11 @@ from psfdae.image.fits_file import Card
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
-from psfdae.image.stamps import Stamps, StarFlag
-from psfdae.method import KnowsField, MeasuresStars
+from psfdae.image.stamps import StarFlag
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
-from psfdae.model.prediction import Prediction, prediction_file
+from psfdae.model.image_prediction import notes_on_model, offsets_from_list, open_for_model
+from psfdae.model.prediction import prediction_file
 from psfdae.model.psf_model import PsfModel, load_model
 from psfdae.options import File
 from psfdae.progress import silence
@@ -100,14 +100,7 @@ def predict_command(
     bundle = bundle_of_image(model, source.name)
     check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
     loaded = load_model(bundle)
-    observation = open_for_model(loaded, source)
-    # Options that only some images and models have.
-    measures_centres = isinstance(loaded.method, MeasuresStars)
-    if fixed_positions and not (measures_centres and observation.shape):
-        raise PredictionError(
-            f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
-            "psfdae from-stars --method field"
-        )
+    observation = open_for_model(loaded, source, fixed_positions)
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
@@ -154,36 +147,6 @@ def bundle_of_image(model: Path | None, name: str) -> Path | None:
     if len(bundles) != 1:
         raise PredictionError(f"{model / name}: {len(bundles)} models, expected one")
     return bundles[0]
-
-
-def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
-    """Open an image whose pixels must be those of a model.
-
-    Raises
-    ------
-    PredictionError
-        If its pixel scale is another one, or not known.
-    """
-    observation = source.open(model.info.stamp_px, model.margin_px)
-    if model.info.source == "stars":
-        # A model of an image may have been trained without a known pixel scale, too.
-        observation = observation.assuming()
-    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
-    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
-    return observation
-
-
-def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
-    """Return sentences on another instrument than the training's, and on light beyond stamps."""
-    notes = []
-    if difference := model.other_instrument(observation.instrument, observation.colour_column):
-        notes.append(f"{observation.path}: {difference}")
-    if observation.shape and isinstance(model.method, KnowsField) and not model.wings:
-        notes.append(
-            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
-            f"{model.stamp_px} px; flux is the light in the stamp"
-        )
-    return notes
 
 
 def check_targets(
@@ -269,29 +232,7 @@ def write_prediction(
             file.write(star_index, prediction)
             flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
             unflagged += int((prediction.flags == 0).sum())
-            offsets.append(offsets_from_list(stamps, prediction))
+            offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
             star_index += len(prediction)
         note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     return flag_counts, unflagged, note if observation.shape else None
-
-
-def offsets_from_list(stamps: Stamps, prediction: Prediction) -> np.ndarray:
-    """Return the offsets of stars from their listed positions.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Along x and y in px; NaN for stars that are too faint, have no flux, or are not listed.
-    """
-    # A model that measures centres (field) gives the offset itself.
-    centre_offset = np.stack([prediction.x_fit - stamps.x, prediction.y_fit - stamps.y], axis=1)
-    # For another one, it is the shift by which the stamp was centred on its brightest pixel. A star
-    # that is off by more than the margin allows is given a pixel more than that.
-    off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
-    shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
-    shift = np.where(off_centre[:, None], PsfModel.margin_px + 1.0, shift)
-    # Noise moves the brightest pixel of a faint star.
-    unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
-    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
-    offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
-    return np.where(unclear[:, None], np.nan, offset)

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
-from psfdae.image.containers import in_unit
+from psfdae.errors import did_you_mean
+from psfdae.image.containers import as_image, in_unit
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import PlainFile
 from psfdae.image.positions import require_sky
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
     from psfdae.image.observation import Observation
 
     Number: TypeAlias = float | Quantity
@@ -99,6 +101,30 @@ class ImageInput(ImageStatements):
     image: Path | PlainFile | np.ndarray
     flux_column: str | None = field(default=None, kw_only=True)
     background_column: str | None = field(default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, image: Image, statements: Mapping[str, Any]) -> ImageInput:
+        """Return an image as Python hands it over, with what is stated about it.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            See `psfdae.image.containers.as_image`.
+        statements : mapping
+            Values by the names of this class's fields.
+
+        Raises
+        ------
+        ObservationError
+            If it is no image, or a statement has another name.
+        """
+        source = cls(as_image(image))
+        names = [attribute.name for attribute in fields(cls) if attribute.name != "image"]
+        for name in statements:
+            if name not in names:
+                hint = did_you_mean(name, names)
+                raise ObservationError(source.path, f"{name}: no statement on an image{hint}")
+        return replace(source, **statements)
 
     @property
     def path(self) -> Path:

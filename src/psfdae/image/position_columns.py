@@ -105,9 +105,10 @@ def choose_positions(names: Sequence[str]) -> Positions:
     ColumnError
         If there are none, or those of several programs.
     """
-    # Tables of psfdae itself (predict, photometry, from-stars) count from 0. They have further
-    # columns of their own, and may have some of other programs.
-    for further_columns in ("shift_x shift_y", "x_error y_error flux_model", "snr verdict part"):
+    # Tables of psfdae itself (predict, photometry, from-stars, detect) count from 0. They have
+    # further columns of their own, and may have some of other programs.
+    tables = ("shift_x shift_y", "x_error y_error flux_model", "snr verdict part", "flux_iso")
+    for further_columns in tables:
         if set(names).issuperset(("x", "y", *further_columns.split())):
             return Positions("x", "y", origin=0)
     # The best pair of each program; a column that two programs use counts once.

@@ -38,6 +38,7 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "flux_total": (OF_IMAGE, ".7g", "within FLUXRAD; NaN if the model has no wings"),
     "flux_total_error": (OF_IMAGE, ".3g", "standard error"),
     "flux_model": (OF_IMAGE, ".7g", "without the light that the model does not have"),
+    "flux_iso": (OF_IMAGE, ".7g", "light above the threshold of the detection"),
     "background": (OF_IMAGE, ".6g", "sky per pixel"),
     "noise": (OF_IMAGE, ".4g", "RMS of the sky noise in a pixel"),
     "snr": ("", ".1f", "of a matched filter, sqrt(sum of PSF^2) / noise"),

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.errors import Error
+from psfdae.image.image_input import ImageInput
 from psfdae.moments import measure_shapes
 
 if TYPE_CHECKING:
+    from astropy.nddata import CCDData
+    from astropy.table import QTable
     from photutils.psf import GriddedPSFModel
 
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
     from psfdae.model.wings import Wings
 
 
@@ -69,6 +74,68 @@ class FieldPsfs(ABC):
     @abstractmethod
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image that the model was trained on, if known."""
+
+    def photometry(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        zero_point: float | None = None,
+        reference: StarList | None = None,
+        magnitude_column: str = "mag",
+        **statements: Any,
+    ) -> QTable:
+        """Measure the fluxes of all stars of an image, overlapping ones together.
+
+        It is the table that the command `psfdae photometry` writes.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            The image that the model learnt from, or another one with the same PSF.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list; no other stars are looked for.
+        zero_point : float, optional
+            Magnitude of a flux of 1.
+        reference : as `catalogue`, optional
+            Star list with magnitudes, which give the zero point.
+        magnitude_column : str
+            Column of the reference with the magnitudes.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`.
+
+        Returns
+        -------
+        QTable
+            A row for each star, with units.
+
+        Raises
+        ------
+        Error
+            If the image or a list cannot be used, or the model knows no PSF of a place.
+        """
+        from psfdae.model.image_photometry import photometry_of_image
+
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return photometry_of_image(self, source, zero_point, reference, magnitude_column).table
+
+    def residual(
+        self, image: Image, catalogue: StarList | None = None, **statements: Any
+    ) -> CCDData:
+        """Return an image without its sky and stars, which are measured as by `photometry`.
+
+        `psfdae.model.image_photometry.photometry_of_image` gives table and residual of one
+        measurement.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `photometry`
+        """
+        from psfdae.model.image_photometry import photometry_of_image
+
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return photometry_of_image(self, source).residual
 
     def flux_error(self, place: np.ndarray) -> np.ndarray:
         """Return the errors of stars' fluxes on a known sky that are due to the model.

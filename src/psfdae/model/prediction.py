@@ -83,6 +83,8 @@ class Prediction:
         n rows of further columns of the star list.
     unit : str
         Unit of the stamps; "" where nothing says it.
+    notes : tuple of str
+        Sentences on an image and its list, and on what limits the trust in the predictions.
 
     Examples
     --------
@@ -106,6 +108,7 @@ class Prediction:
     uncertainty: np.ndarray
     list_columns: Table | None = None
     unit: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         # The order of the list, whatever the order in which columns were computed.

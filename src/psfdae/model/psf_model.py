@@ -9,24 +9,30 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
 from psfdae.image.camera import other_instruments
+from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.method import KnowsField, Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
+from psfdae.model.image_prediction import predict_stars
 from psfdae.model.prediction import Prediction
 from psfdae.model.restoration import Restorer
 from psfdae.model.stamp_arrays import stamps_of_arrays
 from psfdae.model.wings import Wings
 from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, one_thread_each, side_by_side
+
+if TYPE_CHECKING:
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
 
 SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
@@ -188,6 +194,74 @@ class PsfModel(FieldPsfs):
         with one_thread_each():
             parts = side_by_side(lambda block: self.restorer.restore(block, fixed), blocks, threads)
         return replace(Prediction.joined(parts), unit=unit)
+
+    def predict_image(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        fixed: bool = False,
+        threads: int | None = None,
+        **statements: Any,
+    ) -> Prediction:
+        """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            FITS image, or cube of stamps.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list, as `Stars.from_image` takes it.
+        fixed : bool
+            Its centres are exact, for models that measure centres (field).
+        threads : int, optional
+            By default, all cores.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
+            `background_column` of the list.
+
+        Returns
+        -------
+        Prediction
+            One row per star; `notes` has sentences on the image and its list.
+
+        Raises
+        ------
+        Error
+            If the image or its list cannot be used, or its pixels are not those of the model.
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return predict_stars(self, source, threads, fixed)
+
+    def adapt(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        name: str | None = None,
+        **statements: Any,
+    ) -> PsfModel:
+        """Return this model adapted to another exposure, as `psfdae exposure` does.
+
+        The stars of the exposure show how its PSF differs from that of the model; ten may be
+        enough.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `predict_image`
+        name : str, optional
+            Name of the new model, by default that of the image.
+
+        Raises
+        ------
+        Error
+            If this is no model of a field, or the image has too few bright stars.
+        """
+        from psfdae.model.exposures import exposure
+
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return exposure(self, source, name or source.name)[0]
 
     def stream(
         self, observation: Observation, threads: int | None = None, fixed: bool = False

@@ -1,0 +1,60 @@
+"""`detect`: the stars of an image as a table."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.image.image_input import ImageInput
+from psfdae.image.tables import star_table
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from psfdae.image.containers import Image
+
+
+def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
+    """Find the stars of an image.
+
+    Parameters
+    ----------
+    image : path-like, array, NDData, HDU or HDUList
+        FITS image. Mask, uncertainty, unit, WCS and meta of CCDData and NDData are used.
+    threshold : float
+        Detection limit in σ above the sky.
+    **statements
+        Statements on the image, such as `mask`, `extension` or `gain`, named and explained in
+        `psfdae.image.image_input.ImageStatements`.
+
+    Returns
+    -------
+    QTable
+        A row for each star: `id`, `x` and `y` (0-based pixels), `ra` and `dec` (ICRS, if the image
+        has a WCS), `flux_iso` (light above the threshold) and `background` (sky per pixel). All
+        calls that take a star list take it.
+
+    Raises
+    ------
+    Error
+        If the image or a statement cannot be used, or there is no star.
+
+    Examples
+    --------
+    >>> detected = psfdae.detect(image, gain=1.0)
+    >>> len(detected), detected.colnames
+    (36, ['id', 'x', 'y', 'flux_iso', 'background'])
+    """
+    # Stamps are not needed here: the least side that an image may have.
+    observation = ImageInput.of(image, {**statements, "detect": threshold}).open(stamp_px=8)
+    assert observation.detections is not None
+    stars = observation.detections.table
+    # SExtractor's X_IMAGE counts from 1.
+    x, y = (np.asarray(stars[name]) - 1.0 for name in ("X_IMAGE", "Y_IMAGE"))
+    sky_position = observation.on_sky(x, y)
+    on_sky = {} if sky_position is None else dict(zip(("ra", "dec"), sky_position, strict=True))
+    columns = {"id": np.asarray(stars["id"]), "x": x, "y": y, **on_sky}
+    columns["flux_iso"] = np.asarray(stars["FLUX_ISO"])
+    columns["background"] = np.asarray(stars["BACKGROUND"])
+    return star_table(columns, observation.unit)

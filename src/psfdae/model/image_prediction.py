@@ -1,0 +1,122 @@
+"""Prediction of the stars of an image: what the command `predict` and `PsfModel` have in common.
+
+In go a model, and an image with its star list; out come an observation whose pixels are those of
+the model, and sentences on what limits the trust in the predictions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.image.image_input import ImageInput
+from psfdae.image.observation import Observation
+from psfdae.image.positions import list_offset
+from psfdae.image.stamps import Stamps, StarFlag
+from psfdae.method import KnowsField, MeasuresStars
+from psfdae.model.field_psfs import PredictionError
+from psfdae.model.prediction import Prediction
+
+if TYPE_CHECKING:
+    from psfdae.model.psf_model import PsfModel
+
+
+def predict_stars(
+    model: PsfModel, source: ImageInput, threads: int | None, fixed: bool
+) -> Prediction:
+    """Return the predictions of all stars of an image, with sentences on what limits them.
+
+    Parameters
+    ----------
+    model : PsfModel
+    source : ImageInput
+        The image with its list, and what is stated about it.
+    threads : int or None
+        None takes all cores.
+    fixed : bool
+        Listed centres are exact.
+
+    Raises
+    ------
+    PredictionError
+        If the image has pixels of another scale, or of an unknown one.
+    ObservationError
+        If the image or its list cannot be used, or the positions of the list are far off.
+    """
+    observation = open_for_model(model, source, fixed)
+    stamps, predictions = zip(*model.stream(observation, threads, fixed), strict=True)
+    # The stars are near the listed positions, or the list is refused.
+    pairs = zip(stamps, predictions, strict=True)
+    offsets = np.concatenate([offsets_from_list(*pair, model.margin_px) for pair in pairs])
+    offset_note = list_offset(observation.catalogue, offsets, source.accept_offset)
+    notes = [observation.summary(), offset_note if observation.shape else None]
+    notes += notes_on_model(model, observation)
+    return replace(Prediction.joined(predictions), notes=tuple(filter(None, notes)))
+
+
+def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> Observation:
+    """Open an image whose pixels must be those of a model.
+
+    Raises
+    ------
+    PredictionError
+        If its pixel scale is another one, or not known; or if listed centres are exact (`fixed`),
+        and there is no list, or the model measures no centres.
+    """
+    observation = source.open(model.info.stamp_px, model.margin_px)
+    if model.info.source == "stars":
+        # A model of an image may have been trained without a known pixel scale, too.
+        observation = observation.assuming()
+    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
+    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    if fixed and not (isinstance(model.method, MeasuresStars) and observation.shape):
+        raise PredictionError(
+            f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
+            "psfdae from-stars --method field"
+        )
+    return observation
+
+
+def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
+    """Return sentences on another instrument than the training's, and on light beyond stamps."""
+    notes = []
+    if difference := model.other_instrument(observation.instrument, observation.colour_column):
+        notes.append(f"{observation.path}: {difference}")
+    if observation.shape and isinstance(model.method, KnowsField) and not model.wings:
+        notes.append(
+            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
+            f"{model.stamp_px} px; flux is the light in the stamp"
+        )
+    return notes
+
+
+def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) -> np.ndarray:
+    """Return the offsets of stars from their listed positions.
+
+    Parameters
+    ----------
+    stamps : Stamps
+    prediction : Prediction
+        Predictions of these stamps.
+    margin_px : int
+        Pixels by which a star may have been moved to the middle of its stamp.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Along x and y in px; NaN for stars that are too faint, have no flux, or are not listed.
+    """
+    # A model that measures centres (field) gives the offset itself.
+    centre_offset = np.stack([prediction.x_fit - stamps.x, prediction.y_fit - stamps.y], axis=1)
+    # For another one, it is the shift by which the stamp was centred on its brightest pixel. A star
+    # that is off by more than the margin allows is given a pixel more than that.
+    off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
+    shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
+    shift = np.where(off_centre[:, None], margin_px + 1.0, shift)
+    # Noise moves the brightest pixel of a faint star.
+    unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
+    offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
+    return np.where(unclear[:, None], np.nan, offset)
