@@ -15,7 +15,6 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
-from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction
 
@@ -71,7 +70,7 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
         observation = observation.assuming()
     assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
-    if fixed and not (isinstance(model.method, MeasuresStars) and observation.shape):
+    if fixed and not (model.method.knows_field and observation.shape):
         raise PredictionError(
             f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
             "psfdae from-stars --method field"
@@ -84,7 +83,7 @@ def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
     notes = []
     if difference := model.other_instrument(observation.instrument, observation.colour_column):
         notes.append(f"{observation.path}: {difference}")
-    if observation.shape and isinstance(model.method, KnowsField) and not model.wings:
+    if observation.shape and model.method.knows_field and not model.wings:
         notes.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{model.stamp_px} px; flux is the light in the stamp"
