@@ -187,9 +187,10 @@ def test_page_lists_all_flags_and_columns():
     text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
-    photometry = (ROOT / "docs/own_stars.md").read_text(encoding="utf-8")
+    other_pages = [ROOT / f"docs/{name}.md" for name in ("own_stars", "python")]
+    all_text = text + "".join(path.read_text(encoding="utf-8") for path in other_pages)
     for name in COLUMNS:
-        assert f"`{name}`" in text + photometry, name
+        assert f"`{name}`" in all_text, name
     for extension, _ in writer.CUBES.values():
         assert f"| `{extension}` |" in text
     assert f"by up to {stage.PsfModel.margin_px} px" in text
