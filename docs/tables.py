@@ -17,20 +17,23 @@ number of a section that has no such table. Files of two commits are not joined.
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import re
 import sys
 from dataclasses import fields
 from functools import cache
+from importlib import import_module
 from math import fsum
 from pathlib import Path
 from types import SimpleNamespace
 
+import click
 import numpy as np
 import pandas as pd
 import yaml
 
-from psfdae.cli import as_click, stage
+from psfdae.cli import as_click, command_modules, sections, stage
 from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.image_input import ImageStatements
 from psfdae.methods import known, method
@@ -210,6 +213,51 @@ def image_statements():
         }
         for field in fields(ImageStatements)
     )
+
+
+def commands():
+    """Heading, usage and first sentence of each command, in the order of `psfdae --help`."""
+    rows = []
+    for heading, words in sections(sorted({name.split()[0] for name in command_modules()})).items():
+        for name in sorted(command_modules(), key=lambda name: (*words, name).index(name)):
+            if name.split()[0] in words:
+                first_sentence = command_modules()[name][1].partition(". ")[0].removesuffix(".")
+                # Arguments of the command in capitals, as its help has them.
+                command = as_click(stage(name))
+                arguments = [p for p in command.params if isinstance(p, click.Argument)]
+                usage = [
+                    f"psfdae {name}",
+                    *(p.make_metavar(click.Context(command)) for p in arguments),
+                ]
+                rows.append([heading, " ".join(usage).replace("|", r"\|"), first_sentence])
+    return pd.DataFrame(rows, columns=["heading", "usage", "sentence"])
+
+
+def public_names():
+    """Calls of the names on the reference page of Python, with the first sentence of each."""
+    page, rows = (ROOT / "docs/api.md").read_text(encoding="utf-8"), []
+    for path, _, members in re.findall(r"^::: (\S+)(\n.*\n +members: \[(.*)\])?", page, re.M):
+        module, _, name = path.rpartition(".")
+        value = getattr(import_module(module), name)
+        described = {
+            name: value,
+            **{f"{name}.{m}": getattr(value, m) for m in filter(None, members.split(", "))},
+        }
+        for label, thing in described.items():
+            first_sentence = re.split(r"[.;:](?: |$)", inspect.getdoc(thing) or "")[0].split(
+                "\n\n"
+            )[0]
+            # Parameters of functions and methods, without what is passed on.
+            parameters = ""
+            if callable(thing) and not isinstance(thing, type):
+                names = [
+                    n
+                    for n, p in inspect.signature(thing).parameters.items()
+                    if p.kind != p.VAR_KEYWORD
+                ]
+                parameters = f"({', '.join(n for n in names if n != 'self')})"
+            rows.append([f"{label}{parameters}", " ".join(first_sentence.split())])
+    return pd.DataFrame(rows, columns=["call", "sentence"])
 
 
 def header_keys(name):
