@@ -154,7 +154,7 @@ class GaussianMixture(MixtureLaw, Method):
         cluster = k_means(x, p, k, gmm.principal, gmm.place, data.seed)
         del x  # memory: it is needed again in another order
         # The distributions of the clusters, and ν, by which they are shrunk when they are used.
-        arrays = mixture_arrays(data, stars, p, cluster)
+        arrays: dict[str, Any] = mixture_arrays(data, stars, p, cluster)
         return cls(**arrays, shrinkage=np.array([nu]), noise=data.noise)
 
     @classmethod
