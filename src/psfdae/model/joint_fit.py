@@ -137,7 +137,7 @@ def fit_stars(
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.squares() if len(back) else squares
-    bound = (np.abs(fit.place - middle) > 0.999 * range_px).any(axis=1)
+    bound = np.abs(fit.place - middle) > 0.999 * range_px
     return fit.result(len(place), prior, moving, bound)
 
 
@@ -294,7 +294,7 @@ class _Fit:
     ) -> JointFit:
         """Return the fit of `count` stars, these among them.
 
-        `moving` stars (m,) were not at rest, and those of `bound` (m,) at the end of their range.
+        `moving` stars (m,) were not at rest; x or y at the end of its range is in `bound` (m, 2).
         """
         # Standard errors, and the reduced χ² of the pixels of each box.
         error = standard_errors(*_normal_matrix(self.design(), self._rows, prior))
@@ -304,7 +304,7 @@ class _Fit:
         height, width = self.image.shape
         outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
         flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
-        flags += 8 * moving + 32 * bound
+        flags += 8 * moving + 32 * bound.any(axis=1)
 
         def of_all(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
             # Rows of all stars of the list; those that were not fitted have no value.

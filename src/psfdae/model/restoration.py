@@ -145,13 +145,11 @@ class RestoredStars(NamedTuple):
 
     def part(self, rows: slice) -> RestoredStars:
         """Return some of the stars."""
-        arrays = self._asdict() | {"photometry": self.photometry.part(rows)}
-        return RestoredStars(
-            **{
-                name: values[rows] if isinstance(values, np.ndarray) else values
-                for name, values in arrays.items()
-            }
-        )
+        values: dict[str, Any] = {
+            name: array[rows] if isinstance(array, np.ndarray) else array
+            for name, array in self._asdict().items()
+        }
+        return RestoredStars(**values | {"photometry": self.photometry.part(rows)})
 
     def centre_columns(self) -> dict[str, np.ndarray]:
         """Return the columns on centres, and on errors beside that of the flux.

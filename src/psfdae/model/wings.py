@@ -425,7 +425,7 @@ def wings_of(
 
 def error_beside_models(error: np.ndarray, star_light: np.ndarray) -> np.ndarray:
     """Return σ (h, w) of what models of stars leave, to 3 % of whose light in a pixel they hold."""
-    return np.hypot(error, 0.03 * star_light)
+    return np.asarray(np.hypot(error, 0.03 * star_light))
 
 
 def block_sums(values: np.ndarray, side: int) -> np.ndarray:
