@@ -300,8 +300,8 @@ class Restorer:
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred)])
         unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
-        whole = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
-        return [whole.part(slice(*rows)) for rows in pairwise(ends)]
+        restored = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [restored.part(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalised(
         self, photometry: Photometry, has_no_flux: np.ndarray
