@@ -56,7 +56,6 @@ class Dae(Method):
         diagnostics=(HISTORY,),
         per_reference=True,
         rule="train",
-        about="Folder of a trained network.",
     )
     packing = Packing(suffix="")
     groups: ClassVar = {"dae": DaeSettings, "train": Train}
