@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.errors import Error
-from psfdae.image.image_input import ImageInput
+from psfdae.model.image_photometry import ImageFluxes
 from psfdae.moments import measure_shapes
 
 if TYPE_CHECKING:
-    from astropy.nddata import CCDData
-    from astropy.table import QTable
     from photutils.psf import GriddedPSFModel
 
-    from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
     from psfdae.model.wings import Wings
 
 
@@ -46,7 +42,7 @@ class PredictionError(Error, ValueError):
     """
 
 
-class FieldPsfs(ABC):
+class FieldPsfs(ImageFluxes, ABC):
     """PSF at every position of an image, and quantities that follow from it.
 
     Attributes
@@ -75,68 +71,6 @@ class FieldPsfs(ABC):
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image that the model was trained on, if known."""
 
-    def photometry(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        zero_point: float | None = None,
-        reference: StarList | None = None,
-        magnitude_column: str = "mag",
-        **statements: Any,
-    ) -> QTable:
-        """Measure the fluxes of all stars of an image, overlapping ones together.
-
-        It is the table that the command `psfdae photometry` writes.
-
-        Parameters
-        ----------
-        image : path-like, array, NDData, HDU or HDUList
-            The image that the model learnt from, or another one with the same PSF.
-        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list; no other stars are looked for.
-        zero_point : float, optional
-            Magnitude of a flux of 1.
-        reference : as `catalogue`, optional
-            Star list with magnitudes, which give the zero point.
-        magnitude_column : str
-            Column of the reference with the magnitudes.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`.
-
-        Returns
-        -------
-        QTable
-            A row for each star, with units.
-
-        Raises
-        ------
-        Error
-            If the image or a list cannot be used, or the model knows no PSF of a place.
-        """
-        from psfdae.model.image_photometry import photometry_of_image
-
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return photometry_of_image(self, source, zero_point, reference, magnitude_column).table
-
-    def residual(
-        self, image: Image, catalogue: StarList | None = None, **statements: Any
-    ) -> CCDData:
-        """Return an image without its sky and stars, which are measured as by `photometry`.
-
-        `psfdae.model.image_photometry.photometry_of_image` gives table and residual of one
-        measurement.
-
-        Parameters
-        ----------
-        image, catalogue, **statements : as those of `photometry`
-        """
-        from psfdae.model.image_photometry import photometry_of_image
-
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return photometry_of_image(self, source).residual
-
     def flux_error(self, place: np.ndarray) -> np.ndarray:
         """Return the errors of stars' fluxes on a known sky that are due to the model.
 
@@ -161,7 +95,7 @@ class FieldPsfs(ABC):
         """
 
     @abstractmethod
-    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         """Return PSFs (n, m, m) as `psf_at`, at checked positions (n, 2) to (n, 4).
 
         Columns are x, y, magnitude and colour; NaN stands for an average over the training stars.
@@ -219,8 +153,9 @@ class FieldPsfs(ABC):
         # Memory grows as its square; the PSF has no structure at a 32nd of a pixel.
         if not 1 <= oversampling <= 32:
             raise PredictionError(f"oversampling {oversampling}: 1 to 32")
+        # A position far outside the image may overflow, which is refused below.
         with np.errstate(all="ignore"):
-            psfs = self._psfs(position.reshape(-1, count), oversampling)
+            psfs = self.draw_psfs(position.reshape(-1, count), oversampling)
         # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
         # give anything.
         flux = psfs.sum(axis=(1, 2))
@@ -315,6 +250,7 @@ def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
         If the values, called `name` in the message, are no real numbers.
     """
     # Floats of up to 32 bits become float32, all other numbers float64.
+    # Texts, complex numbers and objects are refused.
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
     from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
     from psfdae.model.field_psfs import FieldPsfs
@@ -62,6 +63,69 @@ class ImagePhotometry:
 
         unit = self.table["flux"].unit
         return CCDData(self.measured.residual.astype(np.float32), unit=unit)
+
+
+class ImageFluxes:
+    """Photometry of a whole image, for all models that know the PSF at every place."""
+
+    def photometry(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        zero_point: float | None = None,
+        reference: StarList | None = None,
+        magnitude_column: str = "mag",
+        **statements: Any,
+    ) -> QTable:
+        """Measure the fluxes of all stars of an image, overlapping ones together.
+
+        It is the table that the command `psfdae photometry` writes.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            The image that the model learnt from, or another one with the same PSF.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list; no other stars are looked for.
+        zero_point : float, optional
+            Magnitude of a flux of 1.
+        reference : as `catalogue`, optional
+            Star list with magnitudes, which give the zero point.
+        magnitude_column : str
+            Column of the reference with the magnitudes.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`.
+
+        Returns
+        -------
+        QTable
+            A row for each star, with units.
+
+        Raises
+        ------
+        Error
+            If the image or a list cannot be used, or the model knows no PSF of a place.
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        model = cast("FieldPsfs", self)
+        return photometry_of_image(model, source, zero_point, reference, magnitude_column).table
+
+    def residual(
+        self, image: Image, catalogue: StarList | None = None, **statements: Any
+    ) -> CCDData:
+        """Return an image without its sky and stars, which are measured as by `photometry`.
+
+        `psfdae.model.image_photometry.photometry_of_image` gives table and residual of one
+        measurement.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `photometry`
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return photometry_of_image(cast("FieldPsfs", self), source).residual
 
 
 def photometry_of_image(

@@ -7,10 +7,11 @@ the model, and sentences on what limits the trust in the predictions.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from psfdae.image.camera import other_instruments
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
@@ -19,7 +20,81 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction
 
 if TYPE_CHECKING:
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
     from psfdae.model.psf_model import PsfModel
+
+
+class WholeImages:
+    """Calls of a `PsfModel` that take a whole image, as the commands of the same names do."""
+
+    def predict_image(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        fixed: bool = False,
+        threads: int | None = None,
+        **statements: Any,
+    ) -> Prediction:
+        """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            FITS image, or cube of stamps.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list, as `Stars.from_image` takes it.
+        fixed : bool
+            Its centres are exact, for models that measure centres (field).
+        threads : int, optional
+            By default, all cores.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
+            `background_column` of the list.
+
+        Returns
+        -------
+        Prediction
+            One row per star; `notes` has sentences on the image and its list.
+
+        Raises
+        ------
+        Error
+            If the image or its list cannot be used, or its pixels are not those of the model.
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return predict_stars(cast("PsfModel", self), source, threads, fixed)
+
+    def adapt(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        name: str | None = None,
+        **statements: Any,
+    ) -> PsfModel:
+        """Return this model adapted to another exposure, as `psfdae exposure` does.
+
+        The stars of the exposure show how its PSF differs from that of the model; ten may be
+        enough.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `predict_image`
+        name : str, optional
+            Name of the new model, by default that of the image.
+
+        Raises
+        ------
+        Error
+            If this is no model of a field, or the image has too few bright stars.
+        """
+        from psfdae.model.exposures import exposure
+
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return exposure(cast("PsfModel", self), source, name or source.name)[0]
 
 
 def predict_stars(
@@ -81,7 +156,8 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
 def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
     """Return sentences on another instrument than the training's, and on light beyond stamps."""
     notes = []
-    if difference := model.other_instrument(observation.instrument, observation.colour_column):
+    # Another telescope, camera or filter, as far as both images name theirs.
+    if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
     if observation.shape and model.method.knows_field and not model.wings:
         notes.append(
@@ -119,3 +195,26 @@ def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) ->
     unclear |= ~np.isfinite(stamps.listed).all(axis=1)
     offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
     return np.where(unclear[:, None], np.nan, offset)
+
+
+def other_instrument(model: PsfModel, observation: Observation) -> str:
+    """Describe how an image's telescope, camera or filter differs from the training image.
+
+    The colours of the star lists count as well, where the image's list has any.
+
+    Returns
+    -------
+    difference : str
+        Empty if all that both headers and lists name is the same.
+    """
+    # What the headers of both images name: telescope, camera, filter; and the lists: a colour.
+    stars, instrument = model.info.config.get("stars", {}), observation.instrument
+    trained_on = dict(stars.get("instrument", {}))
+    if observation.colour_column and "colour_column" in stars:
+        key = "the column of colours"
+        trained_on[key] = stars["colour_column"]
+        instrument = {**instrument, key: observation.colour_column}
+    return "; ".join(
+        f"{key} is {value!r}, the model {model.name!r} was trained on {trained_value!r}"
+        for key, trained_value, value in other_instruments(trained_on, instrument)
+    )

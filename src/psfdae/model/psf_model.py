@@ -6,23 +6,21 @@ flags comes out. What happens between is in `psfdae.model.restoration`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
-from psfdae.image.camera import other_instruments
-from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.method import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
-from psfdae.model.image_prediction import predict_stars
+from psfdae.model.image_prediction import WholeImages
 from psfdae.model.prediction import Prediction
 from psfdae.model.restoration import Restorer
 from psfdae.model.stamp_arrays import stamps_of_arrays
@@ -31,14 +29,10 @@ from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, one_thread_each, side_by_side
 
 if TYPE_CHECKING:
-    from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
+    pass
 
 SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
-
-MAX_STARS_READ = 1024
-"""Stars that are read at a time; fewer if their stamps are large."""
 
 
 def load_model(path: str | Path | None = None) -> PsfModel:
@@ -71,7 +65,7 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
 
-class PsfModel(FieldPsfs):
+class PsfModel(WholeImages, FieldPsfs):
     """Fitted method with all that it takes to restore stars: photometry, errors and limits.
 
     Parameters
@@ -95,6 +89,9 @@ class PsfModel(FieldPsfs):
 
     margin_px: ClassVar[int] = 2
     """Pixels by which a star of an image may be moved to the middle of its stamp."""
+
+    max_stars_read: ClassVar[int] = 1024
+    """Stars of an image that are read at a time; fewer if their stamps are large."""
 
     def __init__(self, bundle: Bundle, method: Method | None = None) -> None:
         self.bundle = bundle
@@ -183,85 +180,17 @@ class PsfModel(FieldPsfs):
         PredictionError
             If shapes or types do not fit.
         """
-        # A margin below 0 leaves no side that fits.
+        # Check the arrays, and make them to stamps. A margin below 0 leaves no side that fits.
         side = self.stamp_px + 2 * margin if margin >= 0 else 0
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
-        # Blocks of stars, side by side.
+        # Blocks of stars, side by side; each is restored as if it were alone.
         blocks = self.restorer.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
         with one_thread_each():
             parts = side_by_side(lambda block: self.restorer.restore(block, fixed), blocks, threads)
         return replace(Prediction.joined(parts), unit=unit)
-
-    def predict_image(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        fixed: bool = False,
-        threads: int | None = None,
-        **statements: Any,
-    ) -> Prediction:
-        """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
-
-        Parameters
-        ----------
-        image : path-like, array, NDData, HDU or HDUList
-            FITS image, or cube of stamps.
-        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list, as `Stars.from_image` takes it.
-        fixed : bool
-            Its centres are exact, for models that measure centres (field).
-        threads : int, optional
-            By default, all cores.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
-            `background_column` of the list.
-
-        Returns
-        -------
-        Prediction
-            One row per star; `notes` has sentences on the image and its list.
-
-        Raises
-        ------
-        Error
-            If the image or its list cannot be used, or its pixels are not those of the model.
-        """
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return predict_stars(self, source, threads, fixed)
-
-    def adapt(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        name: str | None = None,
-        **statements: Any,
-    ) -> PsfModel:
-        """Return this model adapted to another exposure, as `psfdae exposure` does.
-
-        The stars of the exposure show how its PSF differs from that of the model; ten may be
-        enough.
-
-        Parameters
-        ----------
-        image, catalogue, **statements : as those of `predict_image`
-        name : str, optional
-            Name of the new model, by default that of the image.
-
-        Raises
-        ------
-        Error
-            If this is no model of a field, or the image has too few bright stars.
-        """
-        from psfdae.model.exposures import exposure
-
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return exposure(self, source, name or source.name)[0]
 
     def stream(
         self, observation: Observation, threads: int | None = None, fixed: bool = False
@@ -271,16 +200,18 @@ class PsfModel(FieldPsfs):
         Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
         taken.
         """
+        # Stamps are read in chunks, each of which is restored in blocks by a thread of its own.
         size = self.restorer.block_size
 
         def predicted(stamps: Stamps) -> Prediction:
             blocks = self.restorer.blocks(stamps)
             return Prediction.joined([self.restorer.restore(block, fixed) for block in blocks])
 
-        chunks = observation.chunks(max(size, min(MAX_STARS_READ, 4 * size)))
+        chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
         with one_thread_each(), task("stars", observation.count) as advance:
             for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
+                # Columns of the star list go along with the stars' rows.
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
                 # The star on the sky, by its own centre where the model measures one.
@@ -319,6 +250,7 @@ class PsfModel(FieldPsfs):
         middle of the field, they are not below those of the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
+        # The light L of wings is known to σ_L, and with it the whole flux to σ_L / (1 + L) of it.
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         errors = self.bundle.errors.measured
         fitted_error = errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0)
@@ -330,37 +262,10 @@ class PsfModel(FieldPsfs):
         size = self.info.config.get("stars", {}).get("image_px")
         return None if size is None else (size[0], size[1])
 
-    def other_instrument(
-        self, instrument: Mapping[str, str], colour_column: str | None = None
-    ) -> str:
-        """Describe how an image's telescope, camera or filter differs from the training image.
-
-        Parameters
-        ----------
-        instrument : mapping
-            By the key of the header, as `Observation.instrument`.
-        colour_column : str, optional
-            Of the star list, if its colours are used.
-
-        Returns
-        -------
-        difference : str
-            Empty if all that both headers and lists name is the same.
-        """
-        stars = self.info.config.get("stars", {})
-        trained_on = dict(stars.get("instrument", {}))
-        if colour_column and "colour_column" in stars:
-            key = "the column of colours"
-            trained_on[key] = stars["colour_column"]
-            instrument = {**instrument, key: colour_column}
-        return "; ".join(
-            f"{key} is {value!r}, the model {self.name!r} was trained on {trained_value!r}"
-            for key, trained_value, value in other_instruments(trained_on, instrument)
-        )
-
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and greatest position (x, y) of training stars; raises as `psf_at`."""
         self._field()
+        # The field's polynomial has its range in its arrays.
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
         # Stars without places leave zeros; a star alone is at one place.
         if not ((high > low) | ((high == low) & (low > 0))).all():
@@ -377,7 +282,7 @@ class PsfModel(FieldPsfs):
             )
         return field
 
-    def _psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         return self._field().psf_at(place, oversampling)
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
