@@ -422,7 +422,7 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
         scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, COVERAGE95) / 1.96)
         return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
-    fitted_flux, growth = fitted.fitted_flux_error()
+    fitted_flux, *growth = fitted.fitted_flux_error()
     flux = lacking((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
     sky = lacking(prediction.background[usable], prediction.background_error[usable])
@@ -432,9 +432,7 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
     usable_centres = np.concatenate([usable, usable])
     centre_error = lacking(off[usable_centres], stated[usable_centres])
     # Few fields are drawn: the error of the flux is not below that of a fit on a known sky.
-    measured = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux)
-    if growth:
-        measured = measured._replace(growth=growth)
+    measured = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
     return replace(bundle, errors=replace(bundle.errors, measured=measured))
 
 
