@@ -290,7 +290,7 @@ class FieldMixture(FieldLaw, Method):
 
 def fitted_arrays(
     fit: FieldFit, bright: BrightStars, side: int, settings: FieldSettings
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Return the arrays of a `FieldLaw` that follow from a fit of the field.
 
     Parameters

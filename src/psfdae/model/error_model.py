@@ -164,7 +164,8 @@ class ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
         values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
         table = arrays["measured"]
-        measured = ModelErrors(*table[:4].tolist(), table[4:6], table[6:])
+        flux, sky, centre, fitted_flux = table[:4].tolist()
+        measured = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
         return cls(**values | {"measured": measured})
 
     def arrays(self) -> dict[str, np.ndarray]:

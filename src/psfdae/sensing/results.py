@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
 from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
-from psfdae.sensing.summary import nearest_modes, wavefront_table
+from psfdae.sensing.summary import nearest_modes, summarise_modes, wavefront_table
 from psfdae.telescope.field import Terms, telescope_model, terms_of
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
@@ -246,25 +246,7 @@ class Wavefronts:
 
         `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
         """
-        # Draws belong to the mode that is nearest; a mode without draws is left out.
-        k = len(self.terms.names)
-        rows: list[tuple[Any, ...]] = []
-        for row, star in enumerate(self.star):
-            # The probability of a mode is its fraction of the star's draws.
-            modes, count = np.unique(self.mode_of_draw[row], return_counts=True)
-            for mode in modes[np.argsort(-count, kind="stable")]:
-                draws = self.coefficients[row, self.mode_of_draw[row] == mode]
-                # Too few draws have no useful covariance: that of the peak takes its place.
-                if len(draws) > 2 * k:
-                    covariance = np.atleast_2d(np.cov(draws, rowvar=False))
-                else:
-                    sd = self.terms.sd[star]
-                    covariance = self.modes.covariance[mode, :k, :k] * sd * sd[:, None]
-                probability = len(draws) / self.draws.shape[1]
-                rows.append((star, probability, draws.mean(axis=0), covariance))
-        names = ("star", "probability", "mean", "covariance")
-        columns = zip(*rows, strict=True)
-        return {name: np.array(values) for name, values in zip(names, columns, strict=True)}
+        return summarise_modes(self.coefficients, self.mode_of_draw, self.modes, self.terms.sd)
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
         """Return central intervals of the coefficients over all modes of each star.

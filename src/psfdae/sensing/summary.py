@@ -6,7 +6,7 @@ whose property `table` is made here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,45 @@ def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
         distance = np.einsum("mni,mij,mnj->mn", gap, precision, gap)
         nearest[row] = numbers[distance.argmin(axis=0)]
     return nearest
+
+
+def summarise_modes(
+    coefficients: np.ndarray, mode_of_draw: np.ndarray, modes: StarModes, sd: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the table of posterior modes, by star and the most probable first.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (m, s, K)
+        Draws of the coefficients in waves.
+    mode_of_draw : ndarray of int, shape (m, s)
+        Result of `nearest_modes`.
+    modes : StarModes
+    sd : ndarray, shape (n, K)
+        Standard deviation of the prior of all stars, in waves.
+
+    Returns
+    -------
+    dict of ndarray
+        `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
+    """
+    # Draws belong to the mode that is nearest; a mode without draws is left out.
+    k = coefficients.shape[-1]
+    rows: list[tuple[Any, ...]] = []
+    for row, star in enumerate(modes.best_modes.star):
+        # The probability of a mode is its fraction of the star's draws.
+        numbers, count = np.unique(mode_of_draw[row], return_counts=True)
+        for mode in numbers[np.argsort(-count, kind="stable")]:
+            draws = coefficients[row, mode_of_draw[row] == mode]
+            # Too few draws have no useful covariance: that of the peak takes its place.
+            if len(draws) > 2 * k:
+                covariance = np.atleast_2d(np.cov(draws, rowvar=False))
+            else:
+                covariance = modes.covariance[mode, :k, :k] * sd[star] * sd[star][:, None]
+            probability = len(draws) / coefficients.shape[1]
+            rows.append((star, probability, draws.mean(axis=0), covariance))
+    names, columns = ("star", "probability", "mean", "covariance"), zip(*rows, strict=True)
+    return {name: np.array(values) for name, values in zip(names, columns, strict=True)}
 
 
 def wavefront_table(wavefronts: Wavefronts) -> Table:
