@@ -90,6 +90,7 @@ class FieldMixture(FieldLaw, Method):
         """
         if data.bright is None:
             raise FitError("it learns from the bright stars of an image: psfdae from-stars")
+        # The field is fitted in frames with a margin, so that residuals can be moved by 2 px.
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
         rng = stream(data.seed, "noise", "field")
@@ -109,6 +110,7 @@ class FieldMixture(FieldLaw, Method):
         background : float
             Photons of the sky in a pixel.
         """
+        # Few stars say how the field differs from that of the training (eq. 5).
         sizes = (self.side + 2 * MARGIN_PX, self.side, self.settings.smoothness)
         fit = refit_field(self.model, bright, background, *sizes)
         listed = fit.list_error(bright)
@@ -127,6 +129,7 @@ class FieldMixture(FieldLaw, Method):
         Settings that this release does not know are ignored: they affect the fit alone.
         """
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
+        # Modes may be in half precision; two arrays have older names in files.
         named: dict[str, Any] = {cls.attributes.get(n, n): array for n, array in arrays.items()}
         named["modes"] = arrays["modes"].astype(np.float32)
         supported = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
@@ -273,6 +276,7 @@ class FieldMixture(FieldLaw, Method):
             unit=np.ones(count),
         )
         posterior = posterior_of_stamps(self, stars, position_known, exact)
+        # Sky as it was in the stamps, and centres in the coordinates of the list.
         measured = Measured(
             flux=posterior.flux,
             background=posterior.sky + sky_level,

@@ -62,15 +62,16 @@ def left_out_stars(fitter: FieldFitter, fit: FieldFit) -> Iterator[LeftOut]:
     terms = fit.model.terms(fitter.place)
     data = fitter.images / fit.flux[:, None, None]
     star_images = fit.model.images(terms, fit.centre, len(fitter.axis))
-    weight, noise = (
-        fitter.pixel_weight(fit.flux, star_images),
-        fitter.pixel_variance(fit.flux, star_images),
-    )
+    # Weights of pixels as at the end of the fit, neighbours' pixels less (eq. 3).
+    weight = fitter.pixel_weight(fit.flux, star_images)
+    noise = fitter.pixel_variance(fit.flux, star_images)
     weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
     fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
+    # Stars are judged in the stamps that a model restores.
     axis = fitter.axis[fitter.in_stamp]
     box = np.ix_(np.arange(len(terms)), fitter.in_stamp, fitter.in_stamp)
     for left_out in range(settings.folds):
+        # Splines without the stars of this fold, from those of the fit.
         used = weight * ((fold != left_out) & fit.good)[:, None, None]
         coefficients = fitter.fit_splines(
             fit.options, terms, data, used, fit.centre, fit.model.coefficients
@@ -80,16 +81,10 @@ def left_out_stars(fitter: FieldFitter, fit: FieldFit) -> Iterator[LeftOut]:
             continue
         images, is_measured = data[box][judged], fitter.measured[box][judged].astype(float)
         splines = np.tensordot(terms[judged], coefficients, 1)
+        # Flux, centre and sky that the star needs under these splines; all pixels count alike.
+        start, steps = fit.centre[judged], settings.left_out_steps
         flux, centre, residual = adjust_stars(
-            splines,
-            images,
-            is_measured,
-            fit.centre[judged],
-            axis,
-            spacing,
-            settings.left_out_steps,
-            sky=True,
-            max_offset_px=settings.max_offset_px,
+            splines, images, is_measured, start, axis, spacing, steps, sky=True
         )
         # The sky b of weighted least squares with the design D of flux, row, column and sky is
         # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
@@ -161,11 +156,13 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
     from scipy.optimize import brentq
 
     def slope(scatter: float) -> float:
+        # Slope of ln of the likelihood by τ², with outliers cut at 3 σ.
         total = sigma**2 + scatter**2
         return float(((np.minimum(values**2 / total, 9.0) - 1.0) / total).sum())
 
     if len(values) < 5 or slope(0.0) <= 0:
         return 0.0
+    # Beyond three times the largest value, the slope is negative.
     upper_end = 3.0 * float(np.abs(values).max())
     return float(brentq(slope, 0.0, upper_end))
 
@@ -185,6 +182,7 @@ def draw_field_stars(
     centre : ndarray, shape (count, 2)
         (row, column) from pixel (d//2, d//2), in the coordinates of the field's centres.
     """
+    # Places over the range of the training stars, and phases over a pixel.
     fields, side = uncertainty.redrawn or (law.model,), law.side
     position = rng.uniform(law.low, law.high, (count, len(law.low)))
     centre = rng.uniform(-0.5, 0.5, (count, 2))
@@ -249,6 +247,7 @@ def flux_error_over_field(
 
     def variance(models: Sequence[FieldModel]) -> np.ndarray:
         """Return the mean squared error of the flux at each place, (25,)."""
+        # Σ m m' / Σ m² − 1 of each field m', squared and averaged over the fields.
         flux = [(psf * draw_psfs(other)).sum(axis=(1, 2)) for other in models]
         ratio = flux / np.square(psf).sum(axis=(1, 2))
         return np.asarray(np.square(ratio - 1.0).mean(axis=0))

@@ -71,9 +71,9 @@ class FitSettings:
         Rounds of splines, centres and fluxes; with more, centres follow what splines cannot.
     centre_steps, left_out_steps : int
         Gauss-Newton steps of a star in a round, and of a star that was left out.
-    window_px, window_reach_px, max_offset_px : float
-        Width of the window of the first centroids, how far these may move, and how far a centre may
-        be from the brightest pixel, in pixels.
+    window_px, window_reach_px, wide_reach_px : float
+        Width of the window of the first centroids, how far these may move, and how far if stars are
+        rings, in pixels.
     model_error, min_error : float
         Error of the model over a pixel's light, which no polynomial follows; error of a pixel over
         the flux, at least.
@@ -103,7 +103,7 @@ class FitSettings:
     left_out_steps: int = 5
     window_px: float = 1.2
     window_reach_px: float = 1.0
-    max_offset_px: float = 1.5
+    wide_reach_px: float = 1.5
     model_error: float = 0.02
     min_error: float = 1e-5
     outlier_sigma: float = 3.0
@@ -265,11 +265,11 @@ class FieldFitter:
             if coordinate not in options.star_terms:
                 high[coordinate] = low[coordinate]
         terms = field_terms(self.place, low, high, options.order)
-        # First fluxes are the light in the frames, first centres windowed centroids.
+        # First fluxes are the light in the frames, first centres centroids in a Gaussian window.
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
         is_usual = self.window_px == settings.window_px
-        reach = settings.window_reach_px if is_usual else settings.max_offset_px
+        reach = settings.window_reach_px if is_usual else settings.wide_reach_px
         centre = windowed_centres(self.images, start, window, 4, reach)
         # Weights are those of a star's expected light, first that of the median star. Those of its
         # own pixels would be larger where noise makes them fainter, and light in the wings too
@@ -287,16 +287,10 @@ class FieldFitter:
             )
             splines = np.tensordot(terms, coefficients, 1)
             factor, centre, _ = adjust_stars(
-                splines,
-                data,
-                weight,
-                centre,
-                self.axis,
-                spacing,
-                settings.centre_steps,
-                max_offset_px=settings.max_offset_px,
+                splines, data, weight, centre, self.axis, spacing, settings.centre_steps
             )
-            # The mean star in the middle of its stamp has the sum 1.
+            # The mean star in the middle of its stamp has the sum 1: a factor of all splines is one
+            # of all fluxes.
             middle = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(draw_splines(middle, sides, np.zeros((1, 2)), spacing).sum())
@@ -308,7 +302,8 @@ class FieldFitter:
             inside = star_images[:, self.in_stamp][:, :, self.in_stamp].sum(axis=(1, 2))
             flux, star_images = flux * inside, star_images / inside[:, None, None]
             residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)
-            # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all.
+            # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all. In the
+            # first round, the field is not known well enough to tell stars.
             noise = self.pixel_weight(flux, star_images)
             square = residual**2 * noise
             chi2 = square.sum(axis=(1, 2)) / np.maximum(self.measured.sum(axis=(1, 2)), 1)
@@ -363,6 +358,7 @@ class FieldFitter:
         terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
         shape = (terms.shape[1], options.knots, options.knots)
         spacing, settings = spacing_of(len(self.axis), options.knots), self.settings
+        # B-splines of the rows and columns of each star's frame, at its centre.
         rows, columns = (
             cubic_splines(self.axis[None] - centre[:, i, None], options.knots, spacing)
             for i in (0, 1)
@@ -376,6 +372,7 @@ class FieldFitter:
             # Only the difference to the other exposure is fitted, after its stretch and blur.
             prior_coefficients = deform_splines(self.prior, terms, data, weight, (rows, columns))
             change = options.change * np.abs(prior_coefficients[0]) + settings.min_coefficient
+            # ρ: a change by `options.change` of the coefficient is one σ.
             ridge[:] = 1.0 / change**2
             ridge[1:] /= settings.varying_change**2
             image = rows @ np.tensordot(terms, prior_coefficients, 1) @ columns.transpose(0, 2, 1)
@@ -384,6 +381,7 @@ class FieldFitter:
             # Changes over the field are a part of the mean star of the round before.
             change = settings.field_change * np.abs(start[0]) + settings.min_coefficient
             ridge[1:] = 1.0 / change**2
+        # Iterations begin at the coefficients of the round before.
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(

@@ -141,6 +141,7 @@ class FieldLaw:
     @cached_property
     def model(self) -> FieldModel:
         """The PSF at every place of the field (eq. 1)."""
+        # Knots cover the frame, a stamp with its margin.
         coefficients = self.coefficients.astype(np.float64)
         spacing = spacing_of(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
         return FieldModel(coefficients, self.low, self.high, spacing)
@@ -171,6 +172,7 @@ class FieldLaw:
         terms : ndarray, shape (n, K)
         position_known : ndarray of bool, shape (n,)
         """
+        # What is left out of the position is not known.
         coordinates = np.full((len(position), 4), np.nan)
         coordinates[:, : position.shape[1]] = position
         # Terms of x and y first, then two of each star property that changes the PSF.
@@ -273,14 +275,9 @@ class FieldLaw:
     @cached_property
     def nodes(self) -> list[Node]:
         """All nodes, in the order of `places`."""
-        return lattice_nodes(
-            self.model,
-            self.side,
-            self.axis_px,
-            self.mean_terms,
-            self.terms_covariance.reshape(len(self.mean_terms), -1),
-            map(self.residuals_at, self.places),
-        )
+        count, residuals = len(self.mean_terms), map(self.residuals_at, self.places)
+        terms = self.mean_terms, self.terms_covariance.reshape(count, count)
+        return lattice_nodes(self.model, self.side, self.axis_px, *terms, residuals)
 
     @cached_property
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
@@ -321,12 +318,12 @@ class FieldLaw:
 
         Where no position is known, C has the variation over the field as well.
         """
+        # Eigenvectors take far longer than all else that a star needs of a node.
         if (k, position_known) not in self._axes_cache:
             node = self.nodes[k]
             rows = [node.residual_modes, *[node.field_modes] * (not position_known)]
-            self._axes_cache[k, position_known] = NodeAxes.of(
-                np.vstack(rows), node.diagonal, node.derivatives, node.images, self.limits.min_axes
-            )
+            axes = NodeAxes.of(node, np.vstack(rows), self.limits.min_axes)
+            self._axes_cache[k, position_known] = axes
         return self._axes_cache[k, position_known]
 
     @property

@@ -165,32 +165,22 @@ class NodeAxes(NamedTuple):
     derivative_products: np.ndarray
 
     @classmethod
-    def of(
-        cls,
-        rows: np.ndarray,
-        diagonal: np.ndarray,
-        derivatives: np.ndarray,
-        images: np.ndarray,
-        min_axes: int,
-    ) -> NodeAxes:
-        """Return the principal axes of C = RᵀR + diag(D) (eq. 8).
+    def of(cls, node: Node, rows: np.ndarray, min_axes: int) -> NodeAxes:
+        """Return the principal axes of C = RᵀR + diag(D), D the node's diagonal (eq. 8).
 
         They are those of C within the space that its rows and the pixels of the largest diagonal
         span (method of Rayleigh and Ritz), which needs no eigenvectors of P x P.
 
         Parameters
         ----------
+        node : Node
         rows : ndarray, shape (r, P)
-            R.
-        diagonal : ndarray, shape (P,)
-            D.
-        derivatives : ndarray, shape (3, P)
-        images : ndarray, shape (K + 1, P)
+            R: the node's modes of the residuals, and those of the field if no position is known.
         min_axes : int
             Number of axes that are kept, at least; there are never fewer than rows.
         """
         # Orthonormal basis of the space.
-        pixels = len(diagonal)
+        diagonal, derivatives, pixels = node.diagonal, node.derivatives, len(node.diagonal)
         axis_count = min(max(min_axes, len(rows)), pixels)
         large = np.argsort(-diagonal, kind="stable")[: axis_count - len(rows)]
         space = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
@@ -207,7 +197,7 @@ class NodeAxes(NamedTuple):
             basis=basis,
             variance=variance[::-1].copy(),
             variance_beyond=float(beyond / (pixels - axis_count)) if axis_count < pixels else 1.0,
-            images=images @ basis[3:].T,
+            images=node.images @ basis[3:].T,
             derivatives=along,
             derivative_products=np.vstack([products_along, products_beyond.ravel()]),
         )

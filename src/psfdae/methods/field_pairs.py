@@ -110,6 +110,7 @@ class Pairs(NamedTuple):
 
     def by_node(self) -> Iterator[tuple[int, slice]]:
         """Yield the number of each node, and which pairs are with it."""
+        # Pairs of a node stand side by side.
         nodes, first = np.unique(self.node, return_index=True)
         for k, start, stop in zip(nodes.tolist(), first, [*first[1:], len(self.node)], strict=True):
             yield k, slice(start, stop)
@@ -141,6 +142,11 @@ class PairFit(NamedTuple):
     covariance: np.ndarray
     nuisance: np.ndarray
 
+    def nuisance_and_slope(self, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return t of x − a m, (N, 3), and its derivative t' by a, for prior σ (N, 3) (eq. 13)."""
+        difference = self.nuisance[:, 0] - self.factor[:, None] * self.nuisance[:, 1]
+        return sigma * difference, -sigma * self.nuisance[:, 1]
+
     def select(self, mask: np.ndarray) -> PairFit:
         """Return the fits of the pairs for which a mask is true."""
         return PairFit._make(a[mask] for a in self)
@@ -159,6 +165,7 @@ def project_pairs(law: FieldLaw, stars: FieldStamps, is_nearby: np.ndarray) -> P
     is_nearby : ndarray of bool, shape (n, nodes)
         Nodes of each star that are looked at.
     """
+    # Pairs in the order of the nodes; all nodes have as many axes.
     node, star = is_nearby.T.nonzero()
     images, axis_count = stars.images, len(law.node_axes(node[0], stars.position_known).variance)
     pairs = Pairs(star, node, *(np.empty((len(star), 2, columns)) for columns in (axis_count, 5)))
@@ -238,6 +245,7 @@ def _products(weighted: np.ndarray, along: np.ndarray, derivatives: np.ndarray) 
     """
     products = np.empty((len(along), 2, 5))
     products[..., :2] = np.einsum("nim,njm->nij", weighted, along)
+    # Products with the derivatives of all pairs as one product of matrices.
     flat = weighted.reshape(-1, weighted.shape[-1])
     products[..., 2:] = (flat @ derivatives.T).reshape(-1, 2, 3)
     return products

@@ -186,6 +186,7 @@ def matched_fluxes(law: FieldLaw, stars: FieldStamps) -> tuple[np.ndarray, np.nd
     is_known = np.isfinite(stars.flux)[:, None]
     flux = np.where(is_known, stars.flux[:, None], np.maximum(product / square, 0.0))
     gain = flux * product - 0.5 * flux**2 * square
+    # Score of a node: its likelihood ratio times its prior.
     variance = stars.noise[:, None] ** 2
     score = gain / variance + stars.log_prior
     rows, best = np.arange(len(flux)), score.argmax(axis=1)
@@ -254,17 +255,14 @@ def mixed_posterior(
     """
     count, pixels = stars.images.shape
     sigma, star = stars.prior_sigma()[pairs.star], pairs.star
-    # Nuisance parameters t = σ Λ⁻¹ σ L G⁻¹ (x − a m), and their derivative with respect to a.
-    nuisance = sigma * (fit.nuisance[:, 0] - fit.factor[:, None] * fit.nuisance[:, 1])
-    nuisance_slope = -sigma * fit.nuisance[:, 1]
-    psf, square, flux, mahalanobis2 = _mixed_pixels(
-        law, stars, pairs, weight, fit, nuisance, nuisance_slope
-    )
+    nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
+    psf, square, flux, mahalanobis2 = _mixed_pixels(law, stars, pairs, weight, fit)
     # Flux, sky and centre of each pair, and the moments of these over the nodes. Where the sky is
     # free, a star has the flux a: what is flat in the rest is sky.
     sky_free = ~stars.sky_known[star]
     sky = nuisance[:, 0] - np.where(sky_free, fit.factor - flux, 0.0) / pixels
     flux = np.where(sky_free, fit.factor, flux)
+    # Centre: that of the node, or the one that is known, and its offset t.
     place = law.places[pairs.node] if stars.centre is None else stars.centre[star]
     measured = np.column_stack([flux, sky, place + nuisance[:, 1:]])
     moments = _second_moments(fit, sigma, nuisance_slope, measured)
@@ -288,22 +286,11 @@ def mixed_posterior(
 
 
 def _mixed_pixels(
-    law: FieldLaw,
-    stars: FieldStamps,
-    pairs: Pairs,
-    weight: np.ndarray,
-    fit: PairFit,
-    nuisance: np.ndarray,
-    nuisance_slope: np.ndarray,
+    law: FieldLaw, stars: FieldStamps, pairs: Pairs, weight: np.ndarray, fit: PairFit
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return moments of the pixels of stars without noise and sky over their nodes (eq. 13 to 16).
 
-    Parameters
-    ----------
-    law, stars, pairs, weight, fit
-        See `mixed_posterior`.
-    nuisance, nuisance_slope : ndarray, shape (N, 3)
-        Nuisance parameters t of each pair, and their derivative with respect to a.
+    Parameters are those of `mixed_posterior`.
 
     Returns
     -------
@@ -316,6 +303,7 @@ def _mixed_pixels(
     """
     count, pixels = stars.images.shape
     first, second = np.zeros((2, count, pixels))
+    # Stars of flux about 1.
     images, s = stars.images / stars.unit[:, None], stars.noise_variance()
     sigma, star, factor = stars.prior_sigma(), pairs.star, fit.factor[:, None]
     # The variance of pixels depends on s and σ alone. It is computed once for all stars whose s
@@ -326,6 +314,7 @@ def _mixed_pixels(
     _, example, noise_class = np.unique(classes, axis=0, return_index=True, return_inverse=True)
     class_variance, class_sigma = np.exp(ln_step * noise_step[example]), sigma[example]
     sigma, sky_free = sigma[star], ~stars.sky_known[star]
+    nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
     flux, mahalanobis2 = np.empty((2, len(star)))
     gradient, precision = np.empty((len(star), 3)), fit.precision
     # If every flux is known, nothing has to be differentiated with respect to a.
@@ -397,6 +386,7 @@ def _weighted_sums(
     star: np.ndarray, weight: np.ndarray, values: np.ndarray, count: int
 ) -> np.ndarray:
     """Return weighted sums (count, …) of values (N, …) over the pairs of each star."""
+    # A weighted histogram of the stars' numbers for each column of the values.
     columns = values.reshape(len(star), -1).T
     sums = [np.bincount(star, weight * column, count) for column in columns]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])

@@ -20,6 +20,7 @@ MARGIN_PX = 2
 
 def phases_of(step_px: float) -> np.ndarray:
     """Return the offsets from the centre of a pixel at which nodes lie, in pixels."""
+    # Places of nodes along an axis, less those of their pixels' centres, each once.
     count = round(MARGIN_PX / step_px)
     place = step_px * np.arange(-count, count + 1)
     return np.unique(np.round(place - np.floor(place + 0.5), 9))

@@ -60,6 +60,7 @@ def fit_field(
         the errors of the field are not measured.
     """
     fitter, few_stars = FieldFitter.of(stars, background, frame_px, stamp_px), FitSettings.few_stars
+    # Orders that the stars support: without positions, the field is one mean PSF.
     supported = sorted(orders)
     if not np.isfinite(stars.position).all():
         supported = [0]
@@ -119,6 +120,7 @@ def _best_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int
             if (error := error_of(step)) >= least_error:
                 break
             options, least_error = step, error
+    # Orders from the lowest on, until the next one does not pay.
     best_order, least_error = 0, np.inf
     for order in orders:
         error = error_of(replace(options, order=order))
@@ -164,6 +166,7 @@ def refit_field(
         low=prior.low,
         high=prior.high,
     )
+    # The same terms and knots; three limits of the change are compared (eq. 5).
     knots, star_terms = knots_of(frame_px, prior.spacing), tuple(prior.star_coordinates.tolist())
     options = FitOptions(knots, smoothness, prior.order, star_terms)
     fits = [fitter.fit(replace(options, change=change)) for change in (0.005, 0.02, 0.1)]

@@ -102,6 +102,7 @@ class FieldModel:
         `position` has x, y, magnitude and colour (n, 4). Those count with which the PSF changes,
         and 2 % of the range beyond its ends are allowed: a training star may be measured there.
         """
+        # Beyond the ends by more than the slack, in any coordinate with which the PSF changes.
         columns = self.star_coordinates
         value, low, high = (a[..., columns] for a in (position, self.low, self.high))
         slack = 0.02 * (high - low)
@@ -177,8 +178,6 @@ def adjust_stars(
     spacing: float,
     steps: int,
     sky: bool = False,
-    max_offset_px: float = 1.5,
-    max_step_px: float = 0.3,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps (eq. 4).
 
@@ -198,8 +197,6 @@ def adjust_stars(
         Number of steps.
     sky : bool
         A constant is fitted as well.
-    max_offset_px, max_step_px : float
-        Largest coordinate of a centre, and largest change in one step, in pixels.
 
     Returns
     -------
@@ -211,13 +208,14 @@ def adjust_stars(
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
         # Weighted least squares (A w Aᵀ) θ = A w d for θ = (F, F δ_row, F δ_col, sky), with the
-        # rows A of the design; the centre moves by δ, within its limits.
+        # rows A of the design; the centre moves by δ, at most by 0.3 px in a step, in which an
+        # image is nearly linear, and no farther than 1.5 px from the brightest pixel.
         design = image_design(splines, centre, axis, spacing, sky)
         weighted = design * weight.reshape(count, 1, -1)
         parameters = np.linalg.solve(weighted @ design.transpose(0, 2, 1), weighted @ flat)[..., 0]
         flux = parameters[:, 0]
-        move = np.clip(parameters[:, 1:3] / flux[:, None], -max_step_px, max_step_px)
-        centre = np.clip(centre + move, -max_offset_px, max_offset_px)
+        move = np.clip(parameters[:, 1:3] / flux[:, None], -0.3, 0.3)
+        centre = np.clip(centre + move, -1.5, 1.5)
     # Residuals of stars of flux 1 at their last centres.
     level = parameters[:, 3, None, None] if sky else 0.0
     star_images = draw_splines(splines, axis, centre, spacing)
@@ -304,6 +302,7 @@ def solve_splines(
     inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
 
     def nearly(flat: np.ndarray) -> np.ndarray:
+        # The terms of each knot by the inverse of its block.
         return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
 
     coefficients, _ = cg(
