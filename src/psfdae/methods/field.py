@@ -72,6 +72,7 @@ class FieldMixture(FieldLaw, Method):
     attributes: ClassVar = {"usual": "mean_terms", "spread": "terms_covariance"}
     """Attributes of arrays that have another name in files."""
     packing = Packing(together=4096, padded=False)
+    knows_field = True
     groups: ClassVar = {"field": FieldSettings}
 
     @classmethod
