@@ -187,7 +187,7 @@ class NodeAxes(NamedTuple):
         # Eigenvectors of C in this space, and the mean variance that is left outside of it.
         projected = rows @ space
         variance, rotation = np.linalg.eigh((space.T * diagonal) @ space + projected.T @ projected)
-        beyond = diagonal.sum() + np.square(rows).sum() - variance.sum()
+        sum_beyond = diagonal.sum() + np.square(rows).sum() - variance.sum()
         basis = np.vstack([derivatives, (space @ rotation[:, ::-1]).T])
         # Products of the derivatives, which every star needs: over all pixels less along the axes.
         along = derivatives @ basis[3:].T
@@ -196,7 +196,9 @@ class NodeAxes(NamedTuple):
         return cls(
             basis=basis,
             variance=variance[::-1].copy(),
-            variance_beyond=float(beyond / (pixels - axis_count)) if axis_count < pixels else 1.0,
+            variance_beyond=float(sum_beyond / (pixels - axis_count))
+            if axis_count < pixels
+            else 1.0,
             images=node.images @ basis[3:].T,
             derivatives=along,
             derivative_products=np.vstack([products_along, products_beyond.ravel()]),
@@ -212,13 +214,13 @@ class NodeAxes(NamedTuple):
         The first array, (n, 1), is the fraction beyond the axes; the second one, (n, m), by how
         much the fraction along each axis differs from it.
         """
-        # s/(λ + s) along the axes and s/(λ₀ + s) beyond.
+        # Along all axes the fraction beyond them, and the difference from it.
         fraction = noise_variance * self.inverse(noise_variance)
         return fraction[:, -1:], fraction[:, :-1] - fraction[:, -1:]
 
     def nuisance_precision(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
         """Return Λ = 1 + σ L G⁻¹ Lᵀ σ, the inverse covariance of t/σ, (n, 3, 3) (eq. 9)."""
-        # L G⁻¹ Lᵀ is a sum over the axes and one term beyond them, for all stars at once.
+        # L G⁻¹ Lᵀ: products of the derivatives along each axis and beyond, weighted by G⁻¹ there.
         products = self.inverse(noise_variance) @ self.derivative_products
         products = products.reshape(-1, 3, 3)
         return np.asarray(np.eye(3) + products * (prior_sigma[:, :, None] * prior_sigma[:, None]))
@@ -246,10 +248,11 @@ class NodeAxes(NamedTuple):
         precision : ndarray, shape (n, 3, 3)
             σ L G⁻¹ Lᵀ σ, their part of the inverse covariance of t/σ.
         """
-        # G is diagonal along the axes: each adds r²/(λ + s), and so on.
+        # G along the leading axes is diagonal: λ + s.
         residual = residual[:, :count]
         total_variance = self.variance[:count] + noise_variance
         derivatives = prior_sigma[:, :, None] * self.derivatives[:, :count]
+        # σ L G⁻¹, and its products with the residual and with L σ.
         weighted = derivatives / total_variance[:, None]
         gradient = np.einsum("nij,nj->ni", weighted, residual)
         chi2 = (residual**2 / total_variance).sum(axis=1)
@@ -260,19 +263,22 @@ class NodeAxes(NamedTuple):
 
         Shape (n, P), of stars of flux 1 without noise and sky.
         """
-        beyond, along = self.noise_fractions(noise_variance)
+        fraction_beyond, fraction = self.noise_fractions(noise_variance)
+        # Λ⁻¹: the covariance of the nuisance parameters over their prior σ.
         covariance = np.linalg.inv(self.nuisance_precision(noise_variance, prior_sigma))
         derivatives, axes = self.basis[:3], self.basis[3:]
         # σ L s G⁻¹: how the noise that is subtracted changes with the nuisance parameters.
-        rows = ((self.derivatives * along[:, None]).reshape(-1, len(axes)) @ axes).reshape(
+        rows = ((self.derivatives * fraction[:, None]).reshape(-1, len(axes)) @ axes).reshape(
             len(noise_variance), 3, -1
         )
-        rows = (rows + beyond[:, None] * derivatives) * prior_sigma[:, :, None]
+        rows = (rows + fraction_beyond[:, None] * derivatives) * prior_sigma[:, :, None]
         pull = covariance @ rows
         # diag(C − C G⁻¹ C) = s diag(1 − s G⁻¹); then diag(Hᵀ Λ⁻¹ H), what the nuisance parameters
         # leave open. The sky itself is no part of the star: in H its row is σ L s G⁻¹ − σ_sky, and
         # the square with it is written out.
-        variance = noise_variance * (1.0 - beyond - along @ axes**2) + (rows * pull).sum(axis=1)
+        variance = noise_variance * (1.0 - fraction_beyond - fraction @ axes**2) + (
+            rows * pull
+        ).sum(axis=1)
         variance += (
             prior_sigma[:, :1] ** 2 * covariance[:, :1, 0] - 2 * prior_sigma[:, :1] * pull[:, 0]
         )
