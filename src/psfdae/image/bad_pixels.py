@@ -69,27 +69,27 @@ def find_bad_pixels(
         If so many pixels have the least value that sky and noise are not measurable.
     """
     notes: list[str] = []
-    mask = masked.copy()
-    if mask.any():
-        notes.append(f"{np.count_nonzero(mask)} pixels that are masked or have no value")
+    mask = np.zeros(masked.shape, dtype=bool)
+
+    def leave_out(area: np.ndarray, words: str) -> None:
+        """Add pixels (h, w) to the mask, with a note of their number if there are any."""
+        np.logical_or(mask, area, out=mask)
+        if area.any():
+            notes.append(f"{np.count_nonzero(area)} {words}")
+
+    leave_out(masked, "pixels that are masked or have no value")
     # Areas of one value, then the columns and rows that the header calls overscan.
     for value, area in blank_areas(image, mask, saturate):
-        mask |= area
-        notes.append(f"{np.count_nonzero(area)} blank pixels (value {value:g})")
+        leave_out(area, f"blank pixels (value {value:g})")
     for key, area in overscan(headers, image, mask):
-        mask |= area
-        notes.append(f"{np.count_nonzero(area)} pixels outside the exposed area by {key}")
+        leave_out(area, f"pixels outside the exposed area by {key}")
     refuse_clipped_sky(image, mask)
     # Dead pixels first: beside these, others would look like cosmic rays.
     noise = pixel_noise(image, mask)
-    dead = dead_pixels(image, mask, noise)
-    if dead.any():
-        mask |= dead
-        notes.append(f"{np.count_nonzero(dead)} dead pixels")
+    leave_out(dead_pixels(image, mask, noise), "dead pixels")
     cosmic = cosmic_rays(image, mask, noise, saturate)
-    if cosmic.any():
-        notes.append(f"{np.count_nonzero(cosmic)} pixels of cosmic rays and hot pixels")
-    return BadPixels(mask | cosmic, cosmic, tuple(notes))
+    leave_out(cosmic, "pixels of cosmic rays and hot pixels")
+    return BadPixels(mask, cosmic, tuple(notes))
 
 
 def _in_bands(find: Callable[..., np.ndarray], *maps: np.ndarray) -> np.ndarray:

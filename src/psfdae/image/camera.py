@@ -18,9 +18,6 @@ from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.sky_level import noise_correlation
 
-BLOCK_PX = 32
-"""Side of the squares in which sky and noise are measured."""
-
 LARGEST_STAMP_PX = 256
 """Side of the largest stamps; planes of a cube that are larger are images."""
 
@@ -150,28 +147,34 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     return gain
 
 
-def sky_sample(image: ImageFile) -> SkySample | None:
+def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
 
     Squares of one value, such as an area without data, do not count.
+
+    Parameters
+    ----------
+    image : ImageFile
+    square_px : int
+        Side of the squares in which sky and noise are measured.
     """
     rows, columns = image.shape
-    # Bands of 32 rows, evenly spread over the image.
-    last_row = max(rows - BLOCK_PX, 0)
-    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // BLOCK_PX))).astype(int))
+    # Bands of rows, evenly spread over the image.
+    last_row = max(rows - square_px, 0)
+    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // square_px))).astype(int))
     levels, noises, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
     deviations: list[np.ndarray] = []
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
         for start in starts:
-            band = pixels[start : start + BLOCK_PX]
+            band = pixels[start : start + square_px]
             band = np.where(np.isfinite(band), band, np.nan)
-            deviation = np.full((BLOCK_PX + 4, columns), np.nan)
+            deviation = np.full((square_px + 4, columns), np.nan)
             deviations.append(deviation)
-            for column in range(0, columns, BLOCK_PX):
-                square = band[:, column : column + BLOCK_PX]
+            for column in range(0, columns, square_px):
+                square = band[:, column : column + square_px]
                 values = square[np.isfinite(square)]
-                if values.size < BLOCK_PX:
+                if values.size < square_px:
                     continue
                 # Stars in a square hardly change its median.
                 highest = max(highest, float(values.max()))
@@ -179,7 +182,7 @@ def sky_sample(image: ImageFile) -> SkySample | None:
                 # σ of a normal distribution is 1.4826 times its median deviation.
                 noise = 1.4826 * float(np.median(np.abs(values - level)))
                 if noise > 0:
-                    deviation[: len(band), column : column + BLOCK_PX] = (square - level) / noise
+                    deviation[: len(band), column : column + square_px] = (square - level) / noise
                     levels.append(level)
                     noises.append(noise)
     if not levels:
@@ -198,8 +201,9 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     """
     largest, count, pairs = -np.inf, 0, 0
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
-        for start in range(0, image.shape[0], 8 * BLOCK_PX):
-            band = pixels[start : start + 8 * BLOCK_PX]
+        # 256 rows at a time, which bounds the memory.
+        for start in range(0, image.shape[0], 256):
+            band = pixels[start : start + 256]
             # The largest value so far; a larger one starts the count anew.
             top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
             if top > largest:

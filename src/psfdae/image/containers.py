@@ -59,18 +59,18 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
         if mask is None and not unit:
             return data
         header = fits.Header({"BUNIT": unit} if unit else {})
-        return _written(name, lambda: _hdus(data, header, mask, None))
+        return _temporary_fits(name, lambda: _hdus(data, header, mask, None))
     if isinstance(image, fits.HDUList):
-        return _written(Path(image.filename() or name), lambda: image)
+        return _temporary_fits(Path(image.filename() or name), lambda: image)
     if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
         # An extension stands behind a primary one.
         first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
-        return _written(name, lambda: fits.HDUList([*first, image.copy()]))
+        return _temporary_fits(name, lambda: fits.HDUList([*first, image.copy()]))
     if not isinstance(image, NDData):
         raise ObservationError(
             name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
         )
-    return _written(name, lambda: _of_nddata(image))
+    return _temporary_fits(name, lambda: _of_nddata(image))
 
 
 def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
@@ -189,7 +189,7 @@ def _hdus(
     return hdus
 
 
-def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
+def _temporary_fits(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
     """Return a temporary file with an image, which is called `name` in messages."""
     content = io.BytesIO()
     with reading(name):

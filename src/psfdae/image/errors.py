@@ -73,7 +73,7 @@ def reading(path: str | Path) -> Iterator[None]:
     """Silence libraries while they read a file, and turn what they raise about it into one error.
 
     Libraries raise a dozen kinds of errors on damaged files (struct, index, key, assertion, zlib,
-    …) that no list would complete; errors of the program itself pass as they are (`_is_bug`).
+    …) that no list would complete; errors of the program itself pass as they are.
 
     Raises
     ------
@@ -95,24 +95,15 @@ def reading(path: str | Path) -> Iterator[None]:
         except MemoryError:
             raise ObservationError(path, "does not fit into memory") from None
         except Exception as error:
-            if _is_bug(error):
+            # A missing package and an undefined name are no property of a file. Neither is a wrong
+            # type, attribute, index or assertion in a line of psfdae's own; libraries raise these
+            # on damaged files, in their own lines.
+            *_, (frame, _) = walk_tb(error.__traceback__)
+            package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+            misuse = TypeError | AttributeError | LookupError | AssertionError
+            is_own_misuse = package == "psfdae" and isinstance(error, misuse)
+            if is_own_misuse or isinstance(error, ImportError | NameError):
                 raise
             # The start of the library's message, which may be long, or the kind of error.
             problem = one_line(error)[:160] or type(error).__name__
             raise ObservationError(path, f"damaged or of a wrong format ({problem})") from error
-
-
-def _is_bug(error: Exception) -> bool:
-    """Return True if an error is one of the program or its installation, not of a file.
-
-    A package that is missing and a name that is not defined are no property of a file. Neither is
-    a wrong type, attribute, index or assertion in a line of psfdae's own; libraries raise these
-    on damaged files, in their own lines.
-    """
-    if isinstance(error, ImportError | NameError):
-        return True
-    if not isinstance(error, TypeError | AttributeError | LookupError | AssertionError):
-        return False
-    # The module of the line that raised it.
-    *_, (frame, _) = walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__", "")).partition(".")[0] == "psfdae"

@@ -35,26 +35,8 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 2880
 """Bytes of a block, of which FITS files consist."""
 
-MAPS = {
-    "mask": re.compile("DQ|MASK|BPM|FLAGS?"),
-    "error": re.compile("(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?"),
-    "variance": re.compile("(VAR|VARIANCE)(_.*)?"),  # VAR_POISSON, a part of it
-    "weight": re.compile("IVAR|WEIGHT|WHT|WGT"),
-}
-"""Names of extensions that go with an image, by JWST, HST, LCO, LSST, Gemini and ccdproc."""
-
-NOT_SCIENCE = re.compile(
-    "|".join(kind.pattern for kind in MAPS.values())
-    + "|BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE"
-    + "|WCSDVARR|D2IMARR"
-)
-"""Names of extensions that hold no image of the sky."""
-
 SCIENCE = ("SCI", "IMAGE")
 """Names of the image of the sky; where one extension of a file has such a name, it is meant."""
-
-INSTRUMENT_KEYS = ("TELESCOP", "INSTRUME", "FILTER")
-"""Keys of telescope, camera and filter, with which PSFs change."""
 
 Card = tuple[str, str | float | None, str]
 """Key, value and comment of a header."""
@@ -284,7 +266,7 @@ def find_image(
         An array is an image itself.
     extension : str or int, optional
         A name (case does not matter), "NAME,version" or a number (0 is the primary one). By default
-        the only image is taken that is not a mask, an error or the like (`NOT_SCIENCE`), or the
+        the only image is taken that is not a mask, an error or the like (`is_science`), or the
         only one called as in `SCIENCE`.
 
     Raises
@@ -349,9 +331,29 @@ def science_images(path: Path) -> dict[str, int]:
     }
 
 
+def map_kind_by_name(name: str) -> str | None:
+    """Return which map of an image an extension is: "mask", "error", "variance" or "weight".
+
+    By the names that JWST, HST, LCO, LSST, Gemini and ccdproc give them; None for another name.
+    """
+    names_by_kind = {
+        "mask": "DQ|MASK|BPM|FLAGS?",
+        "error": "(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?",
+        "variance": "(VAR|VARIANCE)(_.*)?",  # VAR_POISSON, a part of it
+        "weight": "IVAR|WEIGHT|WHT|WGT",
+    }
+    name = name.strip().upper()
+    return next((kind for kind, form in names_by_kind.items() if re.fullmatch(form, name)), None)
+
+
 def is_science(name: str) -> bool:
     """Return False for an extension that goes with an image, such as DQ, by its name."""
-    return NOT_SCIENCE.fullmatch(name.strip().upper()) is None
+    # Sky, context and exposure maps, samples up the ramp, and distortions of the WCS.
+    other_names = (
+        "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR"
+    )
+    is_other = re.fullmatch(other_names, name.strip().upper()) is not None
+    return map_kind_by_name(name) is None and not is_other
 
 
 def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> Any:

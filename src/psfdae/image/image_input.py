@@ -184,7 +184,7 @@ class ImageInput(ImageStatements):
         ObservationError
             If the image, its list or a statement cannot be used; one line that names the file.
         """
-        from psfdae.image.observation import open_observation
+        from psfdae.image.opening import open_observation
 
         # Ranges of whole numbers.
         if stamp_px < 1:

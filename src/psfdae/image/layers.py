@@ -21,7 +21,6 @@ from psfdae.image.camera import CameraValue
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, silent
 from psfdae.image.fits_file import (
-    MAPS,
     SCIENCE,
     ImageFile,
     Pixels,
@@ -30,6 +29,7 @@ from psfdae.image.fits_file import (
     find_image,
     has_pixels,
     is_science,
+    map_kind_by_name,
     open_hdus,
     open_pixels,
 )
@@ -417,7 +417,7 @@ def with_photons(
 
 
 def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
-    """Find the mask and the map of noise that a file has for an image, by the names in `MAPS`.
+    """Find the mask and the map of noise that a file has for an image, by their names.
 
     They have its size. If names repeat, their versions (EXTVER) belong together; of a file with
     several science images that do not, none is taken.
@@ -461,9 +461,8 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
 
 
 def map_kind(image: ImageFile) -> str | None:
-    """Return which of `MAPS` an extension is by its name or UTYPE, None if neither says it."""
-    name = str(image.card("EXTNAME") or "").strip().upper()
-    kind = next((kind for kind, names in MAPS.items() if names.fullmatch(name)), None)
+    """Return which map an extension is by its name and UTYPE, None if neither says it."""
+    kind = map_kind_by_name(str(image.card("EXTNAME") or ""))
     if kind != "error":
         return kind
     # CCDData writes the type of its uncertainty as UTYPE.

@@ -33,7 +33,7 @@ def read_list_table(path: Path) -> Table:
         content = path.read_bytes()
     # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
     if content.startswith((b"SIMPLE  =", *UNPACK)):
-        return _fits_table(path)
+        return fits_table(path)
     # Text may begin with a mark of its encoding; a byte 0 is in no text.
     try:
         text = content.decode("utf-8-sig")
@@ -50,10 +50,10 @@ def read_list_table(path: Path) -> Table:
         return votable(path, content)
     if re.match(r"\s*NL\s+NX\s+NY\b", lines[0]):
         return stetson(path, lines)
-    return _text_table(path, lines)
+    return text_table(path, lines)
 
 
-def _fits_table(path: Path) -> Table:
+def fits_table(path: Path) -> Table:
     """Read the LDAC_OBJECTS or the only table of a FITS file; columns stay in the file till used.
 
     Parameters
@@ -82,7 +82,7 @@ def _fits_table(path: Path) -> Table:
         return Table.read(objects[0], format="fits", mask_invalid=False, unit_parse_strict="silent")
 
 
-def _text_table(path: Path, lines: Sequence[str]) -> Table:
+def text_table(path: Path, lines: Sequence[str]) -> Table:
     """Read a text table from the lines of a file that are not blank."""
     from astropy.io import ascii as text_tables
 

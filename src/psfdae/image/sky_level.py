@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -157,11 +158,7 @@ def noise_correlation(deviation: np.ndarray) -> float:
     if nearest - shared < 0.15:
         return 1.0
     # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
-    lags = [
-        (0, 1),
-        (0, 2),
-        *((rows_apart, columns_apart) for rows_apart in (1, 2) for columns_apart in range(-2, 3)),
-    ]
+    lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
     excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 

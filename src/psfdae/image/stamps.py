@@ -138,9 +138,9 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
 
     Pixel k covers k − ½ ≤ position < k + ½.
     """
-    far = LARGEST_POSITION_PX
-    rounded = np.floor(np.nan_to_num(position, nan=-far, posinf=far, neginf=-far) + 0.5)
-    return np.asarray(np.clip(rounded, -far, far), np.int64)
+    limit = LARGEST_POSITION_PX
+    rounded = np.floor(np.nan_to_num(position, nan=-limit, posinf=limit, neginf=-limit) + 0.5)
+    return np.asarray(np.clip(rounded, -limit, limit), np.int64)
 
 
 def cut_image(
@@ -291,9 +291,6 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).
 
-SMOOTHED_NOISE = 0.53
-"""σ of the difference of two pixels of a smoothed stamp, √2 · (6/16), in σ of a pixel."""
-
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
     """Return stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
@@ -350,9 +347,10 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
     offset = np.zeros((len(stamps), 2), dtype=np.int16)
     if not star.size:
         return offset
-    # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels.
+    # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels, which is
+    # √2 · 6/16 = 0.53 of the σ of a pixel.
     excess = smooth[star].max(axis=(1, 2)) - smooth[star, centre, centre].max(axis=(1, 2))
-    significant = excess > 5.0 * SMOOTHED_NOISE * border_scatter(stamps[star])
+    significant = excess > 5.0 * 0.53 * border_scatter(stamps[star])
     offset[star[significant]] = brightest[star[significant]]
     return offset
 

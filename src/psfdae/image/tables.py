@@ -56,12 +56,10 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "x_error": ("pix", ".3g", "standard error of x_fit, or of x"),
     "y_error": ("pix", ".3g", "standard error of y_fit, or of y"),
     "background_error": (OF_IMAGE, ".3g", "standard error of background"),
-    "corr_flux_background": ("", ".3f", "correlation of errors"),
-    "corr_flux_y": ("", ".3f", "correlation of errors"),
-    "corr_flux_x": ("", ".3f", "correlation of errors"),
-    "corr_background_y": ("", ".3f", "correlation of errors"),
-    "corr_background_x": ("", ".3f", "correlation of errors"),
-    "corr_y_x": ("", ".3f", "correlation of errors"),
+    **{
+        f"corr_{pair}": ("", ".3f", "correlation of errors")
+        for pair in ("flux_background", "flux_y", "flux_x", "background_y", "background_x", "y_x")
+    },
     "shift_x": ("pix", "", "stamp moved along columns"),
     "shift_y": ("pix", "", "stamp moved along rows"),
     "group": ("", "", "number of the stars that were fitted together"),
@@ -117,8 +115,11 @@ def star_table(
     return table
 
 
-def shown_with_digits(table: Table, form: str = ".4g") -> Table:
-    """Return the table, whose columns of real numbers are shown in a format from now on."""
+def table_of_rows(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Table:
+    """Return a table of rows that have the same keys; real numbers are shown in a format."""
+    from astropy.table import Table
+
+    table = Table({name: [row[name] for row in rows] for name in rows[0]})
     for column in table.itercols():
         if column.dtype.kind == "f":
             column.info.format = form

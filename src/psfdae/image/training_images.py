@@ -123,9 +123,8 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
 
 def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
     """Return the stack of all training stars, (s, s), centre at index (s//2, s//2)."""
-    training = stars.of(~held_out)
-    everyone = np.zeros(len(training), dtype=int)
-    return np.asarray(stacks(training.aligned(), training.snr, everyone, 1)[0])
+    # The field as a whole is the only part: all templates are the same.
+    return np.asarray(templates_of(stars, held_out, bins=1)[0])
 
 
 def make_images(

@@ -7,9 +7,9 @@ that a damaged file is refused. The date is not part of it: a model has the same
 it was made.
 
 Only the leading eigenvectors of the flux model's covariance are stored. The variance of the others
-is spread evenly over the directions that they span. For stamps of up to `MAX_FULL_BASIS_PX` pixels,
-reading completes the basis; any basis of these directions gives the same results. For larger
-stamps, whose full basis would take gigabytes, the variance stays one number.
+is spread evenly over the directions that they span. For stamps of up to 32 × 32 pixels, reading
+completes the basis (`flux_model_of`); any basis of these directions gives the same results. For
+larger stamps, whose full basis would take gigabytes, the variance stays one number.
 """
 
 from __future__ import annotations
@@ -42,12 +42,6 @@ from psfdae.version import __version__
 
 SUFFIX = ".psf.safetensors"
 """End of the name of a bundle."""
-
-SHIPPED = "wfsat"
-"""Name of the bundle that comes with the package."""
-
-MAX_FULL_BASIS_PX = 32**2
-"""Pixels of the largest stamps whose covariance gets a full basis when it is read."""
 
 
 class BundleError(Error, ValueError):
@@ -168,24 +162,8 @@ def _digest(tree: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
 
 def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
     """Return the arrays of the file, the covariance cut to its leading eigenvectors."""
-    model, leading = bundle.flux_model, bundle.info.components
-    # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
-    # of a model from a file are equal; their mean could differ from them in the last digit.
-    trailing = np.array([model.other_variance])
-    if model.is_complete:
-        trailing = model.variance[: model.variance.size - leading]
-    is_even = trailing.size and (trailing == trailing[0]).all()
-    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
-    # Variances in double precision, maps of pixels in single; the method's arrays as they are.
-    groups: dict[str, Mapping[str, np.ndarray]] = {
-        "flux": {
-            "variance": np.asarray(model.variance[-leading:], np.float64),
-            "rest": np.asarray(trailing_variance, np.float64),
-            "mean": np.asarray(model.mean, np.float32),
-            "low": np.asarray(model.low, np.float32),
-            "high": np.asarray(model.high, np.float32),
-            "basis": np.asarray(model.basis[:, -leading:], np.float32),
-        },
+    groups = {
+        "flux": flux_arrays(bundle.flux_model, bundle.info.components),
         "errors": bundle.errors.arrays(),
         bundle.info.method: bundle.weights,
     }
@@ -201,7 +179,7 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
 
 def shipped_path() -> Path:
     """Return the file of the bundle that comes with the package."""
-    return Path(str(files("psfdae") / "bundles" / f"{SHIPPED}{SUFFIX}"))
+    return Path(str(files("psfdae") / "bundles" / f"wfsat{SUFFIX}"))
 
 
 def read_bundle(path: Path | None = None) -> Bundle:
@@ -247,7 +225,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)
     )
-    return Bundle(info, weights, _read_flux_model(flux), ErrorModel.of_arrays(errors))
+    return Bundle(info, weights, flux_model_of(flux), ErrorModel.of_arrays(errors))
 
 
 def _require(condition: ArrayLike, path: Path, problem: str) -> None:
@@ -305,16 +283,48 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     _require(abs(total - 1.0) <= 1e-3, path, "array 'flux/mean' must have a sum of 1")
 
 
-def _read_flux_model(arrays: Mapping[str, np.ndarray]) -> FluxModel:
-    """Return the flux model of a file, eigenvalues ascending.
+def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
+    """Return the arrays of a flux model with so many leading eigenvectors, for `flux_model_of`.
 
-    It has a full basis unless the stamps are large: the directions that are not stored come first,
-    with the same variance.
+    Returns
+    -------
+    dict of str to ndarray
+        Variances (k,) and `rest`, that along each other direction, in double precision; maps of
+        the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
+    """
+    # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
+    # of a model from a file are equal; their mean could differ from them in the last digit.
+    trailing = np.array([model.other_variance])
+    if model.is_complete:
+        trailing = model.variance[: model.variance.size - components]
+    is_even = trailing.size and (trailing == trailing[0]).all()
+    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
+    # Eigenvalues ascend: the leading ones are the last.
+    return {
+        "variance": np.asarray(model.variance[-components:], np.float64),
+        "rest": np.asarray(trailing_variance, np.float64),
+        "mean": np.asarray(model.mean, np.float32),
+        "low": np.asarray(model.low, np.float32),
+        "high": np.asarray(model.high, np.float32),
+        "basis": np.asarray(model.basis[:, -components:], np.float32),
+    }
+
+
+def flux_model_of(arrays: Mapping[str, np.ndarray], full_basis_max_px: int = 32**2) -> FluxModel:
+    """Return the flux model of the arrays of a file, eigenvalues ascending.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        As `flux_arrays` returns them.
+    full_basis_max_px : int
+        Pixels of the largest stamps that get a full basis: the directions that are not stored come
+        first, with the same variance.
     """
     basis, variance = arrays["basis"].astype(np.float64), arrays["variance"]
     trailing_variance = float(arrays["rest"])
     pixels, components = basis.shape
-    if pixels <= MAX_FULL_BASIS_PX:
+    if pixels <= full_basis_max_px:
         # Left singular vectors beyond the rank span the orthogonal complement.
         complement = np.linalg.svd(basis)[0][:, components:]
         basis = np.concatenate([complement, basis], axis=1)

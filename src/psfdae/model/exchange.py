@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -26,21 +26,6 @@ from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
-PSFEX = ".psf"
-"""End of the name of a file of PSFEx, written or read."""
-
-STDPSF = ".stdpsf.fits"
-"""End of the name of a file in the format STDPSF."""
-
-GRID_SAMPLES = 4
-"""Values per pixel and axis of a cube of PSFs; STDPSF has no others."""
-
-PSFEX_SAMPLES = 8
-"""Values per pixel and axis of a file of PSFEx."""
-
-UNKNOWN_WIDTH_PX = 1.0
-"""Width of a field in pixels that stands for an unknown one."""
-
 
 def load_field(path: Path) -> FieldPsfs:
     """Return the PSF over an image from a bundle of psfdae, or from a .psf file of PSFEx.
@@ -50,7 +35,7 @@ def load_field(path: Path) -> FieldPsfs:
     Error
         If the file cannot be read or is something else.
     """
-    return PsfexField(path) if path.suffix == PSFEX else load_model(path)
+    return PsfexField(path) if path.suffix == ".psf" else load_model(path)
 
 
 class PsfexField(FieldPsfs):
@@ -63,6 +48,8 @@ class PsfexField(FieldPsfs):
 
     Attributes
     ----------
+    order : int
+        Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere.
     terms : ndarray of int, shape (t, 2)
         Powers of u and v, the scaled positions, in the terms of the polynomial.
     basis : ndarray, shape (t, h, w)
@@ -81,6 +68,9 @@ class PsfexField(FieldPsfs):
     """
 
     image_px = None
+    order = 0
+    unknown_width_px: ClassVar[float] = 1.0
+    """Width of a field in pixels that stands for an unknown one."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
@@ -126,9 +116,9 @@ class PsfexField(FieldPsfs):
         is_position = re.fullmatch(r"X\S*_IMAGE Y\S*_IMAGE", " ".join(names))
         if names and not (is_position and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
-        self._order = int(header["POLDEG1"]) if names else 0
+        self.order = int(header["POLDEG1"]) if names else 0
         self.step_px = float(header["PSF_SAMP"])
-        zero, self.width = np.full(2, 0.0), np.full(2, UNKNOWN_WIDTH_PX)
+        zero, self.width = np.full(2, 0.0), np.full(2, self.unknown_width_px)
         if names:
             zero, self.width = (
                 np.array([float(header[f"{key}{i}"]) for i in (1, 2)])
@@ -139,12 +129,12 @@ class PsfexField(FieldPsfs):
         max_order, max_side = 12, 1025
         self.basis = mask.reshape(-1, *mask.shape[-2:])
         self.terms: np.ndarray = np.array(
-            psfex_powers(self._order) if self._order <= max_order else []
+            psfex_powers(self.order) if self.order <= max_order else []
         )
         # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         side = min(mask.shape[-2:])
         is_usable = (
-            0 <= self._order <= max_order
+            0 <= self.order <= max_order
             and len(self.terms) == len(self.basis)
             and 1 < side <= max(mask.shape[-2:]) <= max_side
             and 0.01 < self.step_px <= 10
@@ -157,11 +147,6 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.stamp_px = 2 * max(1, int(side * self.step_px / 2))
 
-    @property
-    def order(self) -> int:
-        """Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere."""
-        return self._order
-
     @cached_property
     def sha256(self) -> str:
         """Checksum of the file."""
@@ -169,7 +154,7 @@ class PsfexField(FieldPsfs):
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
-        if (self.width <= UNKNOWN_WIDTH_PX).any():
+        if (self.width <= self.unknown_width_px).any():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
@@ -269,7 +254,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
             raise
         low, high, positions = np.zeros(2), np.zeros(2), np.zeros((1, 2))
     # Least squares for the image of each term: psf(u, v) = Σ uⁱ vʲ b_ij.
-    zero, width = (low + high) / 2, np.maximum(high - low, UNKNOWN_WIDTH_PX)
+    zero, width = (low + high) / 2, np.maximum(high - low, PsfexField.unknown_width_px)
     u, v = ((positions - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in psfex_powers(order)], axis=1)
     x, y = positions.T
@@ -331,7 +316,7 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     cards: list[Card] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]
     cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(grid[0, :, 0])]
     cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(grid[:, 0, 1])]
-    _write_cube(path, model, positions, GRID_SAMPLES, cards)
+    _write_cube(path, model, positions, 4, cards)
 
 
 def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int) -> None:

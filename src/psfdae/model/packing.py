@@ -45,9 +45,6 @@ from psfdae.rng import stream
 from psfdae.settings import OfTest
 from psfdae.version import __version__
 
-COMPONENTS = 48
-"""Leading eigenvectors of the flux model that a bundle stores."""
-
 
 def model_of(
     fitted: Method,
@@ -112,16 +109,18 @@ def uncalibrated(
     name: str,
     licence: str,
     largest_mb: float | None = None,
+    components: int = 48,
 ) -> tuple[Bundle, HeldOutStars]:
     """Return a fit with all that it takes to apply it, but its errors, and its test stars.
 
     Parameters are those of `model_of`; of the settings, seed, noise and parts are enough.
+    `components` is the number of leading eigenvectors of the flux model that the bundle stores.
     """
     split, noise = split_stars(stars, trained["split"], config), noise_model(config)
     images, references = stars["realisation"], stars[reference]
     held_out = HeldOutStars.of(stars, reference, noise, split.test)
     # The flux model, its variance beyond the leading eigenvectors spread evenly.
-    flux_model = leading(FluxModel.fit(images[split.train]), COMPONENTS)
+    flux_model = leading(FluxModel.fit(images[split.train]), components)
     # Range of noise, as pixel RMS over the flux, and of S/N.
     band, area = noise.kappa * np.asarray(config.noise.levels), star_area(stars, split.train)
     least_noise, greatest_noise = float(band.min()), float(band.max())
@@ -143,7 +142,7 @@ def uncalibrated(
         snr_min=signal_to_noise(greatest_noise, area),
         snr_max=signal_to_noise(least_noise, area),
         noise_equivalent_px=area,
-        components=COMPONENTS,
+        components=components,
         training_sha256=checksum(images[split.train], references[split.train]),
         training_stars=training_stars,
         method=fitted.name,

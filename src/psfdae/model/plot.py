@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-UNUSABLE_FLAGS = (
-    StarFlag.NO_FLUX
-    | StarFlag.FAINT
-    | StarFlag.MASKED
-    | StarFlag.SATURATED
-    | StarFlag.TRUNCATED
-    | StarFlag.OFF_CENTRE
-    | StarFlag.UNLIKE_TRAINING
-)
-"""Flags of stars whose measured size and shape mean nothing; they are not drawn."""
 
-MAP_COLUMNS = ("x", "y", "snr", "fwhm_px", "ellipticity", "position_angle_deg", "flags")
-"""Columns of a prediction that a map needs; `psf_map` explains them."""
+def has_shape(flags: np.ndarray) -> np.ndarray:
+    """Return True for stars whose measured size and shape mean something, by their flags (n,)."""
+    unusable = (
+        StarFlag.NO_FLUX
+        | StarFlag.FAINT
+        | StarFlag.MASKED
+        | StarFlag.SATURATED
+        | StarFlag.TRUNCATED
+        | StarFlag.OFF_CENTRE
+        | StarFlag.UNLIKE_TRAINING
+    )
+    return np.asarray((flags & int(unusable)) == 0)
 
 
 def usable_stars(stars: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -40,7 +40,7 @@ def usable_stars(stars: Mapping[str, np.ndarray]) -> np.ndarray:
         Columns of a prediction; see `psf_map`.
     """
     is_finite = np.isfinite([stars[name] for name in ("x", "y", "fwhm_px")]).all(axis=0)
-    usable = np.flatnonzero(is_finite & ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0))
+    usable = np.flatnonzero(is_finite & has_shape(stars["flags"]))
     return usable[np.argsort(-stars["snr"][usable], kind="stable")]
 
 
@@ -86,9 +86,8 @@ def map_of_file(path: Path) -> Figure:
     with fits.open(path, memmap=True) as file:
         table: Any = file["STARS"].data
         # Copies in the machine's byte order.
-        stars = {
-            name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in MAP_COLUMNS
-        }
+        names = ("x", "y", "snr", "fwhm_px", "ellipticity", "position_angle_deg", "flags")
+        stars = {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
         # Only the PSFs that are drawn are read: a file may have a million.
         def read_psfs(selected: np.ndarray) -> np.ndarray:

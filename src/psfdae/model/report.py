@@ -62,8 +62,8 @@ def quality_page(
     *checks, held_out_check = report.checks()
     facts = report.model.method.facts().values()
     notes = [line for note in report.stars.notes for line in note.splitlines()]
-    verdicts, flags = stars["verdict"], stars["flags"]
     # A star has one verdict, and may have several flags.
+    verdicts, flags = stars["verdict"], stars["flags"]
     verdict_counts = [(v, int((verdicts == v).sum())) for v in Verdict]
     flag_counts = [(f.name or "", int(((flags & int(f)) > 0).sum())) for f in StarFlag]
     unflagged = ("none", str(int((flags == 0).sum())))
@@ -77,7 +77,7 @@ def quality_page(
         truth_mse=f"{report.table['truth_mse'][0]:.1e}",
         errors_figure=_image_tag(errors_figure(report.table, name)),
         strip=_image_tag(report.strip_png),
-        photometry=_photometry_table(report.found),
+        photometry=_photometry_table(report.photometry),
         facts="".join(f"<p>{escape(fact)}.</p>\n" for fact in facts),
         field_map=_image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         error_maps=_image_tag(error_maps(images)),

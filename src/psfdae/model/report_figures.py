@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
-from psfdae.model.plot import UNUSABLE_FLAGS
+from psfdae.model.plot import has_shape
 from psfdae.model.report_checks import MEAN_PSF, method_labels, nearest_snr, size_errors
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def shapes_figure(
     """
     snr = nearest_snr(degraded)
     # Shapes of flagged stars mean nothing.
-    usable = ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0) & np.isfinite(stars["fwhm_px"])
+    usable = has_shape(stars["flags"]) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
     size_error, ellipticity_error = size_errors(degraded[snr])
     figure = new_figure(7.6, layout="constrained")
