@@ -16,6 +16,7 @@ from psfdae.errors import Error
 
 def one_line(text: object) -> str:
     """Return the text without line breaks and characters that do not print."""
+    # Line breaks and tabs become blanks.
     words = " ".join(str(text).split())
     return "".join(c if c.isprintable() else "?" for c in words)
 
@@ -26,7 +27,11 @@ def ascii_line(text: object) -> str:
 
 
 def no_formula(text: str) -> str:
-    """Return the text, with an apostrophe before it if a spreadsheet would execute it."""
+    """Return the text, with an apostrophe before it if a spreadsheet would execute it.
+
+    Spreadsheets execute cells that begin with = + - @, a tab or a carriage return. Numbers such as
+    -1.5 stay as they are.
+    """
     if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
         return text
     try:
@@ -37,7 +42,14 @@ def no_formula(text: str) -> str:
 
 
 def shorten(names: list[str], length_max: int = 20) -> str:
-    """Return a list of names for a message, cut after `length_max` of them."""
+    """Return a list of names for a message, cut after `length_max` of them.
+
+    Parameters
+    ----------
+    names : list of str
+        Each is cut after 40 characters.
+    length_max : int
+    """
     ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""
     return ", ".join(name[:40] for name in names[:length_max]) + ellipsis if names else "none"
 
@@ -55,7 +67,11 @@ _ONE_AT_A_TIME = threading.RLock()
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Silence warnings, log messages and floating-point errors of libraries."""
+    """Silence warnings, log messages and floating-point errors of libraries.
+
+    Filters of warnings belong to the process: one thread at a time is silent, and restores what it
+    found.
+    """
     from astropy import log
 
     with _ONE_AT_A_TIME, warnings.catch_warnings(), np.errstate(all="ignore"):

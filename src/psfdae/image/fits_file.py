@@ -46,7 +46,13 @@ Card = tuple[str, str | float | None, str]
 
 
 def only_member(file: IO[bytes]) -> IO[bytes]:
-    """Open the only file in a zip file."""
+    """Open the only file in a zip file.
+
+    Raises
+    ------
+    BadZipFile
+        If the zip file holds another number of files.
+    """
     packed = zipfile.ZipFile(file)
     names = packed.namelist()
     if len(names) != 1:
@@ -94,6 +100,11 @@ def plain_file(path: Path) -> PlainFile:
     ------
     ObservationError
         If there is no such file, or it is none of FITS.
+
+    Returns
+    -------
+    PlainFile
+        The file itself, or a temporary copy of what is packed in it.
     """
     with reading(path), path.open("rb") as file:
         # The first bytes tell how the file is compressed, if it is.
@@ -109,7 +120,15 @@ def plain_file(path: Path) -> PlainFile:
 
 
 def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
-    """Return a FITS file of this content, which exists as long as the object that is returned."""
+    """Return a FITS file of this content, which exists as long as the object that is returned.
+
+    Parameters
+    ----------
+    name : Path
+        What messages call the file.
+    content : file
+        Open for reading bytes, at the start of what is copied.
+    """
     with tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits", delete=False) as copy:
         shutil.copyfileobj(content, copy)
     plain, process = PlainFile(name, Path(copy.name), is_copy=True), os.getpid()
@@ -195,15 +214,26 @@ class ImageFile:
         return next((u.strip() for u in units if isinstance(u, str) and u.strip()), "")
 
     def card(self, key: str) -> Any:
-        """Return the value of a card of its own header; None if that has none."""
+        """Return the value of a card of its own header; None if that has none.
+
+        None as well if the card cannot be parsed.
+        """
         return card_value(self.headers[0], key) if self.headers else None
 
     def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return physical values of stored ones, in native byte order, same shape.
 
         They are of double precision where all are below 1e-15.
+
+        Parameters
+        ----------
+        stored : ndarray
+            Pixels as the file has them: neither scaled nor blank.
+        dtype : dtype
+            Type of the values.
         """
         # value = bscale · stored + bzero
+        # Scaling in double precision; without a scale, values are converted once.
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
         else:
@@ -221,7 +251,11 @@ class ImageFile:
         return replace(self, shape=self.shape[1:], leading=self.leading + 1)
 
     def provenance(self) -> list[Card]:
-        """Return the cards that say where the stars come from, those that can be parsed."""
+        """Return the cards that say where the stars come from, those that can be parsed.
+
+        These are object, telescope, instrument, observer, filter, dates, exposure time, air mass
+        and unit.
+        """
         # Of a key that stands in both headers, the value of the image's own.
         cards: list[Card] = []
         for key in (
@@ -245,7 +279,14 @@ def card_value(header: Header, key: str) -> Any:
 
 
 def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
-    """Return an array (h, w), or a cube of stamps (n, s, s), as an image without a header."""
+    """Return an array (h, w), or a cube of stamps (n, s, s), as an image without a header.
+
+    Raises
+    ------
+    ObservationError
+        If the array does not hold numbers, or has not two or three axes.
+    """
+    # A plane, or stamps along the first axis, of any type of numbers.
     values, path = np.asarray(values), Path(name)
     if values.dtype.kind not in "fiu" or values.ndim not in (2, 3) or not values.size:
         shape = "×".join(map(str, values.shape))
@@ -316,6 +357,15 @@ def science_images(path: Path) -> dict[str, int]:
 
     A name, which files get, is the extension's own; or its number where it has none, or one that
     another extension has, too, or that looks like the number of another.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    ObservationError
+        If the file has none, or cannot be read.
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
         images = {k: hdu.name for k, hdu in enumerate(hdus) if has_pixels(hdu)}
@@ -357,7 +407,14 @@ def is_science(name: str) -> bool:
 
 
 def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
-    """Return the extension with the image; see `find_image`."""
+    """Return the extension with the image; see `find_image`.
+
+    Raises
+    ------
+    ObservationError
+        If the extension that is stated does not exist or holds no image, or if none is stated and
+        no image, or several, may be meant; it lists what the file has.
+    """
     # Number, name and size of each extension, for messages.
     labels = []
     for k, hdu in enumerate(hdus):
@@ -376,6 +433,7 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
         return hdu
     # Else the only image that is no mask, error or the like.
     images = [hdu for hdu in hdus if has_pixels(hdu)]
+    # Of a file that has nothing but such extensions, any may be meant.
     science = [hdu for hdu in images if is_science(hdu.name)] or images
     if not science:
         raise ObservationError(path, f"no image; the file has {listed}")
@@ -392,6 +450,7 @@ def _named(hdus: HDUList, text: str) -> Any:
     """Return the extension of a number, or of a name with perhaps a version; None without one."""
     if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
+    # A name alone means its first extension, whatever the version.
     name, _, version = text.rpartition(",") if "," in text else (text, "", "")
     for hdu in hdus:
         if hdu.name.upper() == name.strip().upper() and version.strip() in ("", str(hdu.ver)):
@@ -411,7 +470,15 @@ def has_pixels(hdu: Any) -> bool:
 
 
 def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
-    """Return the celestial WCS of an image; None without a stated scale, or if it is damaged."""
+    """Return the celestial WCS of an image; None without a stated scale, or if it is damaged.
+
+    Parameters
+    ----------
+    header : Header
+        Header of the image.
+    hdus : HDUList
+        Its file, in which look-up tables of distortions may be.
+    """
     from astropy.wcs import WCS
 
     # Without a scale, the pixels would be degrees.
@@ -429,7 +496,16 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Physical values of an image, which are read where they are indexed."""
+    """Physical values of an image, which are read where they are indexed.
+
+    Attributes
+    ----------
+    stored : array-like
+        Pixels as stored: an array, or a section of a file that reads what it is asked for.
+    image : ImageFile
+    dtype : dtype
+        Type of the values.
+    """
 
     stored: Any
     image: ImageFile

@@ -28,6 +28,15 @@ def read_list_table(path: Path) -> Table:
     ------
     ObservationError
         If the file is missing, damaged, or of none of the formats.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Table
+        A row for each star, in the order of the file.
     """
     with reading(path):
         content = path.read_bytes()
@@ -59,6 +68,11 @@ def fits_table(path: Path) -> Table:
     Parameters
     ----------
     path : Path
+
+    Raises
+    ------
+    ObservationError
+        If the file has not exactly one table that may be meant, or it is truncated.
     """
     from astropy.io import fits
     from astropy.table import Table
@@ -83,7 +97,19 @@ def fits_table(path: Path) -> Table:
 
 
 def text_table(path: Path, lines: Sequence[str]) -> Table:
-    """Read a text table from the lines of a file that are not blank."""
+    """Read a text table from the lines of a file that are not blank.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    lines : sequence of str
+
+    Raises
+    ------
+    ObservationError
+        If there is no row of a star, or the text is no table.
+    """
     from astropy.io import ascii as text_tables
 
     # IRAF's DAOPHOT, ECSV and SExtractor describe their columns in comments.
@@ -111,6 +137,11 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
 
     A comment right before numbers without names is the names. VizieR writes two lines of units and
     of dashes below the names, which are left out.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Lines that are not blank.
     """
     # Rows that are no comments, and the comments above the first of them.
     rows = [line for line in lines if not line.lstrip().startswith("#")]
@@ -128,6 +159,18 @@ def votable(path: Path, content: bytes) -> Table:
     """Read the only table with rows of a VOTable.
 
     Data that lie elsewhere are refused: astropy would open any address that a file names.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    content : bytes
+        Its content.
+
+    Raises
+    ------
+    ObservationError
+        If its data lie elsewhere, or not exactly one table has rows.
     """
     from astropy.io.votable import parse
 
@@ -212,6 +255,11 @@ def stetson(path: Path, lines: Sequence[str]) -> Table:
     """Read number, x and y, the first columns of a list of DAOPHOT itself (three head lines).
 
     Its pixels count from 1, as SExtractor's do.
+
+    Raises
+    ------
+    ObservationError
+        If a row has fewer than three numbers.
     """
     from astropy.table import Table
 

@@ -167,6 +167,7 @@ class Observation:
         """Return the same with `assumed_scale_arcsec` if nothing says the scale."""
         if self.pixel_scale_arcsec is not None:
             return self
+        # The origin tells that it was assumed.
         scale = CameraValue(self.assumed_scale_arcsec, "assumed")
         return replace(self, camera=self.camera | {"pixel scale": scale})
 
@@ -178,6 +179,16 @@ class Observation:
         """Return ICRS coordinates in degrees of 0-based pixels (n,).
 
         None without a celestial WCS, and of a cube of stamps.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (n,)
+            Positions in the image, 0-based.
+
+        Returns
+        -------
+        tuple of ndarray, or None
+            Right ascension and declination, shape (n,) each.
         """
         from astropy.wcs.utils import pixel_to_skycoord
 
@@ -208,13 +219,19 @@ class Observation:
         return "\n".join(lines)
 
     def without_position(self) -> np.ndarray:
-        """Return True for stars without a position in a list that has others, shape (n,)."""
+        """Return True for stars without a position in a list that has others, shape (n,).
+
+        Detected stars all have one, and a cube need not have any.
+        """
         if self.positions is None or self.detections is not None:
             return np.zeros(self.count, dtype=bool)
         return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
     def listed_again(self) -> np.ndarray:
-        """Return True for stars of a list that are the same as an earlier one, shape (n,)."""
+        """Return True for stars of a list that are the same as an earlier one, shape (n,).
+
+        They are nearer to it than a tenth of a pixel (`repeated_rows`).
+        """
         if self.positions is None or self.detections is not None or self.shape is None:
             return np.zeros(self.count, dtype=bool)
         return repeated_rows(self.positions)
@@ -254,7 +271,10 @@ class Observation:
             )
 
     def sha256(self) -> str:
-        """Return SHA-256 of all pixels of the image or cube, as float32."""
+        """Return SHA-256 of all pixels of the image or cube, as float32.
+
+        It does not depend on how the file is compressed or scaled, nor on its header.
+        """
         # 256 rows of an image, or stamps of a cube, are in memory at a time.
         digest, rows = hashlib.sha256(), 256
         with open_pixels(self._layers.image, in_pieces=True) as pixels:
@@ -297,6 +317,14 @@ def _cut_from_cube(
         Stars of which a part is off the image: none.
     noise : ndarray, shape (n,)
         σ of the sky, NaN: it is to be estimated.
+
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars that are cut.
+    pixels, mask : Pixels
+        Of the cube, and of its mask if it has one.
     """
 
     def stamps_of(pixels: Pixels, rows: slice) -> np.ndarray:
@@ -324,12 +352,21 @@ def _cut_from_image(
     -------
     data, masked, truncated, noise
         As `_cut_from_cube`; a noise of NaN cannot be measured.
+
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars that are cut.
+    pixels, noise : Pixels
+        Of the image, and of its map of noise if it has one.
     """
     shape, layers, stamp_px = observation.shape, observation._layers, observation.stamp_px
     assert shape is not None and observation.positions is not None
     x, y = observation.positions[part].T
     # The noise of the sky is that of a ring of at least 8 px around the stamp.
     margin = max(observation.margin, 8)
+    # All layers are cut at the same places.
     window = (shape, x, y, stamp_px, margin)
     data, inside, truncated = cut_image(pixels, *window)
     # Other stars of a crowded image are subtracted.
@@ -341,6 +378,7 @@ def _cut_from_image(
         data = np.where(data >= full, data, cleaned)
     # Pixels off the image, of the mask, and those that show no sky.
     masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
+    # The stamp with its own margin, within the wider window.
     stamp = slice(margin - observation.margin, margin + stamp_px + observation.margin)
     if noise is not None and layers.noise is not None:
         # σ of the sky by the map, without the photons of the star.
@@ -366,7 +404,22 @@ def _with_stars(
     truncated: np.ndarray,
     noise: np.ndarray,
 ) -> Stamps:
-    """Return stamps (n, s, s) of a part of the stars with all that is known of these."""
+    """Return stamps (n, s, s) of a part of the stars with all that is known of these.
+
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars of the stamps.
+    data : ndarray, shape (n, s, s)
+        Counts, changed here: pixels without a number become 0.
+    masked : ndarray of bool, shape (n, s, s)
+        Pixels that do not count, to which those without a number are added.
+    truncated : ndarray of bool, shape (n,)
+        Stars of which a part is off the image.
+    noise : ndarray, shape (n,)
+        σ of the sky, NaN where it is to be estimated.
+    """
     # A pixel of +inf is saturated, one of NaN is not.
     level = observation.saturate
     saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level

@@ -116,7 +116,17 @@ def image_or_cube(
     ObservationError
         If the image has several colours, an image has neither a list nor is to be searched, a cube
         is to be searched, or stamps are too small.
+
+    Parameters
+    ----------
+    source : ImageInput
+    image : ImageFile
+    table : Catalogue or None
+        Star list, if there is one.
+    stamp_px : int
+        Least side of stamps.
     """
+    # A threshold means that the stars are to be found.
     is_searched = source.detection_sigma is not None
     # A cube with one plane is an image, if it is no stamp of the only star of a list.
     if len(image.shape) == 3 and image.shape[0] == 1:
@@ -151,10 +161,20 @@ def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
     ------
     ObservationError
         If there is none.
+
+    Parameters
+    ----------
+    path : Path
+        The image, for messages.
+    sky : Sky
+        The image without its sky.
+    threshold : float
+        In σ of the slightly smoothed image.
     """
     from astropy.table import Table
 
     with silent():
+        # The list has the columns of SExtractor, as a list in a file might.
         table = Table(sky.stars(threshold))
     if len(table) == 0:
         raise ObservationError(path, f"no star {threshold:g} σ above the sky")
@@ -173,6 +193,22 @@ def locate_stars(
         None for a cube whose list has no pixels.
     remarks : list of str
         Sentences on the list's origin, and on rows of the same star.
+
+    Parameters
+    ----------
+    source : ImageInput
+    image : ImageFile
+    table : Catalogue or None
+        Star list, or the stars that were found in the image.
+    layers : Layers
+        The image with its sky, which shows the origin of a list that does not say it.
+    is_cube : bool
+        The image is a cube of stamps.
+
+    Raises
+    ------
+    ObservationError
+        If the list does not fit the image, or a column that is stated is missing.
     """
     # Without a list, stars are numbered and have no place.
     remarks: list[str] = []
@@ -210,6 +246,7 @@ def locate_stars(
     stars = ListedStars(identifiers, np.arange(count), numbers[0], numbers[1], numbers[2], flags)
     # A list may cover a larger part of the sky than the image.
     if source.on_image and positions is not None and not is_cube:
+        # Rows keep their numbers in the list.
         selected = on_image(positions, image.shape)
         stars, positions = stars.select(selected), positions[selected]
     return stars, positions, remarks

@@ -106,6 +106,11 @@ def choose_positions(names: Sequence[str]) -> Positions:
     ------
     ColumnError
         If there are none, or those of several programs.
+
+    Parameters
+    ----------
+    names : sequence of str
+        In any order and case.
     """
     # Tables of psfdae itself (predict, photometry, from-stars) count from 0. They have further
     # columns of their own, and may have some of other programs.
@@ -116,6 +121,7 @@ def choose_positions(names: Sequence[str]) -> Positions:
     choices: list[Positions] = []
     for convention in CONVENTIONS:
         for columns in convention:
+            # The case of the names counts only where it tells the program.
             pair = (columns.first, columns.second)
             first, second = (name_in_any_case(names, name) for name in pair)
             if first is None or second is None or (columns.exact and (first, second) != pair):
@@ -141,6 +147,7 @@ def name_in_any_case(names: Sequence[str], name_wanted: str) -> str | None:
     ColumnError
         If several are.
     """
+    # Blanks around a name, as some text tables have, do not count.
     matches = [name for name in names if name.strip().lower() == name_wanted.lower()]
     if len(matches) > 1:
         raise ColumnError(f"columns {' and '.join(matches)} differ in their case only; keep one")

@@ -167,6 +167,7 @@ def cut_image(
     inside : ndarray of bool, the same shape: the pixel is on the image
     truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
     """
+    # Rows and columns of every stamp in the image.
     side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
     rows = central_pixel(y)[:, None] + side
     columns = central_pixel(x)[:, None] + side
@@ -180,6 +181,7 @@ def cut_image(
     if not inside.all():
         stamps = np.where(inside, stamps, 0)
     stamp = slice(margin, margin + stamp_px)
+    # A star is whole if all rows and columns of its stamp, margin aside, are on the image.
     is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
     return stamps, inside, np.asarray(~is_whole)
 
@@ -238,6 +240,7 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     ring = stamps.reshape(size)[:, border]
     if bad is None:
         return np.asarray(mad_std(ring, axis=1), np.float64)
+    # Bad pixels of the ring are left out, but for stamps of which all of the ring is bad.
     hidden = bad.reshape(size)[:, border]
     hidden &= ~hidden.all(axis=1, keepdims=True)
     ring = np.where(hidden, np.nan, ring)
@@ -294,6 +297,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
     """Return stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
+    # [1, 2, 1] along columns, then along rows; 16 is the sum of the weights.
     padded = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
@@ -335,6 +339,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
         (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie within
         `jitter_px`, or of which that cannot be said.
     """
+    # The pixels that the jitter of the training reaches.
     middle = stamps.shape[-1] // 2
     centre = slice(middle - jitter_px, middle + jitter_px + 1)
     # Brightest pixels of the stamps, and of the stamps smoothed once more.
@@ -377,6 +382,7 @@ def cut(window: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> 
     ndarray, shape (n, d, d)
     """
     side = window.shape[-1]
+    # Stamps without an offset are the middle of the window.
     pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
     middle = window[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
     if offset is None or not offset.any():

@@ -116,9 +116,18 @@ def star_table(
 
 
 def table_of_rows(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Table:
-    """Return a table of rows that have the same keys; real numbers are shown in a format."""
+    """Return a table of rows that have the same keys; real numbers are shown in a format.
+
+    Parameters
+    ----------
+    rows : sequence of mappings
+        At least one.
+    form : str
+        Format in which real numbers are shown; all digits are kept.
+    """
     from astropy.table import Table
 
+    # Columns stand in the order of the keys of the first row.
     table = Table({name: [row[name] for row in rows] for name in rows[0]})
     for column in table.itercols():
         if column.dtype.kind == "f":
@@ -131,6 +140,11 @@ def fits_values(column: Column) -> np.ndarray:
 
     Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
     that are missing are NaN, whole ones the least of their type.
+
+    Parameters
+    ----------
+    column : Column, MaskedColumn or Quantity
+        Numbers or text, perhaps masked, perhaps with a unit, which is left out.
     """
     # Values without mask and unit, and which of them are missing.
     unmasked = getattr(column, "unmasked", column)
@@ -147,20 +161,34 @@ def fits_values(column: Column) -> np.ndarray:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
     elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
         values = values.astype(np.float64)
+    # FITS has no masks: a value stands for a missing one.
     if is_missing.any():
         values = np.where(is_missing, _missing(values.dtype), values).astype(values.dtype)
     return values
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return what stands for a missing value in FITS."""
+    """Return what stands for a missing value in FITS.
+
+    Parameters
+    ----------
+    dtype : dtype
+        Type of the column: NaN for real numbers, the least whole number, False for truth values.
+    """
     if dtype.kind == "f":
         return np.nan
     return np.iinfo(dtype).min if dtype.kind == "i" else False
 
 
 def as_fits(table: QTable, name: str) -> BinTableHDU:
-    """Return a table as an extension of a FITS file, with units, meanings and missing values."""
+    """Return a table as an extension of a FITS file, with units, meanings and missing values.
+
+    Parameters
+    ----------
+    table : QTable
+    name : str
+        Name of the extension.
+    """
     from astropy.io import fits
     from astropy.table import Table
 
@@ -206,11 +234,13 @@ def write_table(path: Path, table: QTable) -> None:
     plain = Table(table)  # columns with units in place of quantities
     with atomic_path(path) as temporary, silent():
         if path.suffix.lower() == ".fits":
+            # A table is an extension behind an empty primary one.
             hdus = fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")])
             hdus.writeto(temporary, overwrite=True)
         elif path.suffix.lower() == ".ecsv":
             plain.write(temporary, format="ascii.ecsv", overwrite=True)
         else:
+            # Texts of a list may begin like a formula.
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
             # Formats are those of the columns; numbers that are missing are written as such.
@@ -222,7 +252,14 @@ def write_table(path: Path, table: QTable) -> None:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML; cells of the rows are HTML, those of the head are text."""
+    """Return a table of HTML; cells of the rows are HTML, those of the head are text.
+
+    Parameters
+    ----------
+    head : sequence of str, length k
+    rows : sequence of sequences of str, length k each
+    """
+    # Head, then a line for each row.
     cells = "".join(f"<th>{escape(name)}</th>" for name in head)
     lines = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
     return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

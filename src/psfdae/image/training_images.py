@@ -54,6 +54,7 @@ def star_grid(position: np.ndarray) -> np.ndarray:
         members = by_x[start : start + rows]
         if is_located:
             members = members[np.argsort(position[members, 1], kind="stable")]
+        # Column of the lattice, and place in it.
         grid[members] = np.stack([np.full(members.size, column), np.arange(members.size)], axis=1)
     return grid
 

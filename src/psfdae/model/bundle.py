@@ -98,6 +98,7 @@ def estimator(bundle: Bundle) -> Method:
     info = bundle.info
     method_class = method(info.method)
     if info.dae:
+        # A network is checked by torch when its weights are loaded.
         with needed_by(f"the model {info.name!r}"):
             return method_class.unpack(bundle.weights, info)
     # The method knows which arrays it can work with: it states conditions, and restores a stamp.
@@ -118,7 +119,13 @@ def estimator(bundle: Bundle) -> Method:
 
 
 def creation_date() -> str:
-    """Return today's date in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible."""
+    """Return today's date in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible.
+
+    Raises
+    ------
+    BundleError
+        If SOURCE_DATE_EPOCH is no number of seconds.
+    """
     # https://reproducible-builds.org/specs/source-date-epoch
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -129,20 +136,40 @@ def creation_date() -> str:
 
 
 def write_bundle(bundle: Bundle, path: Path) -> None:
-    """Write a bundle atomically, if its parts fit together; the same one gives the same bytes."""
+    """Write a bundle atomically, if its parts fit together; the same one gives the same bytes.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    path : Path
+
+    Raises
+    ------
+    BundleError
+        If an array is missing or has a wrong shape or value.
+    """
     # Checked as it will be when it is read: no file is written that cannot be read.
     arrays = bundle_arrays(bundle)
     _check(bundle.info, arrays, path)
     content = bundle_bytes(bundle.info, arrays)
+    # The file is whole or absent.
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 def bundle_bytes(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return the bytes of a bundle file with its checksum, without checks of its contents."""
+    """Return the bytes of a bundle file with its checksum, without checks of its contents.
+
+    Parameters
+    ----------
+    info : BundleInfo
+    arrays : mapping of str to ndarray
+        As `bundle_arrays` returns them.
+    """
     from safetensors.numpy import save
 
     tree = info.model_dump(mode="json")
+    # Kind and version, by which a reader knows the file; the checksum; the description.
     text = {
         "kind": "psfdae bundle",
         "format_version": FORMAT_VERSION,
@@ -155,13 +182,21 @@ def bundle_bytes(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> bytes:
 
 def _digest(tree: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 of a description without its date, and of arrays."""
+    # The same model has the same checksum whenever it was made.
     dateless = {key: value for key, value in tree.items() if key != "created"}
+    # Keys in one order: the same description has the same text.
     text = json.dumps(dateless, sort_keys=True) + digest_of(arrays)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
-    """Return the arrays of the file, the covariance cut to its leading eigenvectors."""
+    """Return the arrays of the file, the covariance cut to its leading eigenvectors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        By group and name: `flux/…` (`flux_arrays`), `errors/…`, and those of the method.
+    """
     groups = {
         "flux": flux_arrays(bundle.flux_model, bundle.info.components),
         "errors": bundle.errors.arrays(),
@@ -183,7 +218,19 @@ def shipped_path() -> Path:
 
 
 def read_bundle(path: Path | None = None) -> Bundle:
-    """Read a bundle, by default the shipped one, and check it, or raise BundleError."""
+    """Read a bundle, by default the shipped one, and check it, or raise BundleError.
+
+    Parameters
+    ----------
+    path : Path, optional
+        A safetensors file of at most 256 MB.
+
+    Raises
+    ------
+    BundleError
+        If the file is missing, damaged, of another format, or holds unusable numbers. Nothing in it
+        is executed, and its arrays are used only if their checksum is right.
+    """
     from safetensors import SafetensorError, safe_open
 
     path = shipped_path() if path is None else path
@@ -241,6 +288,14 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     ------
     BundleError
         If an array is missing, unknown, or has a wrong type, shape or number.
+
+    Parameters
+    ----------
+    info : BundleInfo
+    arrays : mapping of str to ndarray
+        By group and name, as in the file.
+    path : Path
+        The file, for messages.
     """
     # Arrays of every bundle; limits of an outlier score only of some.
     pixels, components = info.stamp_px**2, info.components
@@ -291,6 +346,13 @@ def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
     dict of str to ndarray
         Variances (k,) and `rest`, that along each other direction, in double precision; maps of
         the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
+
+    Parameters
+    ----------
+    model : FluxModel
+        With a full basis, or of a file of large stamps.
+    components : int
+        Number k of leading eigenvectors.
     """
     # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
     # of a model from a file are equal; their mean could differ from them in the last digit.
@@ -321,6 +383,7 @@ def flux_model_of(arrays: Mapping[str, np.ndarray], full_basis_max_px: int = 32*
         Pixels of the largest stamps that get a full basis: the directions that are not stored come
         first, with the same variance.
     """
+    # Leading eigenvectors, with their variances; the others share one variance.
     basis, variance = arrays["basis"].astype(np.float64), arrays["variance"]
     trailing_variance = float(arrays["rest"])
     pixels, components = basis.shape

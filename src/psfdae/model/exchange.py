@@ -113,6 +113,7 @@ class PsfexField(FieldPsfs):
         # Coordinates of the polynomial: none, or x and y in one group.
         axis_count = int(header["POLNAXIS"])
         names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axis_count)]
+        # Other coordinates, such as a magnitude, would need values for each star.
         is_position = re.fullmatch(r"X\S*_IMAGE Y\S*_IMAGE", " ".join(names))
         if names and not (is_position and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
@@ -166,6 +167,7 @@ class PsfexField(FieldPsfs):
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
+        # Offset of the star from the middle of its pixel.
         phase = position - np.floor(position + 0.5)
         count = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
         axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
@@ -212,7 +214,10 @@ def _lanczos(offset: np.ndarray, count: int) -> np.ndarray:
 
 
 def psfex_powers(order: int) -> list[tuple[int, int]]:
-    """Return the powers of x and y in the terms of PSFEx's polynomial, in their order."""
+    """Return the powers of x and y in the terms of PSFEx's polynomial, in their order.
+
+    The power of x changes first: 1, x, x², …, y, x y, …, y².
+    """
     return [(i, j) for j in range(order + 1) for i in range(order + 1 - j)]
 
 
@@ -255,6 +260,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
         low, high, positions = np.zeros(2), np.zeros(2), np.zeros((1, 2))
     # Least squares for the image of each term: psf(u, v) = Σ uⁱ vʲ b_ij.
     zero, width = (low + high) / 2, np.maximum(high - low, PsfexField.unknown_width_px)
+    # Scaled positions, from −½ to ½ over the field.
     u, v = ((positions - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in psfex_powers(order)], axis=1)
     x, y = positions.T
@@ -263,6 +269,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     error = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
     # Readers show the FWHM; it is that of the PSF in the middle of the list of positions.
     fwhm = float(measure_shapes(psfs[len(psfs) // 2][None]).fwhm_px[0]) / oversampling
+    # One table of one row, whose only cell has the images of all terms.
     size = basis.shape[-1]
     column = fits.Column(
         "PSF_MASK",
@@ -320,13 +327,24 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
 
 
 def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int) -> None:
-    """Write a cube of PSFs at positions (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
+    """Write a cube of PSFs at positions (n, 2), x and y, as STPSF's `psf_grid` lays it out.
+
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    positions : ndarray, shape (n, 2)
+        Columns and rows, 0-based; the header has them as rows and columns.
+    oversampling : int
+        Values per pixel and axis.
+    """
     cards: list[Card] = [
         ("OVERSAMP", oversampling, "values per pixel and axis"),
         # photutils 3.0 takes every key with these letters, in any case, for a position, and would
         # exchange x and y without a word: now it stops at this one. Others look for capitals.
         ("HIERARCH Det_yx for photutils 3.0", "this needs photutils 3.1 or newer", ""),
     ]
+    # Keys of more than eight letters, from 100 on, need HIERARCH.
     for number, (column, row) in enumerate(positions.tolist()):
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
@@ -354,6 +372,7 @@ def _write_cube(
     # PSFs about the middle of a pixel are centred.
     x, y = np.rint(positions).T
     first = model.psf_at(x[0], y[0], oversampling)
+    # A header of the right axes, by the first PSF; the number of PSFs is set after.
     header = fits.PrimaryHDU(first[None].astype(np.float32)).header
     header["NAXIS3"] = len(positions)
     model_cards: list[Card] = [

@@ -61,6 +61,7 @@ def measure_photometry(
         # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
         gain = np.sqrt(background) / (kappa * level)
         estimate = model.predict(restored[level]["noisy"], gain=gain, position=positions)
+        # Stars that have a flux and an error of it.
         usable = np.isfinite(estimate.psf).all(axis=(1, 2)) & (estimate.flux_error > 0)
         # Offsets of the centre, and their standard errors, along x and y.
         offset = np.stack([estimate.x_fit - bright.x_fit, estimate.y_fit - bright.y_fit])
@@ -69,6 +70,7 @@ def measure_photometry(
         )
         # Pull of the flux: its error over the standard error, that of the truth included.
         pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
+        # Bias, quantile of the pull, and RMS of the distance of the centres.
         flux_bias, flux_bias_stderr = usable_mean(estimate.flux - 1.0, star, usable)
         flux_pull = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
         mean_square_px = usable_mean(np.square(offset).sum(axis=0), star, usable)[0]
@@ -100,5 +102,11 @@ def usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tup
     """Return the mean of usable images and its standard error, clustered by star; NaN of none.
 
     `values`, `star` and the mask `usable` have the shape (n,).
+
+    Parameters
+    ----------
+    values, star : ndarray, shape (n,)
+        Value of each image, and number of the star that it shows.
+    usable : ndarray of bool, shape (n,)
     """
     return clustered_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)

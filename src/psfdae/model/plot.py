@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 
 def has_shape(flags: np.ndarray) -> np.ndarray:
-    """Return True for stars whose measured size and shape mean something, by their flags (n,)."""
+    """Return True for stars whose measured size and shape mean something, by their flags (n,).
+
+    It means nothing for stars without flux, faint, masked, saturated or truncated ones, and such
+    that are off their centre or unlike the training.
+    """
     unusable = (
         StarFlag.NO_FLUX
         | StarFlag.FAINT
@@ -124,6 +128,7 @@ def psf_map(
     limits = (0.0, 1.0, 0.0, 1.0)
     if usable.size:
         limits = (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
+    # Height over width of the field, within what a page can show.
     aspect = np.clip((limits[3] - limits[2]) / (limits[1] - limits[0]), 0.3, 2.0)
     figure = new_figure(0.46 * WIDTH_IN * aspect + 1.5, layout="constrained")
     stamp_axes, whisker_axes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -180,6 +185,7 @@ def _draw_whiskers(
         return None
     # A whisker is as long as two stamps for an ellipticity of 1.
     px_per_ellipticity = 2.0 * spacing_px
+    # Ends of a whisker: the centre plus and minus half its length along the major axis.
     angle = np.deg2rad(stars["position_angle_deg"][selected])
     half = 0.5 * px_per_ellipticity * stars["ellipticity"][selected]
     step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)

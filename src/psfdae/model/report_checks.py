@@ -86,7 +86,10 @@ def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]
 
 
 def nearest_snr(values: Iterable[float]) -> float:
-    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors."""
+    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors.
+
+    Stars of S/N 10 are faint enough for models to differ, and bright enough to be seen in a figure.
+    """
     return min(values, key=lambda value: abs(np.log(value / 10.0)))
 
 
@@ -132,7 +135,13 @@ def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def method_labels(errors: Table) -> dict[str, str]:
-    """Return the label of each method of a table, in the order of the table."""
+    """Return the label of each method of a table, in the order of the table.
+
+    Returns
+    -------
+    dict of str to str
+        Label for legends by name of the method; one mean PSF has the name `MEAN_PSF`.
+    """
     names = dict.fromkeys(errors["method"])
     mean_label = "one mean PSF, its centre fitted"
     return {n: mean_label if n == MEAN_PSF else method_of(n).look.label for n in names}

@@ -127,6 +127,7 @@ class Stars:
         images = as_images(image)
         if not images:
             raise ObservationError("image", "no image, expected at least one")
+        # Keywords are statements on the image, or else settings.
         names = {field.name for field in fields(ImageStatements)}
         settings = {name: value for name, value in statements.items() if name not in names}
         stated = {name: value for name, value in statements.items() if name in names}
@@ -248,6 +249,7 @@ class Stars:
         """
         from astropy.table import vstack
 
+        # Measurements of all stars; of several images, with the file that each star is in.
         columns = self.candidates.columns(self.held_out)
         observations = [image.observation for image in self.images]
         if self.exposures:
@@ -273,6 +275,7 @@ class Stars:
 
     def described(self) -> dict[str, Any]:
         """Return the description of the product "stars", as JSON holds it."""
+        # Settings that determine the stars, then the images, then what is known of the camera.
         observation = self.observation
         parts = {"seed", "calibration_stars", "framing", "parts"}
         description: dict[str, Any] = {
@@ -336,7 +339,13 @@ def stars_of_candidates(
 
 
 def is_crowded(stars: Stars) -> bool:
-    """Return True if so many bright stars have neighbours that it pays to subtract these."""
+    """Return True if so many bright stars have neighbours that it pays to subtract these.
+
+    Parameters
+    ----------
+    stars : Stars
+        Stars of one image.
+    """
     # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
     has_image = stars.observation.shape is not None
     if not has_image or not np.isfinite(stars.candidates.bright.position).all():
@@ -404,6 +413,7 @@ def with_degraded_levels(settings: Settings, bright: BrightStars, sky_photons: f
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
     degraded_snr = settings.calibration_stars.degraded()
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in degraded_snr]
+    # Levels ascend where S/N descend; nine digits, so that a file has the same number.
     noise = Noise(
         name=settings.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],

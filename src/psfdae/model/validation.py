@@ -79,6 +79,7 @@ def validate(
     """
     _require_unseen(model, stars)
     settings = stars.settings
+    # The fits that exist already, that of the model included.
     fits = {**(further_fits or {}), model.info.method: model.method}
     # Every table has the noisy images and linear MMSE; both are quick to fit.
     baselines = ("noisy", "lmmse")
@@ -103,6 +104,7 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
         If pixels or stamps differ from those of the model, or if it was trained on other stars of
         the same image.
     """
+    # Pixels and stamps must have the size of those of the model.
     info, product, path = model.info, stars.product, stars.observation.path
     model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
@@ -136,6 +138,7 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         Fits by name, that of the model included.
     """
     settings, product, test = stars.settings, stars.product, stars.split.test
+    # Held-out images with their truth, star and place.
     truth, star = product[stars.reference][test], product["field_index"][test]
     position, data_range = field_positions(product)[test], settings.evaluation.data_range
     key = {"dataset": stars.name, "split": stars.split_kind, "reference": stars.reference}
@@ -151,6 +154,7 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
             # The model may be of another image, whose noise level λ has another κ.
             scale = settings.noise.kappa / model.info.kappa if is_model else 1.0
             estimate = method.estimate(noisy, scale * level, position)
+            # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
             rows += summarised(row, metrics, star)
@@ -174,6 +178,11 @@ def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return one table of blocks of columns, NaN in the columns that a block does not have.
 
     A block has the array `star` (n,); its other values are arrays as long, or constants.
+
+    Returns
+    -------
+    Table
+        Columns stand in the order in which they first appear.
     """
     from astropy.table import Table
 
@@ -200,6 +209,7 @@ def _error_table(
         Methods in the order of the rows; one mean PSF comes last.
     """
     settings, product, split = stars.settings, stars.product, stars.split
+    # S/N = 1 / (κ λ √A) with the noise-equivalent area A of a typical star.
     area = star_area(product, split.train)
     # Mean and standard error of each metric, by noise level and method.
     cells = {(row["noise_level"], row["method"], row["metric"]): row for row in statistics}
@@ -281,7 +291,13 @@ class Report:
         return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
 
     def checks(self) -> list[Check]:
-        """Check the model on the stars held out: question, answer, and True if it is passed."""
+        """Check the model on the stars held out: question, answer, and True if it is passed.
+
+        Returns
+        -------
+        list of Check
+            They compare errors with those of the simplest models, sizes of stars, stated errors.
+        """
         # Coverage was measured when the model was made, at S/N of its own.
         rows = self.model.info.metrics
         coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
@@ -304,12 +320,25 @@ class Report:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the page, one HTML file that needs no other."""
+        """Write the page, one HTML file that needs no other.
+
+        Parameters
+        ----------
+        path : path-like
+            File that is written, or replaced.
+        """
         write_text(path, self.page())
 
     def strip(self) -> Figure:
-        """Draw held-out stars degraded to S/N 10, as each method restores them."""
+        """Draw held-out stars degraded to S/N 10, as each method restores them.
+
+        Returns
+        -------
+        Figure
+            Six stars, evenly over the field: the bright star, then a row for each method.
+        """
         product, test = self.stars.product, self.stars.split.test
+        # S/N of each noise level, for stars of the typical size.
         kappa = self.stars.settings.noise.kappa
         area = star_area(product, self.stars.split.train)
         # The noise level whose S/N is the nearest to 10.
@@ -365,6 +394,12 @@ def _evenly_spread(position: np.ndarray, count: int) -> np.ndarray:
     """Return indices of at most `count` stars, evenly over the field if positions (n, 2) are known.
 
     Where one is NaN, they are the first stars.
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        (x, y) of the stars.
+    count : int
     """
     if not np.isfinite(position).all():
         return np.arange(min(count, len(position)))
@@ -389,6 +424,7 @@ def _predict_all(
     psf : ndarray, shape (N, d, d)
     residuals : ndarray, shape (k, d, d)
     """
+    # Lists of the batches: columns, PSFs, and residuals of the stars shown.
     columns: dict[str, list[np.ndarray]] = {}
     psfs, residuals, count = [], [], 0
     streams = (
