@@ -18,13 +18,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Product
 from psfdae.image.stamps import StarFlag
-from psfdae.method import (
-    DrawsStars,
-    FindsFlux,
-    MeasuresStars,
-    Method,
-    ScoresOutliers,
-)
+from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import (
@@ -176,9 +170,9 @@ class StarErrors:
         estimate = fitted.estimate(noisy, level, stars.position[star])
         # A method that scores stars by themselves does so in its form for estimated fluxes, as it
         # does for a user's stars.
-        score, free_flux = estimate.outlier_score, fitted.free_flux()
-        if score is None and isinstance(free_flux, ScoresOutliers):
-            score = free_flux.outlier_score(noisy, level)
+        score = estimate.outlier_score
+        if score is None:
+            score = fitted.free_flux().outlier_score(noisy, level)
         error = stars.errors(estimate.psf, star, estimate.sigma).astype(np.float32)
         distance = mahalanobis(noisy, noise, model, components)
         shape = len(nodes), -1
@@ -300,7 +294,7 @@ def with_case_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Genera
         scale[index] = np.interp(nodes, noise[index[1], index[2]], scale[index])
     flux_scale = np.interp(nodes, noise[1, Estimated.FLUX_AND_SKY], flux_scale)
     # Errors of a method that measures stars were counted where the noise is estimated alone.
-    if isinstance(model.method, MeasuresStars):
+    if model.method.knows_field:
         scale[:, 0] = scale[:, 1]
     scale68, scale95 = np.moveaxis(scale, -1, 1)
     return replace(errors, scale68=scale68, scale95=scale95, flux_scale=flux_scale)
@@ -325,7 +319,7 @@ def _scales_at(
     noise, scale, flux_scale = np.full((2, count), node), np.ones((2, 2, count, 2)), 1.0
     # A method that measures stars needs no factor of their fluxes: for their pixels, which are
     # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
-    measures = isinstance(model.method, MeasuresStars)
+    measures = model.method.knows_field
     step, noise_cases = (3, (True,)) if measures else (1, (False, True))
     # Rows are cases times images, once with stated noise and once without.
     noisy, star = stars.draw(node, rng)
@@ -400,7 +394,7 @@ def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> B
     return replace(bundle, errors=errors)
 
 
-def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
+def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
     """Return the bundle of a model with the errors of measured stars that the model makes.
 
     Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
@@ -444,7 +438,7 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     What the method does not know of a star's shape would pass for flux, if there is little noise
     beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
     """
-    if not issubclass(method(bundle.info.method), FindsFlux):
+    if not method(bundle.info.method).finds_flux:
         return bundle
     info, nodes = bundle.info, bundle.errors.noise
     names = ("images", "references", "position")

@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.fits import described_by
-from psfdae.method import KnowsField, Method
+from psfdae.method import Method
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
@@ -189,7 +189,7 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
         model = model_of(
             fitted, stars.product, Stars.reference, settings, description, name, licence
         )
-        if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
+        if not fitted.knows_field or stars.observation.shape is None:
             return model
         # Light beyond the stamps, by all stars of each image; neighbours may have measured it.
         measured = (

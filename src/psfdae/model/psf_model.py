@@ -18,7 +18,7 @@ from psfdae.bundle_info import BundleInfo
 from psfdae.image.camera import other_instruments
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
-from psfdae.method import KnowsField, Method
+from psfdae.method import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.prediction import Prediction
@@ -293,10 +293,10 @@ class PsfModel(FieldPsfs):
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
 
-    def _field(self) -> KnowsField:
+    def _field(self) -> Method:
         """Return the method as one that knows the PSF at every place of the field."""
         field = self.method
-        if not isinstance(field, KnowsField):
+        if not field.knows_field:
             raise PredictionError(
                 f"the model {self.name!r}: {field.look.label}: knows the PSF of a star alone, "
                 "not that of a place; psfdae from-stars --method field makes one that does"

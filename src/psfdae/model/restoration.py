@@ -28,14 +28,7 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import (
-    FindsFlux,
-    KnowsField,
-    MeasuresStars,
-    Method,
-    Packing,
-    ScoresOutliers,
-)
+from psfdae.method import Method, Packing
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
 from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
@@ -156,7 +149,7 @@ class Restorer:
             # 2048 stars at a time are measured and described: their arrays fit in memory.
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
             centred = [self._centred(part, fixed) for part in parts]
-            if isinstance(self.method, MeasuresStars):
+            if self.method.knows_field:
                 errors = self.bundle.errors
                 restored = [restored_by_measurement(part, self.method, errors) for part in centred]
             else:
@@ -215,7 +208,7 @@ class Restorer:
         is_free = has_flux & np.concatenate(
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
-        if is_free.any() and isinstance(self.free_flux, FindsFlux):
+        if is_free.any() and self.method.finds_flux:
             images, noise = self._normalised(photometry, has_no_flux)
             level = np.hypot(noise, info.misfit) / info.kappa
             factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
@@ -233,7 +226,6 @@ class Restorer:
             if sigma is not None:
                 sigma[has_no_flux] = np.nan
             if self.bundle.errors.outlier_limit is not None:
-                assert isinstance(self.free_flux, ScoresOutliers)
                 clusters = {name: values[has_flux] for name, values in near_clusters.items()}
                 score[has_flux] = self.free_flux.outlier_score(
                     images[has_flux], level[has_flux], **clusters
@@ -271,7 +263,7 @@ class Restorer:
         info, errors = self.bundle.info, self.bundle.errors
         stars, flags, photometry = centred.stars, centred.flags, restored.photometry
         psf, sigma = restored.psf, restored.sigma
-        measures_stars = isinstance(self.method, MeasuresStars)
+        measures_stars = self.method.knows_field
         # Noise over the flux: the unit of the training, on which errors and limits depend.
         noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
         shapes = measure_shapes(psf)
@@ -331,7 +323,7 @@ class Restorer:
     ) -> dict[str, Any]:
         """Return fluxes with the light beyond the stamps, and skies without that in the stamps."""
         flux, sky = photometry.flux, photometry.background
-        if self.wings is None or not isinstance(self.method, KnowsField):
+        if self.wings is None or not self.method.knows_field:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
@@ -346,7 +338,7 @@ class Restorer:
 
 
 def restored_by_measurement(
-    centred: CentredStars, method: MeasuresStars, errors: ErrorModel
+    centred: CentredStars, method: Method, errors: ErrorModel
 ) -> RestoredStars:
     """Restore stars with the fluxes that the method measures in place of the photometry.
 
@@ -355,7 +347,8 @@ def restored_by_measurement(
     Parameters
     ----------
     centred : CentredStars
-    method : MeasuresStars
+    method : Method
+        One with the capability `knows_field`.
     errors : ErrorModel
         Errors of measured stars due to errors of the model, which are added to those of the method.
     """

@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import Field, create_model, model_validator
 
+from psfdae.errors import did_you_mean
 from psfdae.joined import joined
 from psfdae.methods import MethodNames, known
 from psfdae.reading import read_yaml
@@ -27,6 +28,7 @@ from psfdae.settings import (
     Parts,
     Seed,
     Stamp,
+    keys_of,
     parse_settings,
 )
 
@@ -127,8 +129,8 @@ def from_words(words: Sequence[str] = ()) -> Settings:
                 words = ("++calibration_stars.light_min=0", *words)
             for point in joined("settings"):
                 return of_config(point.load()(groups, (DATASET_CHOICE, *words)))
-            names = ", ".join(groups)
-            raise ConfigError(f"{word}: expected group.key=value, the group one of {names}")
+            names, hint = ", ".join(groups), did_you_mean(key, keys_of(settings_model()))
+            raise ConfigError(f"{word}: expected group.key=value, the group one of {names}{hint}")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
