@@ -232,8 +232,8 @@ class ImageFile:
         dtype : dtype
             Type of the values.
         """
-        # value = bscale · stored + bzero
-        # Scaling in double precision; without a scale, values are converted once.
+        # value = bscale · stored + bzero, in double precision; without a scale, values are
+        # converted once.
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
         else:

@@ -272,7 +272,7 @@ def sky_to_pixel(
 
     # First by the projection without its distortions.
     stars = SkyCoord(ra, dec, unit="deg")
-    # mode "wcs" is the linear part and the projection, without SIP or look-up tables.
+    # Mode "wcs" is the linear part and the projection, without SIP or look-up tables.
     x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
     # Stars at most one size of the image off its edge.
     rows, columns = shape

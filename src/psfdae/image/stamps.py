@@ -339,7 +339,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
         (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie within
         `jitter_px`, or of which that cannot be said.
     """
-    # The pixels that the jitter of the training reaches.
+    # Pixels in the middle that the jitter of the training reaches.
     middle = stamps.shape[-1] // 2
     centre = slice(middle - jitter_px, middle + jitter_px + 1)
     # Brightest pixels of the stamps, and of the stamps smoothed once more.

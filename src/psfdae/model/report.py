@@ -130,7 +130,6 @@ def _errors_table(errors: Table, model_method: str) -> str:
     levels = np.unique(errors["snr"])
     # A method that was not measured at a S/N has an empty cell.
     cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
-    # Biases in per cent of the flux, with their standard errors.
     rows = [
         [escape(f"{label} (the model)" if name == model_method else label)]
         + [cells.get((name, snr), "") for snr in levels]
@@ -147,6 +146,7 @@ def _photometry_table(photometry: Table) -> str:
     Its columns are the S/N, the mean error of the flux in per cent, its pull and the RMS error of
     the centre, which is empty where no centre was fitted.
     """
+    # Biases in per cent of the flux, with their standard errors.
     rows = [
         [
             f"{row['snr']:.3g}",

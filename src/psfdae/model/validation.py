@@ -104,8 +104,8 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
         If pixels or stamps differ from those of the model, or if it was trained on other stars of
         the same image.
     """
-    # Pixels and stamps must have the size of those of the model.
     info, product, path = model.info, stars.product, stars.observation.path
+    # Pixels and stamps must have the size of those of the model.
     model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
         raise PredictionError(
