@@ -96,15 +96,15 @@ class PlainFile:
 def plain_file(path: Path) -> PlainFile:
     """Return a FITS file that astropy can read at random, unpacked if need be.
 
-    Raises
-    ------
-    ObservationError
-        If there is no such file, or it is none of FITS.
-
     Returns
     -------
     PlainFile
         The file itself, or a temporary copy of what is packed in it.
+
+    Raises
+    ------
+    ObservationError
+        If there is no such file, or it is none of FITS.
     """
     with reading(path), path.open("rb") as file:
         # The first bytes tell how the file is compressed, if it is.

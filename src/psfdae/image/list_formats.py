@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 def read_list_table(path: Path) -> Table:
     """Read the table of stars of a file.
 
-    Raises
-    ------
-    ObservationError
-        If the file is missing, damaged, or of none of the formats.
-
     Parameters
     ----------
     path : Path
@@ -37,6 +32,11 @@ def read_list_table(path: Path) -> Table:
     -------
     Table
         A row for each star, in the order of the file.
+
+    Raises
+    ------
+    ObservationError
+        If the file is missing, damaged, or of none of the formats.
     """
     with reading(path):
         content = path.read_bytes()

@@ -309,6 +309,14 @@ def _cut_from_cube(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cut stamps out of the middle of those of a cube.
 
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars that are cut.
+    pixels, mask : Pixels
+        Of the cube, and of its mask if it has one.
+
     Returns
     -------
     data, masked : ndarray, shape (n, s, s)
@@ -317,14 +325,6 @@ def _cut_from_cube(
         Stars of which a part is off the image: none.
     noise : ndarray, shape (n,)
         σ of the sky, NaN: it is to be estimated.
-
-    Parameters
-    ----------
-    observation : Observation
-    part : slice
-        Stars that are cut.
-    pixels, mask : Pixels
-        Of the cube, and of its mask if it has one.
     """
 
     def stamps_of(pixels: Pixels, rows: slice) -> np.ndarray:
@@ -348,11 +348,6 @@ def _cut_from_image(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cut stamps out of an image, and measure the noise of the sky of each.
 
-    Returns
-    -------
-    data, masked, truncated, noise
-        As `_cut_from_cube`; a noise of NaN cannot be measured.
-
     Parameters
     ----------
     observation : Observation
@@ -360,6 +355,11 @@ def _cut_from_image(
         Stars that are cut.
     pixels, noise : Pixels
         Of the image, and of its map of noise if it has one.
+
+    Returns
+    -------
+    data, masked, truncated, noise
+        As `_cut_from_cube`; a noise of NaN cannot be measured.
     """
     shape, layers, stamp_px = observation.shape, observation._layers, observation.stamp_px
     assert shape is not None and observation.positions is not None

@@ -105,6 +105,15 @@ def image_or_cube(
 ) -> tuple[ImageFile, bool]:
     """Tell an image, out of which stars are cut, from a cube of stamps, or one stamp.
 
+    Parameters
+    ----------
+    source : ImageInput
+    image : ImageFile
+    table : Catalogue or None
+        Star list, if there is one.
+    stamp_px : int
+        Least side of stamps.
+
     Returns
     -------
     image : ImageFile
@@ -116,15 +125,6 @@ def image_or_cube(
     ObservationError
         If the image has several colours, an image has neither a list nor is to be searched, a cube
         is to be searched, or stamps are too small.
-
-    Parameters
-    ----------
-    source : ImageInput
-    image : ImageFile
-    table : Catalogue or None
-        Star list, if there is one.
-    stamp_px : int
-        Least side of stamps.
     """
     # A threshold means that the stars are to be found.
     is_searched = source.detection_sigma is not None
@@ -157,11 +157,6 @@ def image_or_cube(
 def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
     """Return the stars of an image that are `threshold` σ above its sky.
 
-    Raises
-    ------
-    ObservationError
-        If there is none.
-
     Parameters
     ----------
     path : Path
@@ -170,6 +165,11 @@ def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
         The image without its sky.
     threshold : float
         In σ of the slightly smoothed image.
+
+    Raises
+    ------
+    ObservationError
+        If there is none.
     """
     from astropy.table import Table
 
@@ -186,14 +186,6 @@ def locate_stars(
 ) -> tuple[ListedStars, np.ndarray | None, list[str]]:
     """Return the stars of a list, or of a cube without one, with their positions.
 
-    Returns
-    -------
-    stars : ListedStars
-    positions : ndarray or None, shape (n, 2)
-        None for a cube whose list has no pixels.
-    remarks : list of str
-        Sentences on the list's origin, and on rows of the same star.
-
     Parameters
     ----------
     source : ImageInput
@@ -204,6 +196,14 @@ def locate_stars(
         The image with its sky, which shows the origin of a list that does not say it.
     is_cube : bool
         The image is a cube of stamps.
+
+    Returns
+    -------
+    stars : ListedStars
+    positions : ndarray or None, shape (n, 2)
+        None for a cube whose list has no pixels.
+    remarks : list of str
+        Sentences on the list's origin, and on rows of the same star.
 
     Raises
     ------

@@ -102,15 +102,15 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
 def choose_positions(names: Sequence[str]) -> Positions:
     """Find the position columns among the names of a list's columns.
 
-    Raises
-    ------
-    ColumnError
-        If there are none, or those of several programs.
-
     Parameters
     ----------
     names : sequence of str
         In any order and case.
+
+    Raises
+    ------
+    ColumnError
+        If there are none, or those of several programs.
     """
     # Tables of psfdae itself (predict, photometry, from-stars) count from 0. They have further
     # columns of their own, and may have some of other programs.

@@ -284,11 +284,6 @@ def _require(condition: ArrayLike, path: Path, problem: str) -> None:
 def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> None:
     """Check that arrays have the shapes that the description asks for, and usable numbers.
 
-    Raises
-    ------
-    BundleError
-        If an array is missing, unknown, or has a wrong type, shape or number.
-
     Parameters
     ----------
     info : BundleInfo
@@ -296,6 +291,11 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
         By group and name, as in the file.
     path : Path
         The file, for messages.
+
+    Raises
+    ------
+    BundleError
+        If an array is missing, unknown, or has a wrong type, shape or number.
     """
     # Arrays of every bundle; limits of an outlier score only of some.
     pixels, components = info.stamp_px**2, info.components
@@ -341,18 +341,18 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
 def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
     """Return the arrays of a flux model with so many leading eigenvectors, for `flux_model_of`.
 
-    Returns
-    -------
-    dict of str to ndarray
-        Variances (k,) and `rest`, that along each other direction, in double precision; maps of
-        the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
-
     Parameters
     ----------
     model : FluxModel
         With a full basis, or of a file of large stamps.
     components : int
         Number k of leading eigenvectors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Variances (k,) and `rest`, that along each other direction, in double precision; maps of
+        the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
     """
     # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
     # of a model from a file are equal; their mean could differ from them in the last digit.
