@@ -27,7 +27,7 @@ from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import PsfModel, load_model
+from psfdae.model.psf_model import PsfModel, load_model, other_instrument
 from psfdae.options import File
 from psfdae.progress import silence
 
@@ -175,7 +175,7 @@ def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
 def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
     """Return sentences on another instrument than the training's, and on light beyond stamps."""
     notes = []
-    if difference := model.other_instrument(observation.instrument, observation.colour_column):
+    if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
     if observation.shape and model.method.knows_field and not model.wings:
         notes.append(

@@ -86,6 +86,7 @@ def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Metho
     Too few stars are left to choose a method by validation, and only the field falls back to one
     PSF for all.
     """
+    # Without the field among them, all are tried, however few the stars are.
     field = [kind for kind in kinds if kind.name == "field"]
     return field if field and len(stars) < ENOUGH_STARS else [*kinds]
 
@@ -111,6 +112,7 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
     MissingExtraError
         If the method needs a package that is not installed.
     """
+    # The stars as the method takes them: of the image, without those that are held out.
     data = stars.training_set(kind, checkpoint=checkpoint)
     with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
         return kind.fit(data, **kind.settings(stars.settings))
