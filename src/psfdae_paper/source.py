@@ -49,7 +49,7 @@ def source_hash(*names: str) -> str:
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)
     for name in queue:
-        digests[name], imported = _module(name)
+        digests[name], imported = module_digest(name)
         queue += [module for module in imported if module not in digests]
         digests |= {module: digests.get(module) for module in imported}
     lines = "\n".join(f"{name} {digest}" for name, digest in sorted(digests.items()))
@@ -57,7 +57,7 @@ def source_hash(*names: str) -> str:
 
 
 @cache
-def _module(name: str) -> tuple[str, list[str]]:
+def module_digest(name: str) -> tuple[str, list[str]]:
     """Return the digest of a module, or of a program's file, and the modules that it imports.
 
     Raises
@@ -68,9 +68,16 @@ def _module(name: str) -> tuple[str, list[str]]:
     path = SOURCES.parent / name if name.endswith(".py") else _path(name)
     if path is None or not path.is_file():
         raise ValueError(f"{name}: no such command, module or file")
-    # The syntax tree has neither comments nor formatting.
+    # The syntax tree has neither comments nor formatting. Statements that are only a constant, such
+    # as docstrings, are taken out.
     tree = ast.parse(path.read_bytes())
-    parts = [ast.dump(_without_docstrings(tree))]
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            is_constant = [isinstance(getattr(s, "value", None), ast.Constant) for s in body]
+            node.body = [  # type: ignore[attr-defined]
+                s for s, c in zip(body, is_constant, strict=True) if not (c and type(s) is ast.Expr)
+            ]
+    parts = [ast.dump(tree)]
     # A package may have tables, which its functions read.
     if path.name == "__init__.py":
         data = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix != ".py")
@@ -113,18 +120,6 @@ def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
             file = program_folder and program_folder / f"{modules[-1]}.py"
             if file and file.is_file():
                 yield str(file.relative_to(SOURCES.parent))
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    """Remove all statements that are only a constant, such as docstrings, from a syntax tree."""
-    for node in ast.walk(tree):
-        if isinstance(body := getattr(node, "body", None), list):
-            node.body = [  # type: ignore[attr-defined]
-                s
-                for s in body
-                if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
-            ]
-    return tree
 
 
 def git_commit() -> str:

@@ -6,13 +6,12 @@ fit, and the keys that decide which products belong together.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from psfdae.settings import CheckpointSeconds, Count, Group, Positive
-from psfdae_paper.configuration.aligners import TRAINED
 
 
 class Alignment(Group):
@@ -20,7 +19,30 @@ class Alignment(Group):
 
     A state has four numbers: decentre x, y and tilt x, y of the secondary mirror, in units of their
     ranges from −1 to 1.
+
+    Attributes
+    ----------
+    choice : tuple of str
+        Override that chooses scene 3 among the datasets.
+    state_groups : tuple of str
+        Groups of the configuration that decide the stamps of states.
+    wavefront_keys, stamp_keys : tuple of str
+        Keys that decide the wavefront of a state, and its stamps. Products that differ in one of
+        them do not belong together.
     """
+
+    choice: ClassVar = ("dataset=alignment",)
+    state_groups: ClassVar = ("seed", "telescope", "prescription", "alignment", "optics")
+    wavefront_keys: ClassVar = (
+        *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m"),
+        *("prescription", "alignment.decenter_range_m", "alignment.tilt_range_deg"),
+        *("alignment.defocus_m", "alignment.field_radius_deg", "alignment.field_points"),
+        "alignment.highest_zernike",
+    )
+    stamp_keys: ClassVar = (
+        *wavefront_keys,
+        *("telescope.pixel_scale_arcsec", "alignment.stamp_px"),
+    )
 
     # The paper's ranges (section 3.3).
     decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
@@ -174,32 +196,3 @@ class Fit(Group):
     limit: Annotated[float, Field(ge=1, le=2)] = Field(
         1.25, description="States are kept within ± this, in units of the range"
     )
-
-
-NAME = "alignment"
-"""Name of scene 3 among the datasets."""
-
-CHOICE = (f"dataset={NAME}",)
-"""Override that chooses scene 3."""
-
-SHARED_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
-"""Groups of which an option that is chosen for a whole run applies to scene 3, too."""
-
-GROUPS = (
-    *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
-    *("cnn", "perceptron", *(f"train_{name}" for name in TRAINED), "evaluation", "fit"),
-)
-"""Groups of the configuration that scene 3 reads."""
-
-STATE_GROUPS = ("seed", "telescope", "prescription", "alignment", "optics")
-"""Groups that decide the stamps of states."""
-
-WAVEFRONT_KEYS = (
-    *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m", "prescription"),
-    *("alignment.decenter_range_m", "alignment.tilt_range_deg", "alignment.defocus_m"),
-    *("alignment.field_radius_deg", "alignment.field_points", "alignment.highest_zernike"),
-)
-"""Keys that decide the wavefront of a state of scene 3."""
-
-STAMP_KEYS = (*WAVEFRONT_KEYS, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
-"""Keys that decide the stamps of a state of scene 3."""

@@ -23,7 +23,8 @@ from typing import Any, TypeVar, cast
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 from psfdae.settings import NEUTRAL, ConfigError, Group, parse_settings
-from psfdae_paper.configuration import alignment
+from psfdae_paper.configuration.aligners import trained_networks
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import stage_model, with_derived_values
 from psfdae_paper.configuration.methods import all_groups, methods_in
@@ -83,6 +84,17 @@ def _primary(folder: Path) -> str:
     """
     from hydra.core.config_store import ConfigStore
 
+    # Fields without a default must be in the files; excluded ones are inputs of derived values.
+    class_defaults = {
+        name: {
+            key: field.get_default(call_default_factory=True)
+            for key, field in group_class.model_fields.items()
+            if not (field.is_required() or field.exclude)
+        }
+        for name, group_class in _group_classes().items()
+    }
+    class_defaults = {name: values for name, values in class_defaults.items() if values}
+    # Groups that the root's list has, each with the name of one of its files.
     tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
     listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
@@ -93,25 +105,9 @@ def _primary(folder: Path) -> str:
     all_defaults = ["class_defaults", *method_defaults, *defaults]
     # Hydra composes in the order of the list; a later entry replaces values of an earlier one.
     store = ConfigStore.instance()
-    store.store("class_defaults", _class_defaults(), package="_global_")
+    store.store("class_defaults", class_defaults, package="_global_")
     store.store("with_class_defaults", {**tree, "defaults": all_defaults})
     return "with_class_defaults"
-
-
-def _class_defaults() -> dict[str, Any]:
-    """Return the groups of a configuration with the defaults of their classes, if any.
-
-    Fields without a default must be in the files; excluded ones are inputs of derived values.
-    """
-    groups = {
-        name: {
-            key: field.get_default(call_default_factory=True)
-            for key, field in group_class.model_fields.items()
-            if not (field.is_required() or field.exclude)
-        }
-        for name, group_class in _group_classes().items()
-    }
-    return {name: values for name, values in groups.items() if values}
 
 
 def _group_classes() -> dict[str, type[Group]]:
@@ -160,14 +156,19 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
     if not _is_alignment(tree):
         return parse_settings(whole_config(), tree)
     _require_known_groups(tree)
-    return part(alignment.GROUPS, tree)
+    reads = (
+        *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
+        *("cnn", "perceptron", *(f"train_{name}" for name in trained_networks())),
+        *("evaluation", "fit"),
+    )
+    return part(reads, tree)
 
 
 def _is_alignment(tree: Mapping[str, Any]) -> bool:
     """Return True for the configuration of scene 3."""
     dataset = tree.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else None
-    return "scene" not in tree and name == alignment.NAME
+    return "scene" not in tree and name == "alignment"
 
 
 def _require_known_groups(tree: Mapping[str, Any]) -> None:
@@ -328,7 +329,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     missing = [key for key in reads if key not in tree]
     if missing and _is_alignment(tree):
         raise ConfigError(
-            f"dataset = {alignment.NAME}: scene 3 has no simulated stars, which are needed here; "
+            "dataset = alignment: scene 3 has no simulated stars, which are needed here; "
             "its commands are `psfdae alignment …`, its target is scene3"
         )
     if missing:
@@ -340,8 +341,8 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     """Select those of a workflow's overrides that concern a dataset.
 
     The workflow takes one list for everything. A key that only other datasets have is left
-    out; one that no dataset has stays, so that it is refused by name. Options of a group apply
-    to all datasets, but only those of `alignment.SHARED_OPTIONS` to scene 3.
+    out; one that no dataset has stays, so that it is refused by name. Options of a group, such as
+    train=onecycle, apply to all datasets, but to scene 3 only those of groups that it has as well.
 
     Parameters
     ----------
@@ -356,10 +357,10 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     """
     # Words such as train=onecycle choose a file of a group; scene 3 takes few of these groups.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
-    is_alignment = tuple(choice) == alignment.CHOICE
-    applicable_options = [
-        word for word in options if not is_alignment or _key(word) in alignment.SHARED_OPTIONS
-    ]
+    applicable_options = options
+    if tuple(choice) == Alignment.choice:
+        shared_groups = ("preset", "prescription", "dae_train", "network_train")
+        applicable_options = [word for word in options if _key(word) in shared_groups]
 
     def has_key(choice: Sequence[str], dotted_key: str) -> bool:
         """Return True if the configuration of a dataset has a key."""
@@ -372,7 +373,12 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
 
     def concerns(override: str) -> bool:
         """Return True if this dataset has the override's key, or if no dataset has it."""
-        for key in _deciding_keys(override):
+        # `key=value` changes a key; `+group.key=value` adds one to a group, which must be there;
+        # `++group.key=value` does either, hence first the key and then the group decides.
+        key = _key(override)
+        keys = [] if override.startswith("+") and not override.startswith("++") else [key]
+        keys += [key.rpartition(".")[0]] if override.startswith("+") and "." in key else []
+        for key in keys:
             if has_key(choice, key):
                 return True
             if any(has_key([f"dataset={name}"], key) for name in dataset_names()):
@@ -396,42 +402,23 @@ def _key(override: str) -> str:
     return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
 
 
-def _deciding_keys(override: str) -> list[str]:
-    """Return keys whose presence decides which datasets an override concerns.
-
-    That is the override's key; for `+group.key`, which adds a key, the group; for `++group.key`,
-    which changes or adds one, first the key and then the group.
-    """
-    key = _key(override)
-    group = key.rpartition(".")[0]
-    if not override.startswith("+"):
-        return [key]
-    return ([key] if override.startswith("++") else []) + ([group] if group else [])
-
-
 def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration tree without the settings that cannot change a result.
 
     These are marked `NEUTRAL` in their class, such as the time between checkpoints.
     """
-    neutral = _neutral_keys()
+    neutral = {
+        (group, name)
+        for group, group_class in _group_classes().items()
+        for name, field in group_class.model_fields.items()
+        if NEUTRAL in field.metadata
+    }
     return {
         group: {key: value for key, value in values.items() if (group, key) not in neutral}
         if isinstance(values, Mapping)
         else values
         for group, values in tree.items()
     }
-
-
-@cache
-def _neutral_keys() -> frozenset[tuple[str, str]]:
-    """Return group and name of the settings that cannot change a result."""
-    return frozenset(
-        (group, name)
-        for group, group_class in _group_classes().items()
-        for name, field in group_class.model_fields.items()
-        if NEUTRAL in field.metadata
-    )
 
 
 def _first_lines(error: Exception) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
 
 from psfdae.method import Method
 from psfdae.methods import MethodNames
@@ -34,7 +34,7 @@ from psfdae.settings import (
 )
 from psfdae.telescope.aberrations import Prescription, Seidel
 from psfdae.telescope.settings import AnyTelescope
-from psfdae_paper.configuration.aligners import TRAINED
+from psfdae_paper.configuration.aligners import trained_networks
 from psfdae_paper.configuration.alignment import (
     Alignment,
     Cnn,
@@ -42,7 +42,7 @@ from psfdae_paper.configuration.alignment import (
     NetworkTrain,
     Perceptron,
 )
-from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
+from psfdae_paper.configuration.base import SearchDistance, search_distance
 from psfdae_paper.configuration.consistency import Consistent
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
@@ -88,7 +88,8 @@ class Stars(Group):
         description="Search distance for the brightest pixel of a star; null: search_lambda_d"
     )
     search_lambda_d: SearchDistance = Field(
-        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+        default=search_distance(),
+        description="The same in λ/D of whatever telescope, if search_px is null",
     )
 
 
@@ -103,7 +104,8 @@ class Framing(Stamp):
         "null: search_lambda_d"
     )
     search_lambda_d: SearchDistance = Field(
-        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+        default=search_distance(),
+        description="The same in λ/D of whatever telescope, if search_px is null",
     )
     # Mirror-symmetric PSFs have equal maxima, between which rounding would choose.
     tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
@@ -118,8 +120,8 @@ class WholePeriodOptics(Group):
     number of samples, and by rounding on batch and threads.
     """
 
-    pupil_samples: PupilSamples = Field(
-        description="Grid sizes N, ascending; each wavefront takes the first that suffices"
+    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
+        Field(description="Grid sizes N, ascending; each wavefront takes the first that suffices")
     )
     precision: Literal["complex64", "complex128"] = Field(
         description="Precision of the propagation"
@@ -128,6 +130,14 @@ class WholePeriodOptics(Group):
     threads: Count = Field(
         description="Batches in parallel, each with one thread of linear algebra"
     )
+
+    @field_validator("pupil_samples")
+    @classmethod
+    def check_order(cls, grid_sizes: list[int]) -> list[int]:
+        """Require ascending grid sizes, so that the first that suffices is the smallest one."""
+        if sorted(set(grid_sizes)) != grid_sizes:
+            raise ValueError(f"{grid_sizes} must be ascending")
+        return grid_sizes
 
 
 class Optics(WholePeriodOptics):
@@ -234,7 +244,7 @@ class Config(Consistent):
     """The whole configuration of one dataset.
 
     Stages get a model with those of these groups that they read, and annotate it as `Config`, too.
-    Scene 3 reads `alignment.GROUPS`. `whole_config` adds the settings of methods.
+    Scene 3 reads those that `compose.validate_tree` names. `whole_config` adds settings of methods.
     """
 
     if TYPE_CHECKING:
@@ -310,5 +320,5 @@ def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }
-    groups |= {f"train_{name}": (NetworkTrain, ...) for name in TRAINED}
+    groups |= {f"train_{name}": (NetworkTrain, ...) for name in trained_networks()}
     return create_model("Config", __base__=Config, **groups)

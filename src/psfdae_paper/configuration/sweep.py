@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
-from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT
-from psfdae_paper.configuration.alignment import CHOICE, NAME, NETWORKS
+from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
+from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load_file
 from psfdae_paper.configuration.methods import registered
@@ -24,21 +24,6 @@ Value = Scalar | list[Scalar]
 
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
-
-
-def _trainable(name: str) -> str:
-    """Return the name of a model unchanged; ValueError if a sweep cannot train it.
-
-    Sweeps train methods that store a model, and the networks of scene 3.
-    """
-    stored = (method_class.name for method_class in registered() if method_class.storage)
-    models = (*stored, *SWEPT)
-    if name not in models:
-        raise ValueError(f"{name!r} is not one of {', '.join(models)}")
-    return name
-
-
-Model = Annotated[str, AfterValidator(_trainable)]
 
 
 class Axis(Group):
@@ -126,7 +111,7 @@ class Sweep(Group):
     kind: Literal["grid", "random", "adaptive"] = Field(
         description="Every combination, random draws, or draws that learn from earlier ones"
     )
-    model: Model = Field(description="Method, or one of scene 3's networks")
+    model: str = Field(description="Method, or one of scene 3's networks")
     dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
     split: SplitKind = Field(default="random", description="Split of the stars")
     reference: Reference = Field(default="realisation", description="What the DAE is to restore")
@@ -146,10 +131,20 @@ class Sweep(Group):
     startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
     parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
 
+    @field_validator("model")
+    @classmethod
+    def check_name(cls, name: str) -> str:
+        """Require a method that stores a model, or a network of scene 3."""
+        stored = (method_class.name for method_class in registered() if method_class.storage)
+        models = (*stored, *swept_networks())
+        if name not in models:
+            raise ValueError(f"{name!r} is not one of {', '.join(models)}")
+        return name
+
     @property
     def choice(self) -> tuple[str, ...]:
         """Override that chooses the dataset, or scene 3."""
-        return CHOICE if self.dataset is None else (f"dataset={self.dataset}",)
+        return Alignment.choice if self.dataset is None else (f"dataset={self.dataset}",)
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -161,7 +156,7 @@ class Sweep(Group):
         """Keys and groups that may differ between points; all points share their stars."""
         return (
             ALIGNERS[self.model].swept
-            if self.model in SWEPT
+            if self.model in swept_networks()
             else (*method(self.model).groups, "noise.levels")
         )
 
@@ -171,10 +166,10 @@ class Sweep(Group):
         # A grid has as many points as combinations.
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
-        if (self.model in SWEPT) != (self.dataset is None):
+        if (self.model in swept_networks()) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
-        if self.dataset == NAME:
-            raise ValueError(f"dataset = {NAME}: scene 3 has no stars that methods restore")
+        if self.choice == Alignment.choice and self.dataset is not None:
+            raise ValueError(f"dataset = {self.dataset}: scene 3 has no stars that methods restore")
         # Networks of scene 3 err in states of misalignment, methods in images of stars.
         metrics = ["validation_mae"]
         if self.dataset is not None:
@@ -219,7 +214,7 @@ class Sweep(Group):
 
 def point_groups(model: str) -> tuple[str, ...]:
     """Return the groups of the configuration that a point of a model reads."""
-    if model in SWEPT:
+    if model in swept_networks():
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
 

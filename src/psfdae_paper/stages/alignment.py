@@ -35,7 +35,7 @@ from psfdae_paper.alignment.telescope import (
     uniform_states,
     verify,
 )
-from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS, STATE_GROUPS, WAVEFRONT_KEYS
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 
@@ -44,7 +44,9 @@ StatesFile = Annotated[File, "Product of `alignment states`."]
 TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-@command("alignment model", reads=("telescope", "prescription", "alignment"), choice=CHOICE)
+@command(
+    "alignment model", reads=("telescope", "prescription", "alignment"), choice=Alignment.choice
+)
 def model(
     config: Config,
     out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
@@ -97,7 +99,7 @@ def read_model(
     """
     # The wavefront of a state depends on the telescope's optics and on the range of the states.
     product = read_product(path, "alignment_model", ("coefficients",))
-    require(path, product.config, WAVEFRONT_KEYS, expected_config, owner)
+    require(path, product.config, Alignment.wavefront_keys, expected_config, owner)
     return QuadraticModel(product["coefficients"])
 
 
@@ -123,11 +125,11 @@ def read_states(
     """
     product = read_product(path, "alignment_states", ("states", "stamps"))
     if expected_config is not None:
-        require(path, product.config, STAMP_KEYS, expected_config, owner)
+        require(path, product.config, Alignment.stamp_keys, expected_config, owner)
     return product
 
 
-@command("alignment states", reads=STATE_GROUPS, choice=CHOICE)
+@command("alignment states", reads=Alignment.state_groups, choice=Alignment.choice)
 def states(
     config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
@@ -197,7 +199,7 @@ def _geometry(config: Config) -> dict[str, Column]:
     }
 
 
-@command("alignment telescope", reads=("telescope", "alignment"), choice=CHOICE)
+@command("alignment telescope", reads=("telescope", "alignment"), choice=Alignment.choice)
 def telescope(
     config: Config,
     model: ModelFile,
@@ -217,9 +219,9 @@ def telescope(
         for name, path in (("grid", grid), ("uniform", uniform))
     }
     # All products must be those of the configured telescope.
-    require(model, quadratic.config, WAVEFRONT_KEYS, config)
+    require(model, quadratic.config, Alignment.wavefront_keys, config)
     for product in sets.values():
-        require(product.path, product.config, STAMP_KEYS, config)
+        require(product.path, product.config, Alignment.stamp_keys, config)
     coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
     # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:
     # its condition number says how well states can be separated.

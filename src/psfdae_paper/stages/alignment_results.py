@@ -30,16 +30,8 @@ from psfdae_paper.alignment.telescope import (
     design_states,
     fit_quadratic,
 )
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    BOUNDS,
-    ESTIMATORS,
-    FITTED,
-    LEARNED,
-    Aligner,
-    methods_of_set,
-)
-from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import alignment_figures, alignment_tables
@@ -52,9 +44,6 @@ Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fi
 Bounds = Annotated[tuple[File, ...], "Product of `alignment bound`.", {"flag": "--bound"}]
 ErrorTable = Annotated[File, "CSV of `alignment tables`."]
 Png = Annotated[File, "PNG."]
-
-FIGURE_METHODS = [method.name for method in ESTIMATORS if not method.unknown_flux]
-"""Methods whose estimates and errors are drawn."""
 
 
 class Key(TypedDict):
@@ -99,15 +88,15 @@ def read_results(
         is_bound = product.kind == "alignment_bound"
         # Names of the methods, and their values as an array [λ, method, state, ...].
         if is_bound:
-            aligners = methods_of_set(BOUNDS, test_set)
+            aligners = aligners_of("bound", test_set)
             levels, values = product["levels"], product["covariances"].swapaxes(0, 1)
         elif product.kind == "alignment_fit":
             # A product of maximum-likelihood fits has one noise level.
-            aligners = methods_of_set(FITTED, test_set)
+            aligners = aligners_of("fit", test_set)
             levels, values = np.array([product.config["level"]]), product["estimates"][None]
         else:
             # The networks, and the constant estimate of the aligned telescope, which is 0.
-            aligners = [ALIGNERS["constant"], *LEARNED]
+            aligners = [ALIGNERS["constant"], *aligners_of("estimates", test_set)]
             levels = product["levels"]
             values = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
         for level, by_method in zip(levels, values, strict=True):
@@ -126,7 +115,7 @@ def products_of_one_test(
     ProductError
         With the first value that differs.
     """
-    same_keys = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
+    same_keys = ("noise.kappa", "noise.background_photons", *Alignment.stamp_keys)
     products: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
         for path in paths:
@@ -181,7 +170,7 @@ def tables(
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
         bound_config = read_product(path, "alignment_bound", ()).config
-        require(path, bound_config, STAMP_KEYS, product.config, states)
+        require(path, bound_config, Alignment.stamp_keys, product.config, states)
     unit = product["unit"]
     # Measured errors, and those that unbiased estimates at the bound would have.
     rows_by_table: dict[Path, list[alignment_tables.Row]] = {errors: [], correlation: []}
@@ -256,7 +245,7 @@ def time_table(
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
     # An estimate's time, and that of the trainings on which it rests.
-    for method in ESTIMATORS:
+    for method in (a for a in ALIGNERS.values() if a.network):
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
         networks = [method.network, *(["dae"] if method.denoised else [])]
@@ -266,7 +255,7 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
+@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
@@ -274,7 +263,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     """
     # The DAE must be that of these stamps.
     product = read_states(states)
-    require_origin(dae, STAMP_KEYS, product)
+    require_origin(dae, Alignment.stamp_keys, product)
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
@@ -297,7 +286,9 @@ def predicted(
 ) -> None:
     """Draw estimates against the truth, for each method, number of a state and noise level."""
     # Estimated states of each method and noise level.
-    by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
+    by_method: dict[str, dict[float, np.ndarray]] = {
+        name: {} for name, aligner in ALIGNERS.items() if aligner.is_drawn
+    }
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
@@ -313,7 +304,8 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
-        if key["noise_level"] > 0 and key["method"] in (*FIGURE_METHODS, "cramer_rao"):
+        is_shown = ALIGNERS[key["method"]].is_drawn or key["method"] == "cramer_rao"
+        if key["noise_level"] > 0 and is_shown:
             error = expected_abs_error(values) if is_bound else np.abs(values - truth)
             curves[key["noise_level"]][key["method"]] = (
                 alignment_figures.size_of(truth),
@@ -326,7 +318,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 @command(
     "alignment figure twin",
     reads=("telescope", "prescription", "alignment", "optics", "noise"),
-    choice=CHOICE,
+    choice=Alignment.choice,
 )
 def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.

@@ -27,7 +27,6 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.registry import choose_best, forget, link, log_model, registered_name
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
-    MODEL,
     TrackedRun,
     epoch_metrics,
     runs_of_alignment,
@@ -318,7 +317,8 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
     # Files that are not part of the model: tables, figures and settings.
     with tempfile.TemporaryDirectory() as folder:
-        link({k: path for k, path in run.files.items() if not k.startswith(MODEL)}, Path(folder))
+        others = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
+        link(others, Path(folder))
         client.log_artifacts(run_id, folder)
     client.log_text(run_id, as_yaml(run.config), CONFIG)
     client.set_terminated(run_id, run.status, run.end_ms)

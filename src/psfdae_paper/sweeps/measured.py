@@ -6,10 +6,11 @@ come, in the point's folder, its tables of errors and what it cost. `result.json
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -23,9 +24,6 @@ from psfdae.rng import stream
 from psfdae.settings import Reference, SplitKind
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import MeasuredStars
-
-TABLES = {"validation": "validation.csv", "test": "evaluation.csv"}
-"""Tables of a point's errors by part of the data; that of the test is the main workflow's."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,11 @@ class Task:
         Folder for all files of the point; its name is the point's.
     checkpoint : Path
         File from which an interrupted training resumes.
+    tables : dict of str
+        Names of the tables of errors by part of the data; that of the test is the main workflow's.
     """
+
+    tables: ClassVar = {"validation": "validation.csv", "test": "evaluation.csv"}
 
     dataset: str
     split: SplitKind
@@ -82,6 +84,39 @@ class Measured:
     epochs: int | None = None
     stopped: bool = False
     attempt: int = 0
+
+
+@dataclass(frozen=True)
+class Training(ABC):
+    """Training and measurement of one point; each kind of model has a class of its own.
+
+    Attributes
+    ----------
+    config : Config
+        Groups that a point of the model reads.
+    task : Task
+    model : str
+        Name of the method, or of the network of scene 3.
+    """
+
+    config: Config
+    task: Task
+    model: str
+
+    @property
+    @abstractmethod
+    def files(self) -> tuple[str, ...]:
+        """Names of the files of the trained model, in the folder of the point."""
+
+    @abstractmethod
+    def measure(self) -> Measured:
+        """Train as the main workflow does, and measure on validation and test data.
+
+        Raises
+        ------
+        FitError
+            If the training cannot continue.
+        """
 
 
 def geometric_mean(values: Sequence[float]) -> float:
@@ -160,7 +195,7 @@ def measure_images(
             row = {**key, "method": method, "noise_level": level}
             rows += stars.errors(row, estimate, config.evaluation.data_range)[0]
         metrics |= image_metrics(part, rows)
-        write_csv(task.folder / TABLES[part], pd.DataFrame(rows))
+        write_csv(task.folder / task.tables[part], pd.DataFrame(rows))
     return metrics
 
 

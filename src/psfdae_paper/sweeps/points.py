@@ -19,7 +19,7 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration.alignment import STATE_GROUPS
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
@@ -229,7 +229,7 @@ class Plan:
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
         config = validate_tree(self.tree).model_dump()
-        return stage_tree(SIMULATION if self.sweep.dataset else STATE_GROUPS, config)
+        return stage_tree(SIMULATION if self.sweep.dataset else Alignment.state_groups, config)
 
     def _check_ends(self) -> None:
         """Refuse a space with an option or an end of a range that the configuration refuses."""
