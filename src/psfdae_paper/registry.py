@@ -43,6 +43,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
 
     if not run.model_files:
         return None
+    # Pending until its files are there (READY, below).
     name = registered_name(run)
     logged = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
     model_id: str = logged.model_id
@@ -64,6 +65,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
         # The mean over all noise levels, by which `choose_best` compares versions.
         if "test_mse" in run.metrics:
             tags["test_mse"] = f"{run.metrics['test_mse']:.6g}"
+        # A version points to the files of the model; they are not copied.
         location = client.get_logged_model(model_id).artifact_location
         client.create_model_version(name, location, run_id, tags, model_id=model_id)
     return model_id
@@ -83,6 +85,7 @@ def bundle_of(run: TrackedRun) -> Bundle:
     # Groups of settings that tell which stars a fit was trained on, and with which noise.
     groups = ("seed", "noise", "parts")
     config = part(groups, {group: described[group] for group in groups})
+    # The bundle is named like the registered model.
     fitted, name = method_class.load(place, run.reference), registered_name(run)
     return uncalibrated(fitted, product, run.reference, config, described, name, "not stated")[0]
 

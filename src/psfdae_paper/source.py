@@ -83,6 +83,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
         data = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix != ".py")
         parts += [f"{p.name} {hashlib.sha256(p.read_bytes()).hexdigest()}" for p in data]
     program_folder = path.parent if name.endswith(".py") else None
+    # Code and tables together.
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
     return digest, [*_imported(tree, program_folder)]
 
@@ -90,6 +91,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
 def _path(module: str) -> Path | None:
     """Return the file of a module of the packages; None for modules of other packages."""
     path = SOURCES.joinpath(*module.split("."))
+    # A module, or a package.
     files = (path.with_suffix(".py"), path / "__init__.py")
     return next((file for file in files if file.is_file()), None)
 

@@ -257,6 +257,7 @@ def _run_of_fit(
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """List the files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"{TrackedRun.model_prefix}{path.name}": path for path in fits.own_files(kind, place)}
+    # Course of the training and the like, which `load` does not need.
     diagnostics = fits.storage_of(kind).diagnostics
     return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
@@ -364,6 +365,7 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
     from psfdae_paper.sweeps.measured import fit_in, read_cost
 
+    # A point has a folder with all its files.
     folder = results / "sweeps" / name / "points" / point
     result = read_json(folder / "result.json")
     model, config = result["model"], result["config"]
@@ -412,6 +414,7 @@ def settings_of(run: TrackedRun, preset: str) -> dict[str, str]:
     defaults = {}
     # Stars that are none of the datasets, such as those of a user, have no defaults.
     if run.dataset in dataset_names() and (config_dir() / f"preset/{preset}.yaml").is_file():
+        # Settings of the dataset as the preset alone has them.
         defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
     differing = {
         key: value

@@ -87,6 +87,7 @@ class Alignment(Group):
     @property
     def unit(self) -> np.ndarray:
         """Ranges of decentre x, y in metres and tilt x, y in radians, shape (4,)."""
+        # Both axes have the same ranges.
         tilt = np.deg2rad(self.tilt_range_deg)
         return np.array([self.decenter_range_m, self.decenter_range_m, tilt, tilt])
 
@@ -111,8 +112,10 @@ class Cnn(Group):
     @model_validator(mode="after")
     def check_layers(self) -> Cnn:
         """Require odd kernels, and as many kernels and strides as widths."""
+        # An even kernel would shift the image by half a pixel.
         if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
+        # Each convolution has a width, a kernel and a stride.
         for name in ("kernels", "strides"):
             values = getattr(self, name)
             if len(values) != len(self.widths):
@@ -126,6 +129,7 @@ class Cnn(Group):
 class Perceptron(Group):
     """Fully connected layers after the stamps' leading principal components; not in the paper."""
 
+    # Fewer inputs than pixels, so that layers may be fully connected.
     components: Count = Field(
         128, description="Principal components of all stamps of a state together"
     )
@@ -144,9 +148,11 @@ class NetworkTrain(Group):
     The defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋.
     """
 
+    # What is trained, and for how long.
     network: Literal["cnn", "perceptron"] = Field("cnn", description="Network that is trained")
     epochs: Count = Field(100, description="Passes over the training states")
     batch: Annotated[int, Field(ge=2)] = Field(10, description="States per step")
+    # Course of the optimisation.
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         1e-3, description="Adam's learning rate (its maximum if one-cycle)"
     )
@@ -157,6 +163,7 @@ class NetworkTrain(Group):
         0.1, description="Factor of the learning rate at each step of the schedule"
     )
     decay_epochs: Count = Field(30, description="Epochs between steps of the schedule")
+    # What makes more of the training states.
     mirrors: bool = Field(
         False, description="Train on the telescope's mirror images and average estimates over them"
     )
@@ -186,6 +193,7 @@ class Fit(Group):
     outer_states: Count = Field(
         1000, description="States beyond the range that are computed for it"
     )
+    # A fit ends by its tolerance, or here.
     iterations: Count = Field(12, description="Most steps of a fit")
     # After a step of 0.3 standard errors, a few hundredths remain to the maximum.
     tolerance: Positive = Field(

@@ -68,6 +68,7 @@ def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(folder), overrides=list(overrides))
+        # Plain values, with ${…} replaced by the keys that they name.
         resolved: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
@@ -128,6 +129,7 @@ def _reason(error: Exception, folder: Path) -> str:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    # A damaged file: the first that cannot be read is named.
     if not isinstance(error, HydraException | OmegaConfBaseException):
         for path in sorted(folder.rglob("*.yaml")):
             try:
@@ -166,6 +168,7 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
 
 def _is_alignment(tree: Mapping[str, Any]) -> bool:
     """Return True for the configuration of scene 3."""
+    # A group may be damaged, and is then refused by the check of all groups.
     dataset = tree.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else None
     return "scene" not in tree and name == "alignment"
@@ -173,6 +176,7 @@ def _is_alignment(tree: Mapping[str, Any]) -> bool:
 
 def _require_known_groups(tree: Mapping[str, Any]) -> None:
     """Raise ConfigError if a tree has a group that the configuration does not have."""
+    # Groups that a user adds by mistake would be ignored otherwise.
     unknown = sorted(set(tree) - set(whole_config().model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
@@ -210,6 +214,7 @@ def _with_file_name(path: Path, check: Callable[[], Checked]) -> Checked:
     try:
         return check()
     except ConfigError as error:
+        # An error may have several lines, one for each key.
         lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
         raise ConfigError(lines) from None
 
@@ -242,6 +247,7 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
         If the file is no YAML or has other groups; names file, key and range.
     """
     tree = parse_yaml(path)
+    # A file that is no mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
     # All groups of the file are checked: one that the stage does not read is refused.
     return _with_file_name(path, lambda: _checked(reads, groups))
@@ -300,6 +306,7 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
+    # A model becomes a tree again, so that it is checked anew.
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     groups = {key: tree[key] for key in reads if key in tree}
     return _checked(reads, groups)
@@ -364,6 +371,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
 
     def has_key(choice: Sequence[str], dotted_key: str) -> bool:
         """Return True if the configuration of a dataset has a key."""
+        # The composition of the other dataset, with options that apply to it.
         node: Any = compose((*choice, *applicable_options))
         for name in dotted_key.split("."):
             if not isinstance(node, Mapping) or name not in node:
@@ -423,5 +431,6 @@ def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _first_lines(error: Exception) -> str:
     """Return the first two lines of an error's text as one line."""
+    # Hydra and OmegaConf explain themselves at length.
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines[:2])

@@ -148,6 +148,7 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
 @cache
 def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
     """Return a model of some groups of a whole configuration."""
+    # Fields keep their types, but none is optional: a stage needs all groups that it names.
     fields: dict[str, Any] = {
         key: (whole_model.model_fields[key].rebuild_annotation(), ...) for key in keys
     }

@@ -45,6 +45,7 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
     except ProductError as error:
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    # Registered methods that are not listed may still be asked for by name.
     return (*listed, *(kind for kind in known() if kind not in listed))
 
 
@@ -61,5 +62,6 @@ def oracles_last(names: Iterable[str]) -> list[type[Method]]:
 
     Within both kinds the order is that of the configuration.
     """
+    # `sorted` keeps the order of equals.
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

@@ -54,6 +54,7 @@ class Grid(Group):
     Every star lies at one of them. Angles are from the optical axis.
     """
 
+    # Null values are derived in `consistency`.
     points: Count = Field(description="Field points along a side")
     spacing_deg: Positive = Field(
         description="Distance of neighbouring field points; null: the outermost lie at edge_deg"
@@ -143,6 +144,7 @@ class WholePeriodOptics(Group):
 class Optics(WholePeriodOptics):
     """Numerical settings of the propagation by matrix products, which computes stamps only."""
 
+    # Both give the same results but for rounding.
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
@@ -203,6 +205,7 @@ class Calibration(Group):
 class Benchmark(Group):
     """Run time against error; needs a quiet machine."""
 
+    # A machine is never quite without other work.
     repeats: Count = Field(description="Timings of every point; the median is reported")
     stamps: Count = Field(description="Stamps per timing of a kernel")
     peers: bool = Field(description="Time POPPY beside our kernels")
@@ -221,6 +224,7 @@ class Bounds(Group):
     A larger bank has stars more like a test star, and takes more time and memory.
     """
 
+    # Accuracy of the bounds against time and memory.
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
     position_stars: Count = Field(
         description="Further draws, which only the bound uses that is given the field"
@@ -317,6 +321,7 @@ def whole_config() -> type[Config]:
 @cache
 def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
     """Return the model with the settings of some methods; it is made only once."""
+    # Settings of methods and of the networks of scene 3; none has a default of its own.
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }

@@ -29,6 +29,7 @@ Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 class Axis(Group):
     """Setting that a sweep varies: listed values, named sets of values, or a range."""
 
+    # One of three forms: values, choices or a range.
     values: Annotated[list[Value], Field(min_length=1)] | None = Field(
         default=None, description="Listed values; a bare list means the same"
     )
@@ -39,6 +40,7 @@ class Axis(Group):
     high: Finite | None = Field(default=None, description="Upper end of a range")
     log: bool = Field(default=False, description="A range that is even in the logarithm")
     integer: bool = Field(default=False, description="A range of whole numbers")
+    # What the value of the axis changes.
     keys: Annotated[list[str], Field(min_length=1)] | None = Field(
         default=None, description="Configuration keys that get the value; default: the axis' name"
     )
@@ -65,6 +67,7 @@ class Axis(Group):
         form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
         if form_count != 1 or end_count == 1:
             raise ValueError("needs either values, or choices, or low and high")
+        # Keys that only one of the forms has.
         if self.choices is not None and (self.keys or self.repeat):
             raise ValueError("choices contain their keys: remove keys and repeat")
         if self.low is not None and self.high is not None:
@@ -99,6 +102,7 @@ class Axis(Group):
         if self.choices is not None:
             return dict(self.choices[str(value)])
         if self.repeat is not None:
+            # A list of equal numbers, such as one width for all layers.
             assert not isinstance(value, list)
             return dict.fromkeys(self.keys or [name], [value] * self.repeat)
         return dict.fromkeys(self.keys or [name], value)
@@ -135,6 +139,7 @@ class Sweep(Group):
     @classmethod
     def check_name(cls, name: str) -> str:
         """Require a method that stores a model, or a network of scene 3."""
+        # Methods without a file have nothing to train.
         stored = (method_class.name for method_class in registered() if method_class.storage)
         models = (*stored, *swept_networks())
         if name not in models:
@@ -166,6 +171,7 @@ class Sweep(Group):
         # A grid has as many points as combinations.
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
+        # Methods restore the stars of a dataset; networks of scene 3 have states.
         if (self.model in swept_networks()) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
         if self.choice == Alignment.choice and self.dataset is not None:
@@ -183,6 +189,7 @@ class Sweep(Group):
     @model_validator(mode="after")
     def check_axes(self) -> Sweep:
         """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
+        # The summary has these columns beside those of the axes.
         columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
             if name in columns or name.startswith(("validation_", "test_")):

@@ -123,6 +123,7 @@ def read_states(
     ProductError
         If the product is missing or damaged, or does not agree.
     """
+    # Stamps are (n, F, d, d), states (n, 4) in units of their range.
     product = read_product(path, "alignment_states", ("states", "stamps"))
     if expected_config is not None:
         require(path, product.config, Alignment.stamp_keys, expected_config, owner)
@@ -191,6 +192,7 @@ def _geometry(config: Config) -> dict[str, Column]:
     """
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
+    # Noll's numbering of the Zernike polynomials; piston and tilt do not blur a centred stamp.
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
     return {
         "fields": Column(fields, "rad", "field angle (x, y)"),
@@ -228,6 +230,7 @@ def telescope(
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
     # Defocus (Noll 4) of the aligned telescope in each field; the first field is the centre.
     defocus = coefficients[:, 0, noll == 4][:, 0]
+    # Width of a pixel in λ/D: up to 1/2 an image is sampled without aliasing.
     pixel = config.telescope.pixel
     rows = [
         ("pixel", pixel, "lambda/D"),
@@ -249,5 +252,6 @@ def telescope(
             (f"peak_greatest_{name}", peak.max(), "1"),
             (f"stamps_{name}", energy.size, "1"),
         ]
+    # One row for each quantity, with its unit.
     table = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
     write_csv(out, table, digits=6)

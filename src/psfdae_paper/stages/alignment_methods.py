@@ -162,6 +162,7 @@ def train_network(
     # Settings that describe the network to those who load it; `network_predictor` reads them.
     fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
+    # Kind of the network, and whether estimates are averaged over mirror images.
     described |= {"network": settings.network, "mirrors": settings.mirrors}
 
     def begin(attempt: int) -> NetworkTraining:
@@ -171,6 +172,7 @@ def train_network(
 
     # A checkpoint is resumed only if settings and stamps are the same.
     with progress(settings.epochs) as report:
+        # The fingerprint holds settings and stamps, but not what cannot change the result.
         identity = fingerprint(described | deciding(config), data.stamps)
         training = train(begin, checkpoint, identity, report)
     # Weights first: a folder with a configuration is complete.
@@ -295,10 +297,12 @@ def network_predictor(
     trained = from_tree(path, described, training, make=partial(parse_settings, NetworkTrain))
     kind = NETWORKS[trained.network]
     settings = from_tree(path, described, trained.network, make=partial(parse_settings, kind))
+    # Threads as configured: their number can change the last digits.
     torch.set_num_threads(config.evaluation.threads)
     model = with_weights(
         lambda: empty_network(settings, fields, side), folder / Aligner.weights_file
     )
+    # The field points are a centre and a circle of points; a mirror image permutes these.
     mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
@@ -335,6 +339,7 @@ def estimate(
             stamps = denoise(dae, config, noisy) if method.denoised else noisy
             estimates[row, column] = predict[method.network](stamps)
             seconds = time.perf_counter() - started
+            # Seconds for all states of the set, with the DAE if there is one.
             rows.append((test_set, level, method.name, seconds, len(stamps)))
     # True states go along: products of one test are compared by them.
     columns = {
@@ -395,6 +400,7 @@ def fit_alignment_method(
     limit_threads(1)
     # States to fit, states for the emulator, the model of the wavefront, and the network.
     product, large_product = read_states(states, config), read_states(train, config)
+    # Zernike coefficients of a state, quadratic in its four numbers.
     wavefronts = read_model(model, product.config, states)
     predict = network_predictor(network, product, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
@@ -432,6 +438,7 @@ def fit_alignment_method(
         # The next method, which has more parameters, starts from this estimate.
         start = final_fit.parameters[:, :4]
         fits["estimates"].append(final_fit.parameters[:, :4])
+        # Deviance −2 ln L, with ln L = 0 for a perfect fit.
         fits["deviance"].append(-2.0 * final_fit.height)
         fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
         fits["converged"].append(final_fit.converged)

@@ -169,6 +169,7 @@ def tables(
     """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
+        # A bound must be that of the telescope whose states are tabulated.
         bound_config = read_product(path, "alignment_bound", ()).config
         require(path, bound_config, Alignment.stamp_keys, product.config, states)
     unit = product["unit"]
@@ -242,6 +243,7 @@ def time_table(
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
     # Seconds and states of each method, over all test sets and noise levels.
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
+    # Seconds per state from sums, in which large sets have their weight.
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
     # An estimate's time, and that of the trainings on which it rests.
@@ -292,6 +294,7 @@ def predicted(
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
+    # All products have the same states, so that the last truth is that of all.
     write_png(alignment_figures.predicted_against_true(truth, by_method), out)
 
 
@@ -373,6 +376,7 @@ def _stamps_of_multiples(
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
     model = fit_quadratic(design_states(), tracer(design_states()))
+    # A moderate misalignment inside the range, for which the twin is inside, too.
     tilt = np.array([(0.20, 0.25)])  # x, y in units of the range
     state = np.concatenate([coma_free_decentre(model, tilt), tilt], axis=1)[0]
     return state, operator(tracer(multiples[:, None] * state))[0]
@@ -388,6 +392,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
         matrix = np.full((4, 4), np.nan)
+        # A row has one pair of parameters; the matrix is symmetric.
         pairs = rows[rows.method == method.name]
         for pair, value in zip(pairs.pair, pairs.correlation, strict=True):
             a, b = (alignment_tables.PARAMETERS.index(name) for name in pair.split("-"))

@@ -33,9 +33,6 @@ from psfdae_paper.stages.evaluate import Models
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
 
-MAX_SHIPPED_BYTES = 5_000_000
-"""Largest size of the bundle that comes with the package."""
-
 
 @command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
 def bundle(
@@ -125,6 +122,7 @@ def ship(
     for path in bundle:
         errors[path] = _validation_error(read_bundle(path), product, config)
         print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
+    # The smallest error wins; the others are not shipped.
     source = min(errors, key=errors.__getitem__)
     packed = read_bundle(source)
     # The stated half-widths must contain 68 ± 5 % of the errors at every noise level.
@@ -138,9 +136,9 @@ def ship(
     # Its stars are simulated: it has the licence of the package.
     info = packed.info.model_copy(update={"name": SHIPPED, "licence": "MIT"})
     # The package must stay small: the bundle is in every installation.
-    size = source.stat().st_size
-    if size > MAX_SHIPPED_BYTES:
-        raise BundleError(f"{source}: {size} bytes, at most {MAX_SHIPPED_BYTES}")
+    size, largest_size = source.stat().st_size, 5_000_000
+    if size > largest_size:
+        raise BundleError(f"{source}: {size} bytes, at most {largest_size}")
     shipped = out / f"{SHIPPED}{SUFFIX}"
     write_bundle(replace(packed, info=info), shipped)
     print(shipped)
@@ -153,6 +151,7 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     # A method that needs no validation stars was fitted to them, too: fit it without them.
     if not method_class.needs.validation:
         independent_fit = fit_apart(method_class, data, np.arange(len(data.images)), config)
+        # It may be as large as the bundle, so that it has as many fine axes.
         size = sum(array.nbytes for array in bundle.weights.values())
         info = bundle.info
         weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
@@ -163,8 +162,10 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     log_errors = []
     for level in data.levels:
         rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)
+        # Photon noise of star and sky.
         stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
         prediction = model.predict(stamps, gain=1.0)
+        # The prediction has the flux of the star.
         normalised_psf = prediction.psf / prediction.flux[:, None, None]
         log_errors.append(np.log(np.nanmean(np.square(normalised_psf - truth))))
     return float(np.exp(np.mean(log_errors)))

@@ -62,10 +62,17 @@ def scan(
     for r0 in r0_values:
         source = _source(config, r0)
         for scale in config.calibration.pixel_scales_arcsec:
-            images = _images(config, source, scale)
+            # Noise-free, framed, normalised stars at this pixel scale. The search for the brightest
+            # pixel covers the same angle as at the configured scale.
+            telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
+            search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
+            propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
+            images = normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
             for row in rows:
+                # Noise with the MSE that the paper prints for this column.
                 noisy = _at_published_mse(images, row, config)
                 ranges = config.calibration.data_ranges
+                # SSIM of each star at each dynamic range, shape (range, star).
                 similarity = np.atleast_2d(ssim(noisy, images, *ranges))
                 table += [
                     {
@@ -111,25 +118,16 @@ class _CachedWavefronts:
 def _source(config: Config, r0: float) -> WavefrontSource:
     """Return wavefronts of the scanned stars, or of all fields behind turbulence of this r0."""
     if not isinstance(config.wavefront, VonKarman):
+        # Scene 1: stars at random fields, with aberrations of their own.
         count, fields = config.calibration.stars, config.grid.points**2
         return star_wavefronts(
             config, assign_fields(count, fields, stream(config.seed, "scan", "field"))
         )
+    # Scene 2: one wavefront per field, behind turbulence of this strength.
     wavefront = config.wavefront.model_copy(update={"r0_m": r0})
     return _CachedWavefronts(
         template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
     )
-
-
-def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray:
-    """Return noise-free, framed, normalised stars at another pixel scale (arcsec).
-
-    The search for the brightest pixel covers the same angle as at the configured scale.
-    """
-    telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
-    search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
-    propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
-    return normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
 
 
 def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
@@ -138,6 +136,7 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
     The noise of λ = `row.noise_level` has the variance (κλ)² plus that of the star's photons.
     """
     level, background = row.noise_level, config.noise.background_photons
+    # The constant κ whose noise has the published MSE on these stars.
     kappa = kappa_of_mse(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
     return NoiseModel(kappa, background).draw(images, level, rng)

@@ -111,6 +111,7 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
                 "tables/psf_metrics.csv in it, hence neither a trained network nor a folder of "
                 "results"
             )
+    # A network that only one of the results has cannot be compared.
     common = sorted(set.intersection(*networks))
     if not common:
         raise ComparisonError(f"{', '.join(map(str, folders))}: no network in common")
@@ -126,6 +127,7 @@ def errors_of(folder: Path) -> Path:
     table = folder / "evaluation.parquet"
     if table.is_file():
         return table
+    # Of the workflow: METHOD/DATASET/RUN and evaluation/DATASET/RUN.parquet.
     absolute = folder.resolve()
     if len(absolute.parents) < 3:
         raise ComparisonError(f"{folder}: no evaluation.parquet in it")
@@ -137,6 +139,7 @@ def read_run(folder: Path, errors: Path) -> Run:
     # Settings and training are beside the network, its errors in the evaluation.
     config = read_yaml(folder / CONFIG)
     columns = ("epoch", "train_mse", "validation_mse", "seconds")
+    # Some cells may be empty, hence text that is converted below.
     history = read_table(folder / HISTORY, *columns, dtype=str)
     try:
         table = pd.read_parquet(errors, page_checksum_verification=True)
@@ -158,7 +161,9 @@ def describe(first: Run, second: Run) -> str:
         difference = f"{row.difference:+.3g} ± {row.stderr:.2g}{scatter}"
         rows.append((*row[:5], difference, row.sigmas, row.verdict))
     headers = ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"]
+    # What a training reached, and how long it took.
     curves = [comparison.training_summary(run.history) for run in (first, second)]
+    # Errors on the same noisy images are paired, which removes most of their scatter.
     paired = comparison.same_noisy_stars(first.errors, second.errors)
     pairing = "star by star on the same noisy images" if paired else "as independent samples"
     references = {run.config.get("reference", "") for run in (first, second)}
@@ -192,6 +197,7 @@ def describe_tables(first: Path, second: Path) -> str:
     """Return as Markdown the mean errors of two runs that differ by more than seeds do."""
     first_errors, second_errors = read_errors(first), read_errors(second)
     rows, order = comparison.compare_tables(first_errors, second_errors, comparison.seed_scatter())
+    # The paper's methods by increasing error, as it names them.
     looks = [method(name).look for name in comparison.PAPER_ORDER]
     names = " < ".join(look.paper[1] for look in looks if look.paper)
     verdict_texts = {

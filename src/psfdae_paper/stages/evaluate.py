@@ -93,6 +93,7 @@ def evaluate(
             rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)
             summary += rows
             stars_table.append(per_star_rows)
+    # Means with standard errors, and every star.
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
@@ -165,6 +166,7 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
 
     The scatter, where it was measured, is that of a repeated fit with other random numbers.
     """
+    # The standard error of a mean over stars does not hold the scatter between seeds.
     table = comparison.with_seed_stderr(
         read_tables(evaluations, COLUMNS), comparison.seed_scatter()
     )
@@ -181,6 +183,7 @@ def held_out(
     PER_STAR are the evaluations' Parquet files of both splits.
     """
     columns = [*comparison.HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    # Errors in the same fields, as seen in training and as held out.
     parts = [pd.read_parquet(path, columns=columns) for path in per_star]
     write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 

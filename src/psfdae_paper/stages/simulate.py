@@ -80,6 +80,7 @@ def simulate(
         image, catalogue = folder / "image.fits", folder / "stars.csv"
         write_image(config, fields, image_snr, seed, image, catalogue)
         names += ["image.fits", "stars.csv"]
+    # Warnings come last, where they are read.
     for line in warnings:
         print(f"psfdae: {line}", file=sys.stderr)
     telescope = config.telescope
@@ -160,6 +161,7 @@ def stamp_warnings(
     warnings = []
     energy, side = fields.energy, config.framing.stamp_px
     if energy.min() < enough_light:
+        # The field with the least light decides which stamp suffices.
         worst_field = int(energy.argmin())
         x, y = np.rad2deg(fields.field[worst_field])
         # Stamps up to four times as wide are tried.
@@ -194,6 +196,7 @@ def _sufficient_stamp_px(
 
     None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
     """
+    # One propagation on the largest stamp; pixels of smaller ones are the same.
     framing = config.framing.model_copy(update={"stamp_px": max_px})
     source = template_wavefronts(config)
     try:
@@ -323,6 +326,7 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
     """
+    # Sizes and numbers of stars as asked for; all else as the recipe says.
     recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulate_field(recipe, seed)
     x, y = field.centroid.T

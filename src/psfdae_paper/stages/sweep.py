@@ -89,6 +89,7 @@ def sweep_point(
     """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
+    # A misspelt folder, or overrides other than those of the plan.
     if out.name not in plan.points:
         raise SweepError(f"{out}: sweep {name} has no point {out.name}")
     entry = plan.points[out.name]
@@ -96,6 +97,7 @@ def sweep_point(
     roles = {"states", "validation", "test"} if sweep.model in swept_networks() else {"stars"}
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {sweep.model} needs {', '.join(sorted(roles))}")
+    # Networks of scene 3 have no dataset; tables have their name in its place.
     dataset = sweep.dataset or sweep.model
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
     trial = None
@@ -159,6 +161,7 @@ def point(
     for name in (*training.files, *task.tables.values(), "cost.json", "result.json"):
         (task.folder / name).unlink(missing_ok=True)
     outcome = _train(training)
+    # Metrics and settings only: what a point cost is in a file of its own.
     result = {
         "point": task.folder.name,
         "slot": trial.slot if trial else None,

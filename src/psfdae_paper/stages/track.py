@@ -46,9 +46,6 @@ SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 LIVE = "live"
 """Experiment of trainings that are under way; the import of the finished run deletes them."""
 
-PARENT = "mlflow.parentRunId"
-"""Tag by which MLflow shows a run as a part of another."""
-
 
 class TrackingError(Error, RuntimeError):
     """The MLflow database cannot be used."""
@@ -101,6 +98,7 @@ def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt
         If the database cannot be used.
     """
     uri = server()
+    # Tags that tell with which program the runs were imported.
     import_tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
     # MLflow's id of each run, and what was done with it.
     outcomes: list[tuple[str, str]] = []
@@ -178,7 +176,8 @@ def _import(
             experiments[run.experiment] = experiment_of(client, run.experiment, uri, database)
         tags = {**import_tags, **tags_of(run)}
         if run.parent:
-            tags[PARENT] = imported[run.parent]
+            # MLflow shows a run with this tag as a part of another.
+            tags["mlflow.parentRunId"] = imported[run.parent]
         outcome = import_run(client, experiments[run.experiment], run, tags)
         imported[run.source] = outcome[0]
         yield outcome
@@ -267,7 +266,7 @@ def import_run(
     # A run that is there with the same files is left alone but for tags that others decide.
     if unchanged:
         run_id, action = str(unchanged[0].info.run_id), "unchanged"
-        for key in ("superseded", PARENT):
+        for key in ("superseded", "mlflow.parentRunId"):
             # A parent that has new files is another run.
             if key in tags and unchanged[0].data.tags.get(key) != tags[key]:
                 client.set_tag(run_id, key, tags[key])
@@ -329,6 +328,7 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
 
 def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
     """Log metrics as far as they are finite; MLflow takes 1000 at once."""
+    # A training that diverged has infinite errors, which no database takes.
     finite = [metric for metric in metrics if math.isfinite(metric.value)]
     for i in range(0, len(finite), 1000):
         client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
@@ -339,12 +339,14 @@ def tags_of(run: TrackedRun) -> dict[str, str]:
 
     A run with other settings that takes the place of this one sets `superseded` to "true".
     """
+    # The preset is a tag of the whole import.
     slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
     return {**slot, **run.tags, "config_hash": run.config_hash, "superseded": "false"}
 
 
 def ours_to_explain(error: Exception) -> bool:
     """Return True if an error comes from the database, the server or the disk, not from a bug."""
+    # MLflow raises its own errors, those of its database and those of files.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 

@@ -167,6 +167,7 @@ def measure_images(
     dict
         See `Measured.metrics`.
     """
+    # Stars and their split, as in the main workflow.
     product = read_stars(task.data["stars"], task.reference)
     parts = split_stars(product, task.split, config)
 
