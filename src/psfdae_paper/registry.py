@@ -59,6 +59,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     # The model becomes a version of the models of its dataset and method.
     if run.fit is not None:
         if not client.search_registered_models(f"name = '{name}'"):
+            # MLflow lists it beside the name.
             description = f"PSFs of stamps of {run.dataset}, restored by {run.kind}."
             client.create_registered_model(name, description=description)
         tags = {"split": run.split, "reference": run.reference}

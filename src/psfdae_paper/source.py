@@ -44,6 +44,7 @@ def source_hash(*names: str) -> str:
     ValueError
         If there is no such command, module or file.
     """
+    # A command stands for the module of its function.
     commands = command_modules()
     queue = [commands[name][0] if name in commands else name for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
@@ -85,7 +86,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
     program_folder = path.parent if name.endswith(".py") else None
     # Code and tables together.
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    return digest, [*_imported(tree, program_folder)]
+    return digest, [*imported_modules(tree, program_folder)]
 
 
 def _path(module: str) -> Path | None:
@@ -96,7 +97,7 @@ def _path(module: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
+def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
     """Yield the modules of the packages that a module imports, and files beside a program."""
     # Nodes below annotations of arguments and variables, return types and decorators: names that
     # only these use decide no result.

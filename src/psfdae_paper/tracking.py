@@ -25,12 +25,7 @@ from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.settings import leaves
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    Aligner,
-    swept_networks,
-    trained_networks,
-)
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_networks, trained_networks
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered

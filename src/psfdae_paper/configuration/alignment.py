@@ -39,10 +39,7 @@ class Alignment(Group):
         *("alignment.defocus_m", "alignment.field_radius_deg", "alignment.field_points"),
         "alignment.highest_zernike",
     )
-    stamp_keys: ClassVar = (
-        *wavefront_keys,
-        *("telescope.pixel_scale_arcsec", "alignment.stamp_px"),
-    )
+    stamp_keys: ClassVar = (*wavefront_keys, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
 
     # The paper's ranges (section 3.3).
     decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
@@ -64,6 +61,7 @@ class Alignment(Group):
     field_points: Annotated[int, Field(ge=1, le=64)] = Field(
         8, description="Field points on the circle"
     )
+    # Terms of higher order are small in this telescope; few terms make the model fast.
     highest_zernike: Annotated[int, Field(ge=11, le=28)] = Field(
         22, description="Highest Noll index of the wavefront"
     )
@@ -81,6 +79,7 @@ class Alignment(Group):
     grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
         5, description="Levels per degree of freedom of the grid of states"
     )
+    # As many states as the grid has, but drawn at random.
     test_states: Count = Field(625, description="Uniform states of the independent test set")
     train_states: Count = Field(12000, description="Uniform states of the large training set")
 
@@ -105,6 +104,7 @@ class Cnn(Group):
     strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
         [2, 1, 2, 1, 2], description="Strides of the convolutions"
     )
+    # A neuron that is never active would not learn otherwise.
     leak: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.01, description="Slope of the leaky ReLU below 0"
     )
@@ -118,6 +118,7 @@ class Cnn(Group):
         # Each convolution has a width, a kernel and a stride.
         for name in ("kernels", "strides"):
             values = getattr(self, name)
+            # A list that is too short would drop layers.
             if len(values) != len(self.widths):
                 raise ValueError(
                     f"{name} = {values}: {len(self.widths)} widths need as many {name}, "
@@ -172,6 +173,7 @@ class NetworkTrain(Group):
         description="Draws of each field's noise where the DAE's output is learnt, whose "
         "computation takes long; noisy stamps get new noise in every epoch",
     )
+    # These change no result but by rounding.
     threads: Count = Field(1, description="Threads of the training")
     checkpoint_seconds: CheckpointSeconds = Field(
         20.0, description="Least time between checkpoints; repeats nothing"

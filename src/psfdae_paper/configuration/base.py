@@ -42,11 +42,13 @@ def _folder(environment_value: str) -> Path:
 
     A wheel has a copy of the configuration in the package; in the source tree it is beside `src`.
     """
+    # The folder psfdae_paper, wherever it is.
     package = Path(__file__).resolve().parents[1]
     # Of an installed package, or of a source tree; the latter is named if there is neither.
     candidates = (package / "config", package.parents[1] / "config")
     folder = next((path for path in candidates if path.is_dir()), candidates[-1])
     folder = Path(environment_value or folder)
+    # A folder without it would give errors of Hydra that name no file.
     if not (folder / "config.yaml").is_file():
         raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
     return folder.resolve()

@@ -47,6 +47,7 @@ class Groups:
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
         # The workflow passes one file; a user writes words such as noise.kappa=4.98.
+        # Some commands read other groups with other options, such as `fit METHOD`.
         reads = self.names(options)
         if file is not None:
             return load_settings(file, reads)

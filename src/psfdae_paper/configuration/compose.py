@@ -15,7 +15,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -72,6 +73,7 @@ def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
         resolved: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
+    # A root file that is a list or a number.
     if not isinstance(resolved, dict):
         raise ConfigError(f"{folder / 'config.yaml'}: must be a mapping")
     return resolved
@@ -103,6 +105,7 @@ def _primary(folder: Path) -> str:
     method_defaults = [
         {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
     ]
+    # From the weakest to the strongest.
     all_defaults = ["class_defaults", *method_defaults, *defaults]
     # Hydra composes in the order of the list; a later entry replaces values of an earlier one.
     store = ConfigStore.instance()
@@ -183,7 +186,6 @@ def _require_known_groups(tree: Mapping[str, Any]) -> None:
 
 
 Model = TypeVar("Model", bound=Group)
-Checked = TypeVar("Checked")
 
 
 def load_file(model: type[Model], path: Path) -> Model:
@@ -204,15 +206,15 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    return _with_file_name(
-        path, lambda: parse_settings(model, tree if isinstance(tree, dict) else {})
-    )
+    with _named_in_errors(path):
+        return parse_settings(model, tree if isinstance(tree, dict) else {})
 
 
-def _with_file_name(path: Path, check: Callable[[], Checked]) -> Checked:
-    """Return the result of a check; each line of its ConfigError begins with the file's name."""
+@contextmanager
+def _named_in_errors(path: Path) -> Iterator[None]:
+    """Begin each line of a ConfigError with the name of the file that is checked."""
     try:
-        return check()
+        yield
     except ConfigError as error:
         # An error may have several lines, one for each key.
         lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
@@ -250,7 +252,8 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     # A file that is no mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
     # All groups of the file are checked: one that the stage does not read is refused.
-    return _with_file_name(path, lambda: _checked(reads, groups))
+    with _named_in_errors(path):
+        return _checked(reads, groups)
 
 
 def write_settings(
@@ -284,6 +287,7 @@ def write_settings(
     """
     import yaml
 
+    # Checked values in the order of the classes.
     settings = part(reads, stage_tree(reads, tree)).model_dump()
     # The name is a hash of what can change the result: another name makes Snakemake repeat a job.
     serialised = json.dumps(decisive_settings(settings), sort_keys=True)
@@ -314,6 +318,7 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
 
 def _checked(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
     """Return checked groups; type checkers take them for a whole `Config`, as stages state it."""
+    # `stage_model` makes a class of these groups alone.
     return cast(Config, parse_settings(stage_model(reads, whole_config()), groups))
 
 
@@ -329,6 +334,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     """
     # Values that are null in the files because they follow from other groups.
     try:
+        # Edge and spacing of fields, and search distances in pixels.
         tree = with_derived_values(tree)
     except ValueError as error:
         raise ConfigError(str(error)) from None
@@ -386,6 +392,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
         key = _key(override)
         keys = [] if override.startswith("+") and not override.startswith("++") else [key]
         keys += [key.rpartition(".")[0]] if override.startswith("+") and "." in key else []
+        # The first key that any dataset has decides.
         for key in keys:
             if has_key(choice, key):
                 return True

@@ -74,6 +74,7 @@ class Consistent(Group):
         """Refuse a jitter of aberrations for stars that have no random aberrations."""
         # Groups that a stage does not read are absent, and telescopes may have no aberrations.
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
+        # In waves RMS; own telescopes alone have it.
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
         if stars is None or not jitter:
             return self
@@ -88,6 +89,7 @@ class Consistent(Group):
     @model_validator(mode="after")
     def check_scene_groups(self) -> Consistent:
         """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
+        # Both groups have keys that only one kind of dataset needs.
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
         # Groups that a stage does not read are absent, and are not checked.
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
@@ -114,6 +116,7 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
         The same groups with `grid.edge_deg` and `grid.spacing_deg` in degrees, and
         `framing.search_px` and `stars.search_px` in pixels.
     """
+    # Copies of the groups, in which nulls are replaced.
     derived = {
         name: dict(group) if isinstance(group, Mapping) else group for name, group in tree.items()
     }
@@ -140,6 +143,7 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
         # which any distance is right; `points` that are no integer are refused by the next check.
         edge, points = grid.get("edge_deg"), grid.get("points")
         if isinstance(edge, int | float):
+            # n points have n − 1 intervals.
             intervals = max(points - 1, 1) if isinstance(points, int) else 2
             grid["spacing_deg"] = 2.0 * edge / intervals
     return derived

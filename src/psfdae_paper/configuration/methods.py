@@ -43,6 +43,7 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
             raise ProductError("methods: must be a list of different names")
         listed = tuple(method(str(name)) for name in names)
     except ProductError as error:
+        # Errors of the file name it already; those of a method do not.
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     # Registered methods that are not listed may still be asked for by name.

@@ -35,13 +35,7 @@ from psfdae.settings import (
 from psfdae.telescope.aberrations import Prescription, Seidel
 from psfdae.telescope.settings import AnyTelescope
 from psfdae_paper.configuration.aligners import trained_networks
-from psfdae_paper.configuration.alignment import (
-    Alignment,
-    Cnn,
-    Fit,
-    NetworkTrain,
-    Perceptron,
-)
+from psfdae_paper.configuration.alignment import Alignment, Cnn, Fit, NetworkTrain, Perceptron
 from psfdae_paper.configuration.base import SearchDistance, search_distance
 from psfdae_paper.configuration.consistency import Consistent
 from psfdae_paper.configuration.methods import registered
@@ -80,6 +74,7 @@ class Stars(Group):
     """
 
     name: Name = Field(description="Names the file of the stars")
+    # Stars of all splits together.
     count: Count = Field(description="Number of stars")
     # The paper's 10 and 50 %; 0 makes every star its template.
     aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
@@ -127,6 +122,7 @@ class WholePeriodOptics(Group):
     precision: Literal["complex64", "complex128"] = Field(
         description="Precision of the propagation"
     )
+    # More per batch need more memory.
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(
         description="Batches in parallel, each with one thread of linear algebra"
@@ -148,7 +144,7 @@ class Optics(WholePeriodOptics):
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
-def _optics(tree: object) -> object:
+def checked_optics(tree: object) -> object:
     """Check settings of the optics by the class that has their keys.
 
     Scene 3 propagates the whole period of the image and has no choice of a backend.
@@ -162,7 +158,7 @@ if TYPE_CHECKING:
     # Every dataset with a scene has it (`Consistent`); scene 3 reads the base class only.
     AnyOptics = Optics
 else:
-    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
+    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(checked_optics)]
 
 
 class Dataset(Group):
@@ -172,6 +168,7 @@ class Dataset(Group):
     """
 
     name: Name = Field(description="Names folders, tables and figures")
+    # Each combination of split and reference is a training.
     splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
         description="Test stars of all fields, or of fields never seen in training"
     )
@@ -197,6 +194,7 @@ class Calibration(Group):
     r0_m: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Fried parameters scanned (scene 2; scene 1 has none)"
     )
+    # The SSIM has constants in proportion to the square of the dynamic range.
     data_ranges: Annotated[list[Positive], Field(min_length=2)] = Field(
         description="SSIM dynamic ranges scanned, ascending"
     )
@@ -209,6 +207,7 @@ class Benchmark(Group):
     repeats: Count = Field(description="Timings of every point; the median is reported")
     stamps: Count = Field(description="Stamps per timing of a kernel")
     peers: bool = Field(description="Time POPPY beside our kernels")
+    # From these the growth of the costs is read.
     star_counts: Annotated[list[Count], Field(min_length=2)] = Field(
         description="Numbers of stars at which time, memory and disk are measured, ascending"
     )
@@ -226,6 +225,7 @@ class Bounds(Group):
 
     # Accuracy of the bounds against time and memory.
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    # Stars of one field are few in a bank for all fields.
     position_stars: Count = Field(
         description="Further draws, which only the bound uses that is given the field"
     )

@@ -36,6 +36,7 @@ class Axis(Group):
     choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = Field(
         default=None, description="Name of each choice, and the keys with values that it stands for"
     )
+    # Both ends belong to the range.
     low: Finite | None = Field(default=None, description="Lower end of a range")
     high: Finite | None = Field(default=None, description="Upper end of a range")
     log: bool = Field(default=False, description="A range that is even in the logarithm")
@@ -71,12 +72,14 @@ class Axis(Group):
         if self.choices is not None and (self.keys or self.repeat):
             raise ValueError("choices contain their keys: remove keys and repeat")
         if self.low is not None and self.high is not None:
+            # A range needs a length, and a logarithmic one numbers above 0.
             if not self.low < self.high:
                 raise ValueError(f"low = {self.low:g}: must be below high = {self.high:g}")
             if self.log and self.low <= 0:
                 raise ValueError(f"low = {self.low:g}: must be above 0 on a logarithmic range")
             if self.integer and not (self.low.is_integer() and self.high.is_integer()):
                 raise ValueError(f"low = {self.low:g}, high = {self.high:g}: must be whole numbers")
+        # Listed values say by themselves what they are.
         elif self.log or self.integer:
             raise ValueError("log and integer belong to a range, low and high")
         return self
@@ -194,8 +197,10 @@ class Sweep(Group):
         for name, axis in self.space.items():
             if name in columns or name.startswith(("validation_", "test_")):
                 raise ValueError(f"space.{name}: is a column of the summary; choose another name")
+            # A range has no end of values.
             if self.kind == "grid" and not axis.options:
                 raise ValueError(f"space.{name}: a grid needs values or choices, not a range")
+            # A list of lists is no value of a key.
             if axis.repeat and any(isinstance(value, list) for value in axis.options):
                 raise ValueError(f"space.{name}: repeat needs single values, not lists")
         return self
@@ -214,6 +219,7 @@ class Sweep(Group):
                 raise ValueError(
                     f"{key}: a sweep of {self.model} may change {', '.join(self.varied)}"
                 )
+            # The later axis would win without a word.
             if keys.count(key) > 1:
                 raise ValueError(f"{key}: set more than once")
         return self

@@ -31,6 +31,7 @@ class VonKarman(Group):
     layer_strengths: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Fraction of the turbulence in each layer"
     )
+    # A layer is a sum of plane waves with random phases.
     waves: Annotated[int, Field(ge=16, multiple_of=8)] = Field(description="Plane waves per layer")
     remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
 
@@ -43,6 +44,7 @@ class VonKarman(Group):
                 f"layer_strengths = {self.layer_strengths}: one for each of the "
                 f"{len(self.layer_heights_m)} layer_heights_m"
             )
+        # Fractions of the whole turbulence; rounding of typed decimals is allowed.
         if abs(sum(self.layer_strengths) - 1.0) > 1e-6:
             raise ValueError(f"layer_strengths = {self.layer_strengths}: must add up to 1")
         return self

@@ -61,7 +61,8 @@ def model(
     # Few small arrays: threads would not pay.
     limit_threads(1)
     # 25 states of a central composite design determine all terms of the model.
-    tracer, design = _tracer(config), design_states()
+    tracer = StateTracer(config.telescope, config.prescription, config.alignment)
+    design = design_states()
     quadratic = fit_quadratic(design, tracer(design))
     # The grid, with other states, tests it: no wavefront may differ by more than the tolerance.
     grid = grid_states(config.alignment.grid_levels)
@@ -156,7 +157,8 @@ def states(
         count = alignment.test_states if kind == "uniform" else alignment.train_states
         state_set = uniform_states(count, stream(config.seed, "alignment", "states", kind))
     # Wavefronts by the quadratic model, or by rays; then stamps of all fields.
-    zernikes = quadratic(state_set) if quadratic else _tracer(config)(state_set)
+    wavefronts = quadratic or StateTracer(config.telescope, config.prescription, alignment)
+    zernikes = wavefronts(state_set)
     stamps, energy = AlignmentStamps(config.telescope, config.optics, alignment)(zernikes)
     columns = {
         "states": Column(state_set, "range", "decentre x, y and tilt x, y of the secondary"),
@@ -171,17 +173,6 @@ def states(
         **_geometry(config),
     }
     write_product(out, "alignment_states", columns, config.model_dump())
-
-
-def _tracer(config: Config) -> StateTracer:
-    """Return the ray trace of the configured telescope.
-
-    Raises
-    ------
-    MissingExtraError
-        If batoid is not installed.
-    """
-    return StateTracer(config.telescope, config.prescription, config.alignment)
 
 
 def _geometry(config: Config) -> dict[str, Column]:
@@ -224,6 +215,7 @@ def telescope(
     require(model, quadratic.config, Alignment.wavefront_keys, config)
     for product in sets.values():
         require(product.path, product.config, Alignment.stamp_keys, config)
+    # Arrays [field, term, Zernike], [state, field], [Zernike].
     coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
     # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:
     # its condition number says how well states can be separated.

@@ -37,12 +37,7 @@ from psfdae.rng import stream
 from psfdae.settings import deciding, parse_settings
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    Aligner,
-    aligners_of,
-    trained_networks,
-)
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of, trained_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
@@ -82,6 +77,7 @@ def train_dae(
     It learns to restore single stamps with noise of all levels to those without, and is applied
     to the stamps of a state before a network estimates the state.
     """
+    # Both sets must have stamps of the same telescope.
     grid_product = read_states(grid)
     large_product = read_states(train, grid_product.config, grid)
     # The DAE restores stamps one by one, whatever their state and field.
@@ -89,6 +85,7 @@ def train_dae(
     training = _single_stamps(grid_product["stamps"])
     validation = _single_stamps(large_product["stamps"][:100])
     images = np.concatenate([training, validation])
+    # Input and target are the same stamps: noise is drawn while it trains.
     data = TrainingSet(
         images=images,
         references=images,
@@ -147,6 +144,7 @@ def train_network(
     if ALIGNERS[kind].denoised != (dae is not None):
         denoised = [name for name in trained_networks() if ALIGNERS[name].denoised]
         raise click.UsageError(f"--dae goes with --kind {', '.join(denoised)}, and only with it")
+    # Every network has a group train_NAME.
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_states(states)
     if dae:
@@ -167,6 +165,7 @@ def train_network(
 
     def begin(attempt: int) -> NetworkTraining:
         """Start the training; every attempt starts alike."""
+        # Group of the network's layers: cnn or perceptron.
         network = getattr(config, settings.network)
         return training_of(network, data, settings, config.seed, kind)
 
@@ -295,6 +294,7 @@ def network_predictor(
     # It describes training and network, and is checked as settings are.
     training = f"train_{from_tree(path, described, 'name')}"
     trained = from_tree(path, described, training, make=partial(parse_settings, NetworkTrain))
+    # Class of the settings of its layers.
     kind = NETWORKS[trained.network]
     settings = from_tree(path, described, trained.network, make=partial(parse_settings, kind))
     # Threads as configured: their number can change the last digits.
@@ -330,14 +330,17 @@ def estimate(
     }
     # The same noisy stamps for all methods, with the time that each takes; λ = 0 is no noise.
     levels, learned = [0.0, *config.noise.levels], aligners_of("estimates")
+    # Array [λ, method, state, number].
     estimates = np.empty((len(levels), len(learned), *product["states"].shape))
     rows = []
     for row, level in enumerate(levels):
         noisy = noisy_test_states(config, product["stamps"], test_set, level)
         for column, method in enumerate(learned):
             started = time.perf_counter()
+            # Networks behind the DAE get its output.
             stamps = denoise(dae, config, noisy) if method.denoised else noisy
             estimates[row, column] = predict[method.network](stamps)
+            # With the time of the DAE, which is part of the method.
             seconds = time.perf_counter() - started
             # Seconds for all states of the set, with the DAE if there is one.
             rows.append((test_set, level, method.name, seconds, len(stamps)))
@@ -418,6 +421,7 @@ def fit_alignment_method(
         large_product["stamps"],
         config.fit,
     )
+    # The network's estimate is near enough to the maximum for Levenberg steps.
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
@@ -433,6 +437,7 @@ def fit_alignment_method(
         final_fit = best_fit
         if fast is not exact:
             final_fit = exact.maximise(best_fit.parameters, config.fit)
+        # None if all steps were exact.
         last_evaluations = final_fit.evaluations * (fast is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
@@ -455,6 +460,7 @@ def fit_alignment_method(
     }
     for name, text in about.items():
         unit = "range" if name == "estimates" else "1"
+        # Arrays [method, state, …].
         columns[name] = Column(np.array(fits[name]), unit, text)
     described = {**config.model_dump(), "test_set": test_set, "level": level}
     write_product(out, "alignment_fit", columns, described)

@@ -85,6 +85,7 @@ def read_results(
     """
     for product in products_of_one_test(estimates, fits, bounds):
         truth, test_set = product["states"], product.config["test_set"]
+        # A bound has covariances instead of estimates.
         is_bound = product.kind == "alignment_bound"
         # Names of the methods, and their values as an array [λ, method, state, ...].
         if is_bound:
@@ -178,6 +179,7 @@ def tables(
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         if is_bound:
             rows_by_table[errors] += alignment_tables.bound_rows(key, values, unit)
+            # Predicted correlations are those of the bound with flux and position known.
             if key["method"] == "cramer_rao":
                 rows_by_table[correlation] += alignment_tables.predicted_correlations(key, values)
         else:
@@ -189,6 +191,7 @@ def tables(
     # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
+        # A stable sort keeps the order of the parameters.
         frame = pd.DataFrame(table_rows).sort_values(
             ["test_set", "noise_level", "method"],
             key=lambda c: c.map(method_order.index) if c.name == "method" else c,
@@ -219,9 +222,11 @@ def alignment_paper_tables(
     for level in sorted(published("alignment").noise_level.unique()):
         if not np.isclose(measured.noise_level, level).any():
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
+        # Mean and variance of the absolute errors, as in the paper.
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
         write(f"{level:g}", alignment_tables.paper_errors(measured, level), title, digits)
+    # Correlations of signed errors between pairs of parameters.
     table = alignment_tables.paper_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
@@ -269,6 +274,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
+        # Noise is drawn for the whole set, so that these two have that of the tables.
         noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:2]
         rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(dae, config, noisy))]
     titles = [
@@ -309,6 +315,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         is_shown = ALIGNERS[key["method"]].is_drawn or key["method"] == "cramer_rao"
         if key["noise_level"] > 0 and is_shown:
+            # A bound gives the variance: E|x| = σ √(2/π) for a normal error.
             error = expected_abs_error(values) if is_bound else np.abs(values - truth)
             curves[key["noise_level"]][key["method"]] = (
                 alignment_figures.size_of(truth),
@@ -391,6 +398,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
+        # Pairs that the paper does not print stay empty.
         matrix = np.full((4, 4), np.nan)
         # A row has one pair of parameters; the matrix is symmetric.
         pairs = rows[rows.method == method.name]

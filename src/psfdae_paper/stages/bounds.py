@@ -17,13 +17,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.files import (
-    ProductError,
-    read_product,
-    write_csv,
-    write_parquet,
-    write_product,
-)
+from psfdae.files import ProductError, read_product, write_csv, write_parquet, write_product
 from psfdae.methods import method
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.options import File
@@ -96,6 +90,7 @@ def bounds(
     require(templates, framed.config, STATIC, config)
     # The static PSFs with all centring errors that a star may have.
     static = jittered_templates(framed["psf"], config.framing.jitter_px)
+    # Rows are collected in one place, whichever bounds a dataset has.
     bound = tables.Tables(dataset, bounded_stars(config, product))
     # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
@@ -103,6 +98,7 @@ def bounds(
     elif bank is None:
         raise ProductError(f"{stars}: the stars have random aberrations, a bank is needed")
     else:
+        # The floor: field and centring error are known, the random aberrations are not.
         tables.add_floor(config, product, bound)
         bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
         require(bank, bank_product.config, STARS, product.config, stars)
@@ -154,6 +150,7 @@ def optics(
         first = method_class.with_bank(bank_product.arrays, config, next(iter(data.values())))
         estimators = {reference: replace(first, data=data[reference]) for reference in data}
         for level, noisy in bounded.noisy.items():
+            # Time for the log: the posterior is what takes long.
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)
             for reference, estimator in estimators.items():
@@ -217,6 +214,7 @@ def efficiency(
     by_cell = dict(list(methods.groupby(CELL, sort=False)))
     rows: list[dict[str, object]] = []
     for key, bounded in bound_stars.groupby(CELL, sort=False):
+        # A cell that was bounded must have been evaluated.
         errors = by_cell[key]
         if errors.method.isin(tables.POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
@@ -245,6 +243,7 @@ def paper_rows_table(
         "method == 'bayes' and reference == 'realisation' and metric == 'mse'"
     )
     table = paper[[*key, "method", "value"]].rename(columns={"value": "mse_paper"})
+    # Only rows that the paper and this run both have.
     table = table.merge(measured[[*key, "method", "mse"]], on=[*key, "method"])
     table = table.merge(
         limits[[*key, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}), on=key

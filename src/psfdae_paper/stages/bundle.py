@@ -90,6 +90,7 @@ def _fit_config(
     for path in fits.own_files(method_class, place):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
+    # A fit is a folder or one file.
     path = place / CONFIG if place.is_dir() else place
     fit_config = method_class.described(place)
     # Its configuration says how it was trained: the groups of the method, and the split of the
@@ -120,6 +121,7 @@ def ship(
     # The candidate with the smallest error.
     product, errors = read_stars(stars), {}
     for path in bundle:
+        # Each candidate restores the same noisy stars.
         errors[path] = _validation_error(read_bundle(path), product, config)
         print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
     # The smallest error wins; the others are not shipped.
@@ -147,6 +149,7 @@ def ship(
 def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     """Return the MSE of PSFs of flux 1, as a geometric mean over the noise levels."""
     method_class = method(bundle.info.method)
+    # Split and reference of the model that is shipped.
     data = training_set(config, method_class, stars, "random", "realisation")
     # A method that needs no validation stars was fitted to them, too: fit it without them.
     if not method_class.needs.validation:

@@ -52,6 +52,7 @@ def scan(
     only on image structure and dynamic range.
     """
     limit_threads(1)  # batches run in parallel
+    # Columns of the paper's tables with the noise as it was, before any method.
     rows = [row for row in original_noise_rows() if row.dataset == dataset]
     r0_values = [float("nan")]
     if isinstance(config.wavefront, VonKarman):
@@ -210,6 +211,7 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     for path in stars.values():
         product = read_product(path, "stars", ())
         config = product.config
+        # The first product of a scene is what others are compared with.
         first = scenes.setdefault(config["scene"]["experiment"], product)
         require(path, config, STATIC, first.config, first.path)
         values[config["scene"]["experiment"]] = config["telescope"]["pixel_scale_arcsec"]
@@ -225,6 +227,7 @@ def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]
     background = config.noise.background_photons
     rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")
     noise = NoiseModel(config.noise.kappa, background)
+    # With the configured κ, as in the evaluation.
     noisy = noise.draw(images, row.noise_level, rng)
     noisy_at_published_mse = _at_published_mse(images, row, config)
     data_range, error = config.evaluation.data_range, mse(noisy, images).mean()

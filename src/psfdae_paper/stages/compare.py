@@ -100,6 +100,7 @@ def _tables(folder: Path) -> list[Path]:
 
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """Return the runs to compare with each other: folder of the network, table of its errors."""
+    # Folders of single networks.
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
     # Whole results: all networks that they have in common, one group for each.
@@ -143,6 +144,7 @@ def read_run(folder: Path, errors: Path) -> Run:
     history = read_table(folder / HISTORY, *columns, dtype=str)
     try:
         table = pd.read_parquet(errors, page_checksum_verification=True)
+    # A network may be there before it is evaluated.
     except FileNotFoundError:
         raise ProductError(f"{errors}: no such file; evaluate the run first") from None
     except (OSError, ValueError) as error:
@@ -166,6 +168,7 @@ def describe(first: Run, second: Run) -> str:
     # Errors on the same noisy images are paired, which removes most of their scatter.
     paired = comparison.same_noisy_stars(first.errors, second.errors)
     pairing = "star by star on the same noisy images" if paired else "as independent samples"
+    # Errors to templates and to realisations have different truths.
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: their errors are not comparable.\n\n"
     return "\n\n".join(
@@ -214,6 +217,7 @@ def describe_tables(first: Path, second: Path) -> str:
     counts = f"A has {len(first_errors)}, B {len(second_errors)}"
     lines += [f"{len(rows)} mean errors are in both ({counts})."]
     for verdict, text in verdict_texts.items():
+        # A line for each verdict, also where it has no rows.
         verdict_rows = rows[rows.verdict == verdict]
         lines += [f"- {len(verdict_rows)} {text}"]
         if verdict in ("beyond", "not measured"):

@@ -79,7 +79,9 @@ def evaluate(
     # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
+    # Methods that store a model are loaded; the others are fitted to the training stars.
     methods = estimators(config, product, vars(models), split, reference)
+    # Stars that no method has been fitted to.
     test = split_stars(product, split, config).test
     test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}

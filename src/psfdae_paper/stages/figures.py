@@ -30,13 +30,7 @@ from psfdae_paper.evaluation.drawing import REFERENCES
 from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
 from psfdae_paper.evaluation.measure import COLUMNS, read_tables
 from psfdae_paper.evaluation.paper import published
-from psfdae_paper.stages.evaluate import (
-    READS,
-    Evaluations,
-    Metric,
-    Models,
-    estimators,
-)
+from psfdae_paper.stages.evaluate import READS, Evaluations, Metric, Models, estimators
 from psfdae_paper.stars.fields import square_grid
 
 Stars = Annotated[File, "Product of the stage stars."]
@@ -110,6 +104,7 @@ def figure_headline(
     strip_stars = drawn_stars(config, stars, models, "realisation", 5)
     # Rows of restored stars, one for each method, and below them the truth.
     truth, *restored = strip_stars.rows(config, [level])
+    # Labels and colours of the methods.
     looks = [estimator.look for estimator in strip_stars.methods.values()]
     rows = [
         replace(row, label=look.label if look.restores else f"{look.label} star")
@@ -195,6 +190,7 @@ def drawn_stars(
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    # Test stars of seen fields, in the order of the file.
     test = split_stars(product, "random", config).test
     # Field angles (x, y) of all field points, of which each star has one.
     grid = product.config["grid"]

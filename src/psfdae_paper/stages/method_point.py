@@ -60,6 +60,7 @@ class MethodTraining(Training):
         limit_threads(config.evaluation.threads)
         fitted = method_class.load(place, task.reference, config.evaluation)
         metrics = measure_images(config, task, name, validation_fit or fitted, fitted)
+        # Settings of the fit; the start that succeeded is a result.
         described = method_class.described(place)
         attempt = described.pop("attempt", 0)
         epochs, stopped = None, False
@@ -67,6 +68,7 @@ class MethodTraining(Training):
             # The history has the duration of the training, with all parts of an interrupted one.
             last_epoch = read_table(fits.path_beside(method_class, place, HISTORY)).iloc[-1]
             seconds, cpu_seconds = float(last_epoch["seconds"]), float(last_epoch["cpu_seconds"])
+            # Fewer epochs than allowed: the training was stopped early.
             groups = method_class.settings(settings).values()
             epochs = int(last_epoch["epoch"])
             stopped = epochs < max(getattr(group, "epochs", 0) for group in groups)

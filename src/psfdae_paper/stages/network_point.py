@@ -46,15 +46,10 @@ class StateNetworkTraining(Training):
         config, task, name = self.config, self.task, self.model
         # All states must have stamps of one telescope.
         trained_on = read_product(task.data["states"], "alignment_states", ())
+        expected = trained_on.config, trained_on.path
         for role in ("validation", "test"):
             product = read_product(task.data[role], "alignment_states", ())
-            require(
-                product.path,
-                product.config,
-                Alignment.stamp_keys,
-                trained_on.config,
-                trained_on.path,
-            )
+            require(product.path, product.config, Alignment.stamp_keys, *expected)
         # The training of the main workflow.
         settings = part(network_groups(name), config)
         train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
@@ -73,20 +68,14 @@ class StateNetworkTraining(Training):
                 key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
                 rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
             # Mean absolute error of all parameters in units of the range, at each noise level.
-            mae = {
-                f"{role}_mae_{level:g}": float(
-                    np.mean(
-                        [
-                            row["mean_abs_error"]
-                            for row in rows
-                            if row["unit"] == "range" and row["noise_level"] == level
-                        ]
-                    )
-                )
-                for level in task.levels
-            }
+            mae: dict[str, float] = {}
+            for level in task.levels:
+                at_level = [row for row in rows if row["noise_level"] == level]
+                errors = [row["mean_abs_error"] for row in at_level if row["unit"] == "range"]
+                mae[f"{role}_mae_{level:g}"] = float(np.mean(errors))
             metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
             write_csv(task.folder / task.tables[role], pd.DataFrame(rows))
+        # Settings and cost, from the files of the training.
         described = read_yaml(task.folder / CONFIG)
         history = read_table(task.folder / HISTORY)
         return Measured(

@@ -71,6 +71,7 @@ def simulate(
         templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
         warnings = stamp_warnings(config, fields, least_energy)
+    # The figure and the table of the same measurements.
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
     names = ["templates.h5", "psfs.png", "fields.csv"]
     if fits:
@@ -159,6 +160,7 @@ def stamp_warnings(
         If a stamp contains less than `least_energy`.
     """
     warnings = []
+    # Light of each PSF inside its stamp.
     energy, side = fields.energy, config.framing.stamp_px
     if energy.min() < enough_light:
         # The field with the least light decides which stamp suffices.
@@ -285,7 +287,9 @@ def write_image(
     sky = 1000.0  # photons per pixel
     flux = snr * np.sqrt(sky * noise_equivalent_px(stamps.mean(axis=0)))
     # Expected photons: sky, and the stars at the positions of their field points.
+    # 8 px of sky between stamps.
     pitch = stamps.shape[-1] + 8
+    # The detector has a place for each field of the square grid.
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
     expected = np.full((int(rows) * pitch, int(columns) * pitch), sky)
@@ -329,6 +333,7 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     # Sizes and numbers of stars as asked for; all else as the recipe says.
     recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulate_field(recipe, seed)
+    # Positions of all stars, in pixels.
     x, y = field.centroid.T
     write_field(
         *(out, catalogue, field.image.astype(np.float32), x, y),

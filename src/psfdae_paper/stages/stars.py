@@ -46,6 +46,7 @@ def templates(
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
     side = framing.stamp_px + 2 * framing.jitter_px
     psf, peak = propagation.framed(side)
+    # The stamp without the margin.
     stamp = slice(framing.jitter_px, side - framing.jitter_px)
     # Field angles of a square grid, centred on the optical axis.
     index, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
@@ -95,6 +96,7 @@ def stars(
         "grid": Column(static["grid"], "1", "grid index (ix, iy) of every field"),
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
     }
+    # Fraction of the light that is inside the stamp, before it is normalised.
     energy = Empty((count,), np.float64, "1", "light inside the stamp")
     # Without random aberrations, realisations are the templates.
     propagation = None
@@ -119,6 +121,7 @@ def stars(
         columns |= {"realisation": columns["template"], "energy": energy}
     with stream_product(out, "stars", columns, config.model_dump()) as data:
         for start in range(0, count, STARS_AT_A_TIME):
+            # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.
             framed = static["psf"][star_field[part]].astype(np.float64)

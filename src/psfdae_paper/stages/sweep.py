@@ -27,7 +27,7 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value
-from psfdae_paper.sweeps.measured import Task, Training
+from psfdae_paper.sweeps.measured import Measured, Task, Training
 from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, with_values
 
 
@@ -100,6 +100,7 @@ def sweep_point(
     # Networks of scene 3 have no dataset; tables have their name in its place.
     dataset = sweep.dataset or sweep.model
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
+    # An adaptive sweep proposes values for a trial when it runs.
     trial = None
     if entry.slot is not None:
         trial = Trial(
@@ -184,31 +185,29 @@ def _train(training: Training) -> dict[str, object]:
     dict
         status, reason, epochs, attempt, metrics and config.
     """
-    config, task = training.config, training.task
+    task = training.task
+    # The duration of a training that fails is its cost, too.
     started, started_cpu = time.monotonic(), time.process_time()
-    outcome: dict[str, object]
+    status, reason = "finished", ""
     try:
         measured = training.measure()
+        status = "stopped" if measured.stopped else "finished"
     except FitError as error:
         # A training that cannot go on is a result: the point has no metrics.
-        reason = str(error).splitlines()[0]
+        status, reason = "failed", str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
         task.checkpoint.unlink(missing_ok=True)
-        cost = (time.monotonic() - started, time.process_time() - started_cpu)
-        outcome = {"status": "failed", "reason": reason, "epochs": None, "attempt": None}
-        outcome |= {"metrics": {}, "config": config.model_dump()}
-    else:
-        cost = (measured.seconds, measured.cpu_seconds)
-        outcome = {
-            "status": "stopped" if measured.stopped else "finished",
-            "reason": "",
-            "epochs": measured.epochs,
-            "attempt": measured.attempt,
-            "metrics": measured.metrics,
-            "config": measured.described,
-        }
-    # The cost differs from run to run and has a file of its own.
-    seconds, cpu_seconds = (round(duration, 3) for duration in cost)
-    cost_text = json.dumps({"seconds": seconds, "cpu_seconds": cpu_seconds})
-    write_text(task.folder / "cost.json", cost_text + "\n")
-    return outcome
+        seconds, cpu_seconds = time.monotonic() - started, time.process_time() - started_cpu
+        config = training.config.model_dump()
+        measured = Measured({}, config, seconds, cpu_seconds, attempt=None)
+    # The cost differs from run to run and has a file of its own; times are to a millisecond.
+    cost = {key: round(getattr(measured, key), 3) for key in ("seconds", "cpu_seconds")}
+    write_text(task.folder / "cost.json", json.dumps(cost) + "\n")
+    return {
+        "status": status,
+        "reason": reason,
+        "epochs": measured.epochs,
+        "attempt": measured.attempt,
+        "metrics": measured.metrics,
+        "config": measured.described,
+    }

@@ -154,6 +154,7 @@ def best_overrides(results: Path, name: str) -> list[str]:
     path = results / "sweeps" / name / "best.yaml"
     if not path.is_file():
         raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
+    # A list of words for the command line.
     overrides = read_yaml(path).get("overrides")
     if not isinstance(overrides, list):
         raise ProductError(f"{path}: damaged (no overrides); delete it and run again")
@@ -172,6 +173,7 @@ def sweep_figure(
     # Axes as text: they may be numbers or names of options.
     table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))
     points = sweep_figures.SweepPoints(table_of_points, described)
+    # Both figures take the same points.
     draw = {
         "parallel": sweep_figures.parallel_coordinates,
         "response": sweep_figures.response_curves,

@@ -72,6 +72,7 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
+    # Methods, networks of scene 3 and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
@@ -215,6 +216,7 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
     # A server decides itself where artifacts go.
     is_served = uri.startswith(("http", "databricks"))
     location = None if is_served else (database.parent.resolve() / "mlartifacts" / name).as_uri()
+    # An experiment that was deleted keeps its name: it is restored.
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         return str(client.create_experiment(name, artifact_location=location))
@@ -350,6 +352,7 @@ def ours_to_explain(error: Exception) -> bool:
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
+    # Any other error is a mistake of this program, and is not hidden.
     return isinstance(error, MlflowException | SQLAlchemyError | OSError)
 
 

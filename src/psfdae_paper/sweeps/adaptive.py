@@ -81,11 +81,7 @@ def ask(
 
 def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
     """Return Optuna's distributions of the axes: categories, whole numbers, or a range."""
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     # Steps and logarithms of a range are those of the axis.
     distributions: dict[str, BaseDistribution] = {}
@@ -94,6 +90,7 @@ def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
             options = [_stored_value(axis, option) for option in axis.options]
             distributions[name] = CategoricalDistribution(options)
         elif axis.integer:
+            # Both ends belong to the range, as in `draws`.
             low, high = map(int, axis.ends)
             distributions[name] = IntDistribution(low, high, log=axis.log)
         else:

@@ -73,8 +73,8 @@ class Measured:
         Passes over the training data; None for methods without epochs.
     stopped : bool
         The training ended by early stopping.
-    attempt : int
-        New starts after a dead network.
+    attempt : int or None
+        New starts after a dead network; None for a training that failed.
     """
 
     metrics: dict[str, float]
@@ -83,7 +83,7 @@ class Measured:
     cpu_seconds: float
     epochs: int | None = None
     stopped: bool = False
-    attempt: int = 0
+    attempt: int | None = 0
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
     # Name of the metric, and its mean over noise levels.
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
+        # One row of the table for each level and metric.
         by_level = {row["noise_level"]: row["value"] for row in rows if row["metric"] == metric}
         metrics[f"{part}_{metric}"] = mean(list(by_level.values()))
         metrics |= {f"{part}_{metric}_{level:g}": value for level, value in by_level.items()}
@@ -196,6 +197,7 @@ def measure_images(
             row = {**key, "method": method, "noise_level": level}
             rows += stars.errors(row, estimate, config.evaluation.data_range)[0]
         metrics |= image_metrics(part, rows)
+        # Written after all levels: a table is whole or absent.
         write_csv(task.folder / task.tables[part], pd.DataFrame(rows))
     return metrics
 
@@ -204,6 +206,7 @@ def read_cost(folder: Path) -> dict[str, float]:
     """Read seconds and CPU seconds of a point's training; raises ProductError."""
     path = folder / "cost.json"
     tree = read_json(path)
+    # NaN where the training did not record it.
     return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
 
 

@@ -84,6 +84,7 @@ def tidy(axis: Axis, value: float) -> int | float:
 
 def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the configuration keys and their values at a point of the space."""
+    # An axis may stand for several keys.
     keys: dict[str, Value] = {}
     for name, axis in space.items():
         # Later axes cannot change the same key (`Sweep.check_keys`).
@@ -252,6 +253,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     ConfigError, SweepError
         If a file is wrong; the message names file and key.
     """
+    # What is varied, from the file of the sweep.
     sweep = load_sweep(name)
     # The configuration of the sweep's dataset, with those overrides that concern it.
     tree = compose((*sweep.choice, *overrides_for(overrides, sweep.choice)))
