@@ -32,8 +32,8 @@ WORDS = [
 def few_draws():
     """Errors of models are measured at three levels of noise, on few noisy images."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("NODES", 3), ("MIN_IMAGES", 40)):
-            patch.setattr(calibration, name, value)
+        patch.setattr(calibration, "NODES", 3)
+        patch.setattr(calibration.HeldOutStars, "min_images", 40)
         yield
 
 

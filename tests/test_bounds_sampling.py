@@ -10,19 +10,12 @@ from scipy.stats import multivariate_t
 
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
-from psfdae_paper.bounds import sampling
-from psfdae_paper.bounds.mixture import FREEDOM
+from psfdae_paper.bounds.mixture import Mixture
+from psfdae_paper.bounds.mode_search import climb, find_twins, recentre
+from psfdae_paper.bounds.modes import Knowledge, Modes
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
-from psfdae_paper.bounds.sampling import (
-    Knowledge,
-    Modes,
-    StampModel,
-    StarPosteriors,
-    climb,
-    find_twins,
-    recentre,
-    sample_posterior,
-)
+from psfdae_paper.bounds.sampling import sample_posterior
+from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 
 LEVEL = 3e-3
@@ -87,16 +80,16 @@ def modes(model, stars, noise):
     none = np.zeros(4, int)
     start = Modes.at(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
-    posteriors = StarPosteriors(likelihood.counts(stars[2]), likelihood, model)
+    posteriors = StarPosteriors(stars[2], likelihood, model)
     first = climb(start, posteriors)
-    return climb(first + find_twins(first, likelihood, model), posteriors)
+    return climb(first + find_twins(first, posteriors), posteriors)
 
 
-def sampled(model, modes, stars, noise, draws=2000):
+def sampled(model, modes, stars, noise, draws=2000, **blocks):
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
     rngs = [stream(1, "test", star) for star in range(4)]
-    posteriors = StarPosteriors(likelihood.counts(stars[2]), likelihood, model)
-    return sample_posterior(modes, posteriors, np.zeros(4, int), draws, rngs)
+    posteriors = StarPosteriors(stars[2], likelihood, model)
+    return sample_posterior(modes, posteriors, np.zeros(4, int), draws, rngs, **blocks)
 
 
 def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
@@ -115,11 +108,10 @@ def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, e
     assert ((blind.effective_size > 500) & (blind.effective_size < 2100)).all()
 
 
-def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
+def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise):
     first, second = (sampled(model, modes, stars, noise, 80)[0].with_truth for _ in range(2))
     assert first.image_sum.tobytes() == second.image_sum.tobytes()
-    monkeypatch.setattr(sampling, "STARS_AT_ONCE", 1)
-    single = sampled(model, modes, stars, noise, 80)[0].with_truth
+    single = sampled(model, modes, stars, noise, 80, stars_at_once=1)[0].with_truth
     assert single.mean_image == pytest.approx(first.mean_image, abs=1e-6)
 
 
@@ -143,7 +135,8 @@ def test_twins_give_the_same_image(model, noise):
     assert broad.stamps(z_negated, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
     none = np.zeros(1, int)
     start = Modes.at(none, none, middle, none, z)
-    twins = find_twins(start, Likelihood.of(noise, 1e-4, images[0]), broad)
+    likelihood = Likelihood.of(noise, 1e-4, images[0])
+    twins = find_twins(start, StarPosteriors(images[0], likelihood, broad))
     at_twin = (twins.field == 1) & (twins.offset == middle).all(axis=1)
     assert twins.z[at_twin][0] == pytest.approx(z_far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
@@ -159,11 +152,12 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
     images = broad.stamps(z, 2 * number, middle)
     likelihood = Likelihood.of(noise, 1e-4, images)
     start = Modes.at(number, 2 * number, middle, 0 * number, z)
-    modes = climb(start, StarPosteriors(likelihood.counts(images), likelihood, broad))
+    posteriors = StarPosteriors(images, likelihood, broad)
+    modes = climb(start, posteriors)
     for first in range(2):
         evidence = np.where(number == first, 100.0, 99.0)
         two_modes = replace(modes, star=0 * number, evidence=evidence)
-        twins = find_twins(two_modes, likelihood, broad)
+        twins = find_twins(two_modes, posteriors)
         at = [
             np.flatnonzero((twins.field == f) & (twins.offset == o).all(axis=1))[0]
             for f, o in zip(2 * number, middle, strict=True)
@@ -183,7 +177,7 @@ def test_density_of_draws_is_students_t():
     density = modes.log_density(z, field, offset)
     for mode in number:
         scale = factor[mode] @ factor[mode].T
-        law = multivariate_t(modes.z[mode], scale, FREEDOM)
+        law = multivariate_t(modes.z[mode], scale, Mixture.freedom)
         at_mode = (field == mode) & (np.arange(30) < 20)
         assert density[mode, at_mode] == pytest.approx(law.logpdf(z[at_mode]), abs=1e-9)
         assert (density[mode, ~at_mode] == -np.inf).all()
@@ -194,7 +188,7 @@ def aside(stars, model, noise, level, shift):
     z, truth, _, offset = (part[:1] for part in stars)
     noisy = noise.draw(truth, level, np.random.default_rng(7))
     likelihood = Likelihood.of(noise, level, truth)
-    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
+    posteriors = StarPosteriors(noisy, likelihood, model)
     none = np.zeros(1, int)
     start = Modes.at(none, none, offset + shift, np.full(1, Knowledge.FIELD), z)
     truth = Modes.at(none, none, offset, np.full(1, Knowledge.TRUTH), z)
@@ -204,7 +198,7 @@ def aside(stars, model, noise, level, shift):
 def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     z, truth, noisy, offset = stars
     likelihood = Likelihood.of(noise, LEVEL, truth)
-    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
+    posteriors = StarPosteriors(noisy, likelihood, model)
     number, back = np.arange(len(z)), []
     for shift in set(jitters(1)) - {(0, 0)}:
         start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), Knowledge.FIELD), z)

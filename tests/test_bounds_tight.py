@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from psfdae_paper.bounds.estimates import BoundedStars, Estimates
-from psfdae_paper.bounds.tables import COLUMNS, Tables
+from psfdae_paper.bounds.tables import Tables
 from psfdae_paper.bounds.tight import Evidence, calibration
 from psfdae_paper.stages import bounds
 
@@ -100,7 +100,7 @@ def table_of(estimated):
 
 def compared(tables, folder, errors):
     """Table of the efficiency of a made-up method with these errors."""
-    pd.DataFrame(tables.summary, columns=COLUMNS).to_csv(folder / "b.csv")
+    pd.DataFrame(tables.summary, columns=Tables.summary_columns).to_csv(folder / "b.csv")
     per_star = pd.concat(tables.per_star, ignore_index=True)
     per_star.to_parquet(folder / "b.parquet")
     per_star.assign(method="dae", mse=np.tile(errors, 2)).to_parquet(folder / "e.parquet")

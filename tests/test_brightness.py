@@ -18,6 +18,7 @@ from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
 from psfdae.methods.field_spline import FieldModel
+from psfdae.model.psf_model import other_instrument
 from psfdae.noise import NoiseModel
 
 SIDE, SPACING = 12, 0.5
@@ -208,5 +209,5 @@ def test_colours_are_those_of_the_list_and_of_another_column_are_named(
     bright = stars.candidates.bright
     assert bright.colour == pytest.approx(np.asarray(listed[column])[bright.row])
     observation = ImageInput(training.image, catalogue=listed, **words).open(16)
-    other = colourful.other_instrument(observation.instrument, observation.colour_column)
+    other = other_instrument(colourful, observation)
     assert (column in other) == unlike == bool(other)

@@ -13,7 +13,7 @@ from command_line import psfdae, refused
 from psfdae.files import write_text
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import (
-    compare_errors,
+    compare_evaluations,
     held_out_ratios,
 )
 
@@ -50,10 +50,10 @@ def scaled(table, factor):
 def test_equal_networks_are_the_same_and_a_better_one_is_better():
     verdicts = []
     for seed in range(20):
-        table = compare_errors(errors(100 + seed, 1e-5), errors(200 + seed, 1e-5), {})
+        table = compare_evaluations(errors(100 + seed, 1e-5), errors(200 + seed, 1e-5), {})
         verdicts += list(table[table.method == "dae"].verdict)
     assert verdicts.count("same") >= 0.9 * len(verdicts)
-    table = compare_errors(errors(1, 1e-5), errors(2, 0.8e-5), {})
+    table = compare_evaluations(errors(1, 1e-5), errors(2, 0.8e-5), {})
     assert set(table[table.method == "dae"].verdict) == {"better"}
     assert set(table[table.method == "noisy"].verdict) == {"same"}
     assert of_network(table).difference == pytest.approx(-2e-6, rel=0.2)
@@ -63,10 +63,10 @@ def test_pairs_of_stars_show_what_independent_samples_hide():
     """A gain of 2 % of every star's error, far below the scatter between stars."""
     first = errors(1, 1e-5)
     second = scaled(first, 0.98)
-    assert of_network(compare_errors(first, second, {})).verdict == "better"
+    assert of_network(compare_evaluations(first, second, {})).verdict == "better"
     noisy = second.method == "noisy"
     second.loc[noisy, "mse"] = errors(1, 1e-5, noise_seed=9)[noisy].mse
-    assert of_network(compare_errors(first, second, {})).verdict == "same"
+    assert of_network(compare_evaluations(first, second, {})).verdict == "same"
 
 
 def test_seeds_count_beside_the_stars():
@@ -75,7 +75,7 @@ def test_seeds_count_beside_the_stars():
     trained = [scaled(first, f) for f in np.random.default_rng(4).normal(1.0, 0.03, 5)]
 
     def different(scatter):
-        rows = [of_network(compare_errors(a, b, scatter)) for a, b in combinations(trained, 2)]
+        rows = [of_network(compare_evaluations(a, b, scatter)) for a, b in combinations(trained, 2)]
         return sum(row.verdict != "same" for row in rows)
 
     assert different(MEASURED) <= 1 and different({}) > 5
@@ -86,9 +86,9 @@ def test_seeds_count_beside_the_stars():
         ({"dataset": "e", "reference": "realisation"}, "worse"),
     ):
         one = first.assign(**place)
-        row = of_network(compare_errors(one, scaled(one, 1.06), MEASURED))
+        row = of_network(compare_evaluations(one, scaled(one, 1.06), MEASURED))
         assert row.verdict == verdict
-    row = of_network(compare_errors(first, scaled(first, 0.5), MEASURED))
+    row = of_network(compare_evaluations(first, scaled(first, 0.5), MEASURED))
     assert row.verdict == "better"
     assert row.seed_stderr == pytest.approx(0.03 * np.hypot(row["first"], row.second))
 

@@ -8,8 +8,10 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 
 from psfdae.methods import groups_of
+from psfdae.networks.settings import DaeSettings, Train
 from psfdae.networks.training import fingerprint
 from psfdae.settings import ConfigError, as_overrides, deciding
 from psfdae_paper.configuration import compose
@@ -34,6 +36,15 @@ def test_every_dataset_composes_as_its_file(dataset):
         assert (config_dir() / f"stars/{config.stars.name}.yaml").is_file()
 
 
+def test_files_name_every_key_of_the_network_and_its_training():
+    """Who opens the folder to change a value finds the key, and the value that is used."""
+    for name, group in (("dae/width16", DaeSettings), ("train/onecycle", Train)):
+        tree = yaml.safe_load((config_dir() / f"{name}.yaml").read_text(encoding="utf-8"))
+        assert tree.keys() == group.model_fields.keys()
+        differing = {key for key, value in tree.items() if value != group.model_fields[key].default}
+        assert differing == ({"epochs", "crop_epochs"} if group is Train else set())
+
+
 def test_settings_of_the_paper():
     bands = {1: [3e-5, 5e-5, 7e-5, 9e-5], 2: [3e-4, 5e-4, 7e-4, 9e-4], 3: [1e-3, 2e-3, 3e-3, 5e-3]}
     for number in range(1, 7):
@@ -55,6 +66,11 @@ def test_settings_of_the_paper():
         ("train.lr=fast", r"train\.lr = 'fast': .*valid number"),
         ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
+        ("train.lrr=1", r"^train\.lrr: unknown key; did you mean train\.lr\?$"),
+        ("snr_min=20", r"^snr_min: unknown key; did you mean calibration_stars\.snr_min\?$"),
+        ("dae=width17", "^dae=width17: no such option; .*width32.*; did you mean width16"),
+        ("trian=onecycle", r"^trian: unknown key; did you mean train\?$"),
+        ("train.lr", "^train.lr: expected key=value"),
         ("trian.lr=0.1", r"trian\.lr"),
         ("noise.levels=[0.1", r"no viable alternative at input"),
     ],

@@ -27,10 +27,11 @@ from psfdae.model.bundle import BundleError
 from psfdae.model.neighbours import light_of_others
 from psfdae.model.photon_noise import measure_gain, with_measured_gain
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
+from psfdae.model.wings import StarFluxes, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, WIDE = 330, 200.0, 10, 61
+RADIUS = np.geomspace(5, 25, 7)  # of the tents of wings
 CORE, CORE_PX, WING_PX = 0.94, 1.4, 3.0  # flux of the Gaussian, its σ, and the radius of the wings
 
 
@@ -126,12 +127,12 @@ def test_a_star_behind_a_brighter_one_is_found_in_the_second_round():
     left += 40 * np.exp(-((rows - 40) ** 2 + (columns - 10) ** 2) / 4.0)
     sky = crowded.Sky(left, level, noise, level > 0, np.nan)
     known = np.array([[10.2, 40.1], [30.0, 20.0]])
-    place, flux = crowded._with_hidden(sky, noise, known, np.array([1e4, 1e4]), 5.0, 3.0)
+    place, flux = crowded.with_hidden_stars(sky, noise, known, np.array([1e4, 1e4]), 5.0, 3.0)
     assert place[:2].tolist() == known.tolist() and len(place) == len(flux) == 3
     assert place[2] == pytest.approx([33, 20], abs=0.1)
     # Beside a bright star, as much light may be a PSF that is a little off.
     doubt = np.where(left > 1, 40.0, 1.0)
-    assert len(crowded._with_hidden(sky, doubt, known, flux[:2], 5.0, 3.0)[0]) == 2
+    assert len(crowded.with_hidden_stars(sky, doubt, known, flux[:2], 5.0, 3.0)[0]) == 2
 
 
 def test_aperture_corrections(found):
@@ -179,8 +180,8 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"profile": [10**400] * (TENTS + 1)},
-        {"covariance": (-np.eye(TENTS + 1)).tolist()},
+        {"profile": [10**400] * len(RADIUS)},
+        {"covariance": (-np.eye(len(RADIUS))).tolist()},
     ],
 )
 def test_damaged_wings_are_refused(sky, changed):
@@ -192,9 +193,6 @@ def test_damaged_wings_are_refused(sky, changed):
         PsfModel(damaged)
 
 
-RADIUS = np.geomspace(5, 25, TENTS + 1)
-
-
 @pytest.mark.parametrize("level", [0.0, 3.0])
 @pytest.mark.parametrize("brightness", [1.0, 1e-3])
 def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
@@ -202,36 +200,38 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     rng = np.random.default_rng(1)
     place, flux = rng.uniform(0, 300, (30, 2)), brightness * 10 ** rng.uniform(4, 5.5, 30)
     outer = np.full(30, 0.03)
-    true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, TENTS + 1), np.eye(TENTS + 1), 0.03)
-    bands = tented_light((300, 300), place, flux, outer, true)
+    true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    stars = StarFluxes(place, flux, outer)
+    bands = tented_light((300, 300), stars, true)
     tented = np.concatenate([light for _, light in bands], axis=1)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
-    known = (np.full(image.shape, 5.0), nothing, place)
-    wings = wings_of(image, *known, flux, outer, 10)
+    known = np.full(image.shape, 5.0), nothing
+    wings = wings_of(image, *known, stars, 10)
     light, error = wings.light()
     # In a unit whose square single precision cannot hold, they are the same.
     unit = np.float32(1e-25)
     tiny = (unit * image).astype(np.float32), np.full(image.shape, 5.0 * unit)
-    in_unit = wings_of(*tiny, nothing, place, unit * flux, outer, 10)
+    in_unit = wings_of(*tiny, nothing, stars._replace(flux=unit * flux), 10)
     assert in_unit.profile == pytest.approx(wings.profile, rel=1e-3, abs=1e-9)
     if brightness == 1.0:
         assert light == pytest.approx(true.light()[0], abs=4 * error)
         assert error < 0.05 * light
         # Of a sky with structure pixels share what is left; the error knows it.
         wavy = image + 10.0 * np.sin(np.arange(300) / 15)[:, None]
-        off, doubt = wings_of(wavy, *known, flux, outer, 10).light()
+        off, doubt = wings_of(wavy, *known, stars, 10).light()
         assert doubt > 4 * error and abs(off - true.light()[0]) < 2 * doubt
     else:
         # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
         assert light == pytest.approx(0.65 * 0.03, abs=0.002)
         assert 0.3 * light < error < 1.5 * light
-    assert wings_of(image, *known, np.full(30, np.nan), outer, 10) is None
+    assert wings_of(image, *known, stars._replace(flux=np.full(30, np.nan)), 10) is None
 
 
 def test_the_light_of_wings_is_the_sum_over_pixels():
-    wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, TENTS + 1), np.eye(TENTS + 1), 1.0)
-    drawn = tented_light((81, 81), np.array([[40.3, 40.1]]), np.ones(1), np.ones(1), wings)
+    wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
+    star = StarFluxes(np.array([[40.3, 40.1]]), np.ones(1), np.ones(1))
+    drawn = tented_light((81, 81), star, wings)
     total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in drawn)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]

@@ -30,7 +30,7 @@ class Moving(FieldPsfs):
     def check_scale(self, pixel_scale_arcsec, what):
         pass
 
-    def _psfs(self, place, oversampling):
+    def draw_psfs(self, place, oversampling):
         u, v = (2 * (place - LOW) / (HIGH - LOW) - 1).T
         axis = np.arange(oversampling * self.stamp_px + (oversampling > 1)) / oversampling
         axis = axis - self.stamp_px // 2

@@ -6,6 +6,7 @@ import errno
 import io
 import itertools
 import json
+import re
 import subprocess
 import sys
 import time
@@ -169,3 +170,18 @@ def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path
     line = refused("stars", "--templates", "none.h5", "--out", out)
     assert line == "psfdae: none.h5: no such file\n"
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("predct", "No such command 'predct'; did you mean predict?"),
+        ("config -m train.lr=1e-3,2e-3", "-m: several values are a sweep: .*config sweep=NAME"),
+        ("fit --multirun train.lr=1e-3,2e-3", "--multirun: several values are a sweep"),
+        ("config --cfg job", "--cfg: psfdae config OVERRIDES prints the composed configuration"),
+    ],
+)
+def test_a_mistyped_command_and_options_of_hydra_are_answered(words, message):
+    result = psfdae(*words.split())
+    assert result.exit_code == 2
+    assert re.search(f"Error: {message}".replace("?", r"\?"), result.output), result.output

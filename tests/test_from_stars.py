@@ -38,7 +38,7 @@ from psfdae.rng import stream
 from psfdae.splits import held_out_fields
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import simulate
-from psfdae_paper.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
+from psfdae_paper.stars.example import FieldRecipe, example_field, star_images
 
 TINY = ["preset=smoke", *SIZE_WORDS, "train.epochs=1"]
 
@@ -78,7 +78,7 @@ def test_star_of_a_perfect_telescope_lies_where_it_was_put():
     """Its centre of light, from the middle of the pixel nearest to the position."""
     position = np.array([[300.0, 400.0], [310.3, 399.8], [299.6, 405.45], [301.49, 288.52]])
     images = star_images(FieldRecipe(seidel=(0.0,) * 5), position)
-    axis = np.arange(RENDER_PX) - RENDER_PX // 2
+    axis = np.arange(32) - 16  # of stamps of 32 px
     centre = np.stack([images.sum(axis=1) @ axis, images.sum(axis=2) @ axis], axis=1)
     assert centre == pytest.approx(position - np.rint(position), abs=0.02)
 

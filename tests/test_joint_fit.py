@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.sparse import csc_array
 
-from psfdae.model.joint_fit import chains, fit_stars
+from psfdae.model.joint_fit import chains, fit_stars, standard_errors
 from psfdae.model.psf_grid import PsfGrid
 
 SIGMA_PX, FWHM_PX, BOX_PX = 1.2, 2.83, 7
@@ -60,6 +62,15 @@ def test_errors_are_those_of_the_noise(psfs):
     assert np.median(pulls, axis=0) == pytest.approx([0.0] * 3, abs=0.25)
     assert np.median(fit.chi2) == pytest.approx(1.0, abs=0.1)
     assert (fit.flags & 8 == 0).mean() > 0.95  # at rest
+
+
+def test_standard_errors_are_those_of_the_inverse_of_all_stars_that_overlap():
+    """Two stars that share light, and one alone: √ of the diagonal of N⁻¹, in the stars' units."""
+    rng = np.random.default_rng(2)
+    pair, single = (d @ d.T for d in (rng.normal(size=(6, 20)), rng.normal(size=(3, 20))))
+    normal, unit = block_diag(pair, single), rng.uniform(0.5, 2.0, (3, 3))
+    expected = np.sqrt(np.diag(np.linalg.inv(normal))).reshape(3, 3) / unit
+    assert standard_errors(csc_array(normal), unit) == pytest.approx(expected, rel=1e-9)
 
 
 def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):

@@ -12,6 +12,7 @@ from prediction_stars import observe
 from psfdae.image.stamps import SMOOTHED_NOISE, StarFlag, border_pixels, cut, displacement, smoothed
 from psfdae.model import flux_model as module
 from psfdae.model.flux_model import FluxModel, robust_flux
+from psfdae.model.leading_modes import LeadingModes, clipped_rms
 from psfdae.model.photometry import Photometer
 from psfdae.moments import measure_shapes
 
@@ -56,7 +57,7 @@ def test_bad_pixels_are_marked_and_repaired(noisy, stars, model, noise, value, p
     broken[3][place] = value
     clean, estimate = robust_flux(noisy, model), robust_flux(broken, model)
     assert estimate.flags[3] == flags
-    assert abs(estimate.flux[3] - clean.flux[3]) < 2 * estimate.error[3]
+    assert abs(estimate.flux[3] - clean.flux[3]) < 2 * estimate.flux_error[3]
     wrong = estimate.images[3] != noisy[3]
     assert wrong.any()
     # What is put in is closer to the truth than a measured pixel would be, on average.
@@ -86,7 +87,7 @@ def test_one_fit_is_the_one_of_dense_matrices(stars, model):
     x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
     used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
     prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
-    found = module._generalised_least_squares(x, used, prior, sigma, model)
+    found = module.generalised_least_squares(x, used, prior, sigma, model)
     covariance = (model.basis * model.variance) @ model.basis.T
     for star, (flux, error, score, repaired) in enumerate(zip(*found, strict=True)):
         whole = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
@@ -174,7 +175,7 @@ def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels(gaussian_stars,
     found = measure(whole_model, stamps, 0.0, bad, background=sky)
     alone = robust_flux(np.where(bad, np.nan, stamps - sky), whole_model)
     assert found.flux == pytest.approx(alone.flux, rel=1e-6)
-    assert found.flux_error == pytest.approx(alone.error, rel=1e-6)
+    assert found.flux_error == pytest.approx(alone.flux_error, rel=1e-6)
     assert found.background == pytest.approx(sky, abs=1e-12)
 
 
@@ -190,10 +191,10 @@ def test_stars_as_bright_as_their_error_are_fitted_and_flagged_as_with_care(
     assert np.array_equal((found.flags & NO_FLUX) > 0, ~(ratio > 1))
     assert np.array_equal((found.flags & FAINT) > 0, (ratio > 1) & (ratio < 3))
     assert (found.images[ratio < 1] == 0).all()
-    alone = robust_flux(stamps, whole_model.with_free_sky())
+    alone = robust_flux(stamps, whole_model.with_free_sky)
     careful = ratio < 2
     assert found.flux[careful] == pytest.approx(alone.flux[careful], rel=1e-6)
-    assert found.flux_error[careful] == pytest.approx(alone.error[careful], rel=1e-6)
+    assert found.flux_error[careful] == pytest.approx(alone.flux_error[careful], rel=1e-6)
 
 
 def test_another_flux_of_the_same_light_is_another_sky(gaussian_stars, whole_model):
@@ -224,7 +225,7 @@ def test_residuals_of_the_border_are_those_of_dense_matrices(
     x = stars - total[:, None] / 256
     leading, variance = whole_model.basis[:, -48:], whole_model.variance[-48:]
     weight = np.tile(1 / (variance + sigma**2), (3, 1))
-    found = Photometer(whole_model, 48)._border_scores(
+    found = LeadingModes(whole_model, 48).border_scores(
         x, x @ leading, total, flux, weight, np.full(3, sigma**2), np.full(3, sky_known)
     )
     inverse = np.linalg.inv((leading * variance) @ leading.T + sigma**2 * np.eye(256))
@@ -233,6 +234,14 @@ def test_residuals_of_the_border_are_those_of_dense_matrices(
         inverse -= np.outer(beyond, beyond) / beyond.sum()
     residual = (stars - flux[:, None] * whole_model.mean) @ inverse / np.sqrt(np.diag(inverse))
     assert found == pytest.approx(residual[:, border_pixels(16)], abs=1e-4)
+
+
+def test_root_mean_square_of_scores_is_without_outliers_and_without_nan():
+    """1 for a normal variable; a row of NaN counts as 1."""
+    score = np.random.default_rng(9).normal(size=(3, 20_000))
+    score[0, :100], score[1, ::2], score[2] = 50.0, np.nan, np.nan
+    assert clipped_rms(score) == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
+    assert clipped_rms(score)[2] == 1.0
 
 
 # Centring

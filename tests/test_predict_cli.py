@@ -18,7 +18,6 @@ from psfdae.commands import predict as stage
 from psfdae.image.image_input import ImageInput
 from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
 from psfdae.model import prediction as writer
-from psfdae.model import psf_model
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.restoration import SNR_TOLERANCE
 from workflow_runs import ROOT
@@ -144,7 +143,7 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     files = []
     for rows, threads in ((1024, 1), (256, 3)):
-        monkeypatch.setattr(psf_model, "MAX_STARS_READ", rows)
+        monkeypatch.setattr(stage.PsfModel, "max_stars_read", rows)
         out = folder / f"rows{rows}_{threads}.fits"
         statements = stage.ImageStatements()
         stage.predict_command(folder / "cube.fits", statements, threads=threads, out=out)

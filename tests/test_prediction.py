@@ -139,6 +139,21 @@ def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypa
     assert has(without, StarFlag.POOR_FIT).sum() >= poor.sum()
 
 
+@pytest.mark.parametrize("sigma", [None, 2.0])
+def test_chi2_of_noise_is_1_whatever_part_of_it_a_star_follows(sigma):
+    """A pixel is left the part k = 1 − u²/s of its noise, if that of the star is known to u."""
+    rng, psf = np.random.default_rng(3), np.full((4000, 6, 6), 9.0)
+    noise, gain = np.full(4000, 3.0), np.full(4000, 1.0)
+    part = 1.0 if sigma is None else 1.0 - sigma**2 / 18.0
+    residual = np.sqrt(18.0 * part) * rng.normal(size=psf.shape)
+    residual[:, 0] = np.nan
+    flux_sigma = None if sigma is None else np.full(psf.shape, sigma)
+    chi2 = restoration.reduced_chi2(residual, psf, flux_sigma, noise, gain)
+    assert chi2.mean() == pytest.approx(1.0, abs=0.01)
+    residual[:] = np.nan
+    assert np.isnan(restoration.reduced_chi2(residual, psf, flux_sigma, noise, gain)).all()
+
+
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):
     stars = observe(field_psfs, 1e-4)
     without = shipped.predict(stars.stamps, noise=SKY**0.5)

@@ -12,9 +12,9 @@ from psfdae.methods import method
 from psfdae.metrics import mse
 from psfdae.model.star_sets import noise_model
 from psfdae.optics.wavefronts import monomial_coefficients
-from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
 from psfdae_paper.bounds.floor import local_error
+from psfdae_paper.bounds.modes import largest_of_groups
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.methods import wavefront
@@ -123,9 +123,7 @@ def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, nam
     modes_of_field = modes.take(
         np.flatnonzero(modes.field == columns["field_index"][-TEST:][modes.star])
     )
-    first = modes_of_field.take(
-        sampling.largest_of_groups(modes_of_field.star, modes_of_field.evidence, 1)
-    )
+    first = modes_of_field.take(largest_of_groups(modes_of_field.star, modes_of_field.evidence, 1))
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0

@@ -34,7 +34,7 @@ from typing import (
 
 import click
 
-from psfdae.errors import Error, install_line, missing
+from psfdae.errors import Error, did_you_mean, install_line, missing
 from psfdae.joined import joined
 from psfdae.version import __version__
 
@@ -144,6 +144,16 @@ class Commands(Careful):
             return Commands(name, name=cmd_name, help=groups()[name])
         return as_click(stage(name)) if name in command_modules() else None
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that is typed; UsageError names one that is like an unknown one."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            hint = did_you_mean(args[0], self.list_commands(ctx))
+            raise click.UsageError(error.message.removesuffix(".") + hint, ctx) from None
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with the first sentence of their help, from the modules' text."""
         # Sentences are cut to what a line has room for beside the longest name.
@@ -163,6 +173,22 @@ class Commands(Careful):
         if absent := len(words) - sum(map(len, listed.values())):
             formatter.write_paragraph()
             formatter.write_text(f'{absent} more with the extra "paper": {install_line("paper")}')
+
+
+class SettingsCommand(click.Command):
+    """Command with settings; options of other programs are refused with what does the same."""
+
+    foreign_options: Mapping[str, str]
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the command line; UsageError says what to type in place of a foreign option."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            advice = self.foreign_options.get(error.option_name)
+            if advice is None:
+                raise
+            raise click.UsageError(f"{error.option_name}: {advice}", ctx) from None
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -292,7 +318,10 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 
     # The last word is the command's own; the others are those of its groups.
     help_text = cleandoc(function.__doc__ or "")
-    return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
+    word = spec.name.split()[-1]
+    click_command = SettingsCommand(word, callback=run, params=parameters, help=help_text)
+    click_command.foreign_options = getattr(spec.settings, "foreign_options", {})
+    return click_command
 
 
 def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> Sequence[str]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from importlib.metadata import PackageNotFoundError, distribution, requires
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -89,3 +90,16 @@ def install_line(extra: str) -> str:
     if place.scheme == "file" and (path := Path(unquote(place.path))).exists():
         return f'pip install "{path}[{extra}]"'
     return f'pip install ".[{extra}]" in the folder of psfdae\'s source'
+
+
+def did_you_mean(word: str, names: Iterable[str]) -> str:
+    """Return "; did you mean NAME?" with at most three names that are like a word, or "".
+
+    Names whose last part is the word's are the likeliest: train.lr for lr. Others are alike in
+    their letters.
+    """
+    names = [name for name in names if name != word]
+    last_part = word.rpartition(".")[2]
+    alike = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
+    alike = sorted(alike, key=len) or get_close_matches(word, names, n=1)
+    return f"; did you mean {' or '.join(alike[:3])}?" if alike else ""

@@ -4,8 +4,11 @@ Each is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, wi
 where files give others, these are in `config/<group>/default.yaml`. The list `methods` of
 `config/config.yaml` names those that the reproduction runs. Rules, tables, figures, sweeps, runs
 of MLflow, bundles and `from-stars` ask the classes for all that they must know: how a method
-looks, what it needs, how a fit is stored, how it is packed. What only some methods can do is a
-protocol.
+looks, what it needs, how a fit is stored, how it is packed.
+
+A method has at least `look`, `fit` and `predict`. All else has a default in the base class: a
+method with a product names its arrays in `storage`, one with uncertainties returns them by
+`estimate`, and two capabilities tell what only some methods can do, `knows_field` and `finds_flux`.
 
 Modules of methods load neither torch nor scipy when they are imported: options of
 commands follow from them.
@@ -16,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -147,7 +150,7 @@ class Estimate:
     measured : Measured or None
         Measurements of a method that measures stars itself; its PSFs have the sum 1.
     outlier_score : ndarray, shape (n,), or None
-        See `ScoresOutliers.outlier_score`, if the method computes it together with the PSFs.
+        See `Method.outlier_score`, if the method computes it together with the PSFs.
     explained : ndarray of bool, shape (n,), or None
         True if the method's own model explains the star; otherwise its PSF is another method's.
     """
@@ -264,77 +267,6 @@ class Packing:
     padded: bool = True
 
 
-# What some methods can do.
-
-
-@runtime_checkable
-class MeasuresStars(Protocol):
-    """Method that measures flux, sky and centre of a star together with its PSF."""
-
-    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
-        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
-
-    def measure(
-        self,
-        stamps: np.ndarray,
-        noise: np.ndarray,
-        position: np.ndarray | None = None,
-        centre: np.ndarray | None = None,
-        fixed: bool | np.ndarray = False,
-        flux: np.ndarray | None = None,
-        sky: np.ndarray | None = None,
-        gain: np.ndarray | None = None,
-    ) -> Estimate:
-        """Measure stars on stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
-
-
-@runtime_checkable
-class DrawsStars(Protocol):
-    """Method that draws stars from their distribution, the uncertainty of its fit included."""
-
-    def draw_stars(
-        self, count: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
-
-    def fitted_flux_error(self) -> tuple[float, tuple[float, ...]]:
-        """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
-
-
-@runtime_checkable
-class KnowsField(Protocol):
-    """Method that has a model of the PSF at every place of the field."""
-
-    @property
-    def order(self) -> int:
-        """Order of the polynomial by which the PSF changes over the field."""
-
-    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """Return the PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
-
-
-@runtime_checkable
-class FindsFlux(Protocol):
-    """Method that measures the flux over that by which an image was divided, in its free form."""
-
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, object]:
-        """Return this flux of images (n, d, d), shape (n,), and which clusters are near them.
-
-        `estimate` and `outlier_score` take the latter as `near_clusters` and look at no other.
-        """
-
-
-@runtime_checkable
-class ScoresOutliers(Protocol):
-    """Method that knows the distribution of the training stars, so that it scores outliers."""
-
-    def outlier_score(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Return how unlike all training stars images (n, d, d) are, shape (n,).
-
-        −2 ln of the probability density; for a normal law the square of Mahalanobis' distance.
-        """
-
-
 class Method:
     """Base of all methods; its name is that of its module.
 
@@ -348,6 +280,13 @@ class Method:
         None if no bundle holds it.
     groups : mapping
         Groups of the configuration that are its settings; `fit` gets them by name.
+    knows_field : bool
+        It has a model of the PSF at every place of the field, by which it measures flux, sky and
+        centre of a star together with its PSF: it has `measure`, `psf_at`, `order` and
+        `draw_stars`. `TrainingSet.bright` is for it.
+    finds_flux : bool
+        Its form `free_flux` measures the flux of an image, of which only an estimate was known: it
+        has `flux`.
     """
 
     name: ClassVar[str] = ""
@@ -356,6 +295,8 @@ class Method:
     storage: ClassVar[Storage | None] = Storage()
     packing: ClassVar[Packing | None] = Packing()
     groups: ClassVar[Mapping[str, type[Group]]] = {}
+    knows_field: ClassVar[bool] = False
+    finds_flux: ClassVar[bool] = False
 
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
@@ -422,6 +363,69 @@ class Method:
         """Return the PSFs by `predict`, which gets what the method needs besides the image."""
         inputs = (level,) * self.needs.level + (position,) * self.needs.position
         return self.predict(noisy, *inputs)
+
+    def outlier_score(
+        self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        """Return how unlike all training stars images (n, d, d) are, shape (n,).
+
+        −2 ln of the probability density; for a normal law the square of Mahalanobis' distance. None
+        if the method does not know the distribution of the training stars, or has the score in its
+        `estimate`. `near_clusters` is what `flux` returned of these images.
+        """
+        return None
+
+    # Methods with the capability `finds_flux`.
+
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the fluxes of images (n, d, d), over those by which they were divided, shape (n,).
+
+        The second array tells which clusters are near an image, (n, K): `estimate` and
+        `outlier_score` take it as `near_clusters`, and look at no others.
+        """
+        raise NotImplementedError(f"{self.name}: finds no fluxes")
+
+    # Methods with the capability `knows_field`.
+
+    @property
+    def order(self) -> int:
+        """Order of the polynomial by which the PSF changes over the field."""
+        raise NotImplementedError(f"{self.name}: knows no field")
+
+    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
+        """Return the PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
+        raise NotImplementedError(f"{self.name}: knows no field")
+
+    def measure(
+        self,
+        stamps: np.ndarray,
+        noise: np.ndarray,
+        position: np.ndarray | None = None,
+        centre: np.ndarray | None = None,
+        fixed: bool | np.ndarray = False,
+        flux: np.ndarray | None = None,
+        sky: np.ndarray | None = None,
+        gain: np.ndarray | None = None,
+    ) -> Estimate:
+        """Measure stars on stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
+        raise NotImplementedError(f"{self.name}: does not measure stars")
+
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
+        return np.zeros(len(position), bool)
+
+    def draw_stars(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draw noise-free stars from their distribution, the uncertainty of the fit included.
+
+        Returns images, positions and centres; see `psfdae.methods.field.FieldMixture.draw_stars`.
+        """
+        raise NotImplementedError(f"{self.name}: draws no stars")
+
+    def fitted_flux_error(self) -> tuple[float, tuple[float, ...]]:
+        """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
+        raise NotImplementedError(f"{self.name}: knows no field")
 
     # A fit as files, and as part of a bundle.
 

@@ -10,12 +10,12 @@ Plain mappings go into `parse_settings`, and checked, immutable groups come out.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from psfdae.errors import Error
+from psfdae.errors import Error, did_you_mean
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -73,16 +73,28 @@ def parse_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError("\n".join(_line(e) for e in error.errors())) from None
+        keys = list(keys_of(model))
+        raise ConfigError("\n".join(_line(e, keys) for e in error.errors())) from None
 
 
-def _line(error: Mapping[str, Any]) -> str:
-    """Return an error of pydantic's as a line with the key, its value and what is allowed."""
+def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a pydantic model, those of its groups after each group's name."""
+    for name, field in model.model_fields.items():
+        yield prefix + name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Group):
+            yield from keys_of(field.annotation, f"{prefix}{name}.")
+
+
+def _line(error: Mapping[str, Any], keys: Iterable[str]) -> str:
+    """Return an error of pydantic's as a line with the key, its value and what is allowed.
+
+    `keys` are those that there are: one that is like an unknown key is named.
+    """
     # Some of pydantic's messages say enough, or name the input already.
     key = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key"
+        return f"{key}: unknown key{did_you_mean(key, keys)}"
     if error["type"] == "missing":
         return f"{key}: missing"
     if error["type"] == "value_error":

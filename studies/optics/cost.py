@@ -9,10 +9,12 @@ thread, on a machine that does nothing else.
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 import time
 from datetime import date
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -23,7 +25,7 @@ from psfdae.methods import method
 from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import field_positions, read_stars, training_set
 from psfdae.threads import limit_threads
-from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds import mode_search
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.methods import wavefront
@@ -74,7 +76,8 @@ def main(results: Path, out: Path, picture: Path) -> None:
         if type(estimator).look.restores:
             add(type(estimator), estimator, {"starts": None, "draws": None})
     bank = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
-    preset = sampling.SEARCH
+    search = mode_search.search
+    defaults = inspect.signature(search).parameters
     for optics in ("wavefront", "wavefront_position"):
         kind = method(optics)
         data = training_set(config, kind, product, "random", REFERENCE)
@@ -83,9 +86,9 @@ def main(results: Path, out: Path, picture: Path) -> None:
         for effort in EFFORTS:
             starts = effort["starts"]
             fewer_starts = {"fields": starts, "offsets": starts} if starts else {}
-            sampling.SEARCH = preset._replace(**fewer_starts)
+            mode_search.search = partial(search, **fewer_starts)
             wavefront.DRAWS_PER_STAR = effort["draws"]
-            default_starts = preset.offsets if kind.needs.position else preset.fields
+            default_starts = defaults["offsets" if kind.needs.position else "fields"].default
             add(kind, fitted, effort | {"starts": starts or default_starts}, repeats=1)
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True

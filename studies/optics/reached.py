@@ -22,8 +22,9 @@ from psfdae.methods import method
 from psfdae.metrics import clustered_mean
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.threads import limit_threads
-from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.estimates import bounded_stars, true_modes
+from psfdae_paper.bounds.mode_search import climb
+from psfdae_paper.bounds.stamp_model import StarPosteriors
 from psfdae_paper.configuration.compose import load
 
 BOUND_OF = {"wavefront": "bayes", "wavefront_position": "bayes_position"}
@@ -88,10 +89,7 @@ def misses(config, product, bank, optics) -> dict:
     by_level = {}
     for level, noisy in stars.noisy.items():
         modes, doubtful = fitted.modes(noisy, level, position)
-        likelihood = fitted.likelihood(level)
-        counts = likelihood.counts(noisy)
-        posteriors = sampling.StarPosteriors(counts, likelihood, fitted.model)
-        summits = sampling.climb(truth, posteriors)
+        summits = climb(truth, StarPosteriors(noisy, fitted.likelihood(level), fitted.model))
         highest = np.full(count, -np.inf)
         np.maximum.at(highest, modes.star, modes.evidence)
         missing = summits.star[summits.evidence > highest[summits.star] + MISSED]

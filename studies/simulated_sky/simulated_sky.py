@@ -104,13 +104,13 @@ def places(
     truth: Annotated[File, "NPZ of `field`."],
     selection: Annotated[File, "selection.csv of from-stars on image and list."],
     bundle: Annotated[File, "Its model, of the method field."],
+    out: Annotated[File, "CSV with the errors of each package."],
     packages: Annotated[
         tuple[str, ...],
         {"flag": "--other"},
         "NAME=FILE of a package that learnt from the same stars: a .psf of PSFEx, or NPZ with psf "
         "(held-out stars, m, m), PSFs at the listed places about the pixel m//2, and oversampling.",
-    ],
-    out: Annotated[File, "CSV with the errors of each package."],
+    ] = (),
 ) -> None:
     """Errors of PSFs of sum 1 at the places of the stars that were held out.
 

@@ -7,7 +7,7 @@ from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import FramingError
-from psfdae_paper.stars.scenes import SLOPE_SAMPLES, TurbulentWavefronts, template_wavefronts
+from psfdae_paper.stars.scenes import TurbulentWavefronts, template_wavefronts
 from stress.bench import changed, propagation, stamp_mse
 
 FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the config's
@@ -63,7 +63,9 @@ class Ramps(list):
     """OPD maps that rise by so many waves per sample of the grid of the slopes."""
 
     def opd(self, index, axis, dtype):
-        ramp = 0.5 * SLOPE_SAMPLES * np.broadcast_to(axis, (axis.size, axis.size))
+        ramp = (
+            0.5 * TurbulentWavefronts.slope_samples * np.broadcast_to(axis, (axis.size, axis.size))
+        )
         return (np.array(self)[index, None, None] * ramp).astype(dtype)
 
 
@@ -75,7 +77,7 @@ def test_broken_wavefronts(bench, record):
         propagation(config, bad).stamps(16, CENTRED)
     steep = TurbulentWavefronts(Ramps([0.51]))
     with record.refused("OPD map, 0.51 waves per sample", SamplingError):
-        propagation(bench.turbulence.config, steep, pupil_samples=[SLOPE_SAMPLES])
+        propagation(bench.turbulence.config, steep, pupil_samples=[steep.slope_samples])
     with record.refused("brightest pixel outside the search window", FramingError):
         stamper(config, seidel(3 * static), 4).brightest()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psfdae.image.stamps import StarFlag, border_median
-from psfdae.model.flux_model import CLIP_SIGMA, robust_flux
+from psfdae.model.flux_model import FluxModel, robust_flux
 
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0  # sampling errors that a measured RMS may be off by
@@ -76,7 +76,7 @@ def test_hot_pixels(bench, record):
     usual = rms(robust_flux(images, model).flux - 1)
     # An excess that hides in the range of the training set counts in full at most.
     tolerated = model.pixel_range[1].reshape(stars.shape[1:])[3, 4]
-    hidden = tolerated + (CLIP_SIGMA + SIGMAS) * bench.noise.kappa * bench.level
+    hidden = tolerated + (FluxModel.clip_sigma + SIGMAS) * bench.noise.kappa * bench.level
     for excess in (1e-2, 1.0, 1e6):
         hot = put(images, (slice(None), 3, 4), images[:, 3, 4] + excess)
         robust, by_sum = rms(robust_flux(hot, model).flux - 1), rms(hot.sum(axis=(1, 2)) - 1)

@@ -40,7 +40,6 @@ from psfdae.model.fitting import (
 )
 from psfdae.model.settings import (
     DATASET_CHOICE,
-    IMAGE_GROUPS,
     Settings,
     SettingsReader,
     of_config,
@@ -151,7 +150,7 @@ def from_stars(
     if stamp_px is not None:
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
-    settings = with_keywords(of_config(config), IMAGE_GROUPS, size_settings)
+    settings = with_keywords(of_config(config), Settings.image_groups, size_settings)
     stem, sentence = model_name(image, name), ""
     if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")

@@ -24,11 +24,10 @@ from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
-from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import PsfModel, load_model
+from psfdae.model.psf_model import PsfModel, load_model, other_instrument
 from psfdae.options import File
 from psfdae.progress import silence
 
@@ -102,7 +101,7 @@ def predict_command(
     loaded = load_model(bundle)
     observation = open_for_model(loaded, source)
     # Options that only some images and models have.
-    measures_centres = isinstance(loaded.method, MeasuresStars)
+    measures_centres = loaded.method.knows_field
     if fixed_positions and not (measures_centres and observation.shape):
         raise PredictionError(
             f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
@@ -176,9 +175,9 @@ def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
 def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
     """Return sentences on another instrument than the training's, and on light beyond stamps."""
     notes = []
-    if difference := model.other_instrument(observation.instrument, observation.colour_column):
+    if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
-    if observation.shape and isinstance(model.method, KnowsField) and not model.wings:
+    if observation.shape and model.method.knows_field and not model.wings:
         notes.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{model.stamp_px} px; flux is the light in the stamp"

@@ -83,6 +83,7 @@ class FieldMixture(FieldLaw, Method):
         per_reference=True,
     )
     packing = Packing(together=4096, padded=False)
+    knows_field = True
     groups: ClassVar = {"field": FieldSettings}
 
     @classmethod

@@ -94,6 +94,7 @@ class GaussianMixture(MixtureLaw, Method):
     )
     packing: ClassVar[Packing | None] = Packing(together=8192, padded=False)
     groups: ClassVar = {"gmm": Gmm}
+    finds_flux = True
 
     @classmethod
     def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:

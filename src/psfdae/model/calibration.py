@@ -12,19 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Product
 from psfdae.image.stamps import StarFlag
-from psfdae.method import (
-    DrawsStars,
-    FindsFlux,
-    MeasuresStars,
-    Method,
-    ScoresOutliers,
-)
+from psfdae.method import Method
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import (
@@ -46,14 +41,8 @@ from psfdae.rng import stream
 NODES = 8
 """Noise levels at which errors are measured, equidistant in the logarithm."""
 
-MIN_IMAGES = 250
-"""Noisy images per node, at least; of fewer stars, each is seen several times."""
-
 COVERAGE = 0.6827
 """Part of the errors within a half-width; of a normal variable within ± 1 σ."""
-
-COVERAGE95 = 0.95
-"""Part of the errors within the wider half-width; of a normal variable within ± 1.96 σ."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +53,8 @@ class HeldOutStars:
 
     Attributes
     ----------
+    min_images : int
+        Noisy images per noise node, at least; of fewer stars, each is seen several times.
     images : ndarray, shape (n, d, d)
         Noise-free stars, to which noise is added.
     references : ndarray, shape (n, d, d)
@@ -84,6 +75,8 @@ class HeldOutStars:
     flux_error: np.ndarray
     own_noise: np.ndarray
 
+    min_images: ClassVar[int] = 250
+
     @classmethod
     def of(
         cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
@@ -91,13 +84,15 @@ class HeldOutStars:
         """Return some stars of a product "stars", by their indices."""
         truth = stars[reference]
         flux_error, pixel_noise = own_noise(stars, truth, noise.background)
+        # All stars of the product, of which the test stars are taken.
         arrays = (stars["realisation"], truth, field_positions(stars), flux_error, pixel_noise)
         images, references, position, *noise_in_image = (array[test] for array in arrays)
         return cls(images, references, noise, position, *noise_in_image)
 
     def draw(self, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Return at least `MIN_IMAGES` noisy images (n, d, d) of flux 1, and their stars (n,)."""
-        star = np.resize(np.arange(len(self.images)), max(len(self.images), MIN_IMAGES))
+        """Return at least `min_images` noisy images (n, d, d) of flux 1, and their stars (n,)."""
+        # Few stars are repeated, each time with other noise. λ is the noise over the flux and κ.
+        star = np.resize(np.arange(len(self.images)), max(len(self.images), self.min_images))
         return self.noise.draw(self.images[star], noise / self.noise.kappa, rng), star
 
     def errors(
@@ -176,9 +171,10 @@ class StarErrors:
         estimate = fitted.estimate(noisy, level, stars.position[star])
         # A method that scores stars by themselves does so in its form for estimated fluxes, as it
         # does for a user's stars.
-        score, free_flux = estimate.outlier_score, fitted.free_flux()
-        if score is None and isinstance(free_flux, ScoresOutliers):
-            score = free_flux.outlier_score(noisy, level)
+        score = estimate.outlier_score
+        if score is None:
+            score = fitted.free_flux().outlier_score(noisy, level)
+        # Errors in units of the method's σ, if it has one; distances with the noise of each star.
         error = stars.errors(estimate.psf, star, estimate.sigma).astype(np.float32)
         distance = mahalanobis(noisy, noise, model, components)
         shape = len(nodes), -1
@@ -214,7 +210,7 @@ class StarErrors:
         # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
         # are taken to have the same distribution.
         scaled = self.error / np.maximum(self.half_width, 1e-12)[:, None]
-        return np.array([np.quantile(node, COVERAGE95) for node in scaled], np.float64)
+        return np.array([np.quantile(node, 0.95) for node in scaled], np.float64)
 
     def outlier_limit(self) -> np.ndarray | None:
         """Return the outlier score that 0.1 % of the stars exceed at every node, shape (S,).
@@ -234,6 +230,7 @@ class StarErrors:
 
     def distance_limit(self) -> float:
         """Return the distance that 0.1 % of the stars exceed."""
+        # Distances have the noise in their unit: those of all nodes count together.
         quantile = float(np.quantile(self.distance, 0.999))
         return max(quantile, float(self._few_star_limit(self.distance).max()))
 
@@ -246,6 +243,7 @@ class StarErrors:
         """
         from scipy.stats import t
 
+        # A star that is seen several times, with other noise, shows no more of what stars are like.
         count = len(np.unique(self.star))
         if count >= 100:
             return np.zeros(len(distance))
@@ -289,6 +287,7 @@ def with_case_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Genera
     No training must have seen the stars: where noise is far below the errors that a method makes
     on other stars, those of the training do not tell.
     """
+    # Noise as it is found, and factors, at each node; the last axis is that of the nodes.
     errors = model.bundle.errors
     nodes = errors.noise
     measured = [_scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)]
@@ -300,8 +299,9 @@ def with_case_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Genera
         scale[index] = np.interp(nodes, noise[index[1], index[2]], scale[index])
     flux_scale = np.interp(nodes, noise[1, Estimated.FLUX_AND_SKY], flux_scale)
     # Errors of a method that measures stars were counted where the noise is estimated alone.
-    if isinstance(model.method, MeasuresStars):
+    if model.method.knows_field:
         scale[:, 0] = scale[:, 1]
+    # Nodes first, as `ErrorModel` has them.
     scale68, scale95 = np.moveaxis(scale, -1, 1)
     return replace(errors, scale68=scale68, scale95=scale95, flux_scale=flux_scale)
 
@@ -325,7 +325,7 @@ def _scales_at(
     noise, scale, flux_scale = np.full((2, count), node), np.ones((2, 2, count, 2)), 1.0
     # A method that measures stars needs no factor of their fluxes: for their pixels, which are
     # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
-    measures = isinstance(model.method, MeasuresStars)
+    measures = model.method.knows_field
     step, noise_cases = (3, (True,)) if measures else (1, (False, True))
     # Rows are cases times images, once with stated noise and once without.
     noisy, star = stars.draw(node, rng)
@@ -352,12 +352,12 @@ def _scales_at(
         over_ratio = error[usable] / np.maximum(prediction.ratio95, 1.0)[usable, None, None]
         for brightness, pixels in enumerate((~is_bright[usable], is_bright[usable])):
             scale[0, *index, brightness] = np.quantile(error[usable][pixels], COVERAGE)
-            scale[1, *index, brightness] = np.quantile(over_ratio[pixels], COVERAGE95)
+            scale[1, *index, brightness] = np.quantile(over_ratio[pixels], 0.95)
         # Pull of the flux, |F − 1| / σ_F: 95 % of a normal variable are within 1.96.
         if index == (1, Estimated.FLUX_AND_SKY) and not measures:
             flux_sigma = np.hypot(prediction.flux_error, stars.flux_error[star[image]])[usable]
             pull = np.abs(prediction.flux - 1.0)[usable] / flux_sigma
-            flux_scale = float(np.quantile(pull, COVERAGE95) / 1.96)
+            flux_scale = float(np.quantile(pull, 0.95) / 1.96)
     return noise, scale, flux_scale
 
 
@@ -400,7 +400,7 @@ def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> B
     return replace(bundle, errors=errors)
 
 
-def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
+def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
     """Return the bundle of a model with the errors of measured stars that the model makes.
 
     Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
@@ -409,7 +409,8 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
     bundle, rng = model.bundle, stream(seed, "noise", "calibration", "model")
     # S/N 2000 of a matched filter, where noise is far below the errors of most models.
     noise = 1.0 / (2000.0 * np.sqrt(bundle.info.noise_equivalent_px))
-    images, position, centre = fitted.draw_stars(MIN_IMAGES, rng)
+    # Measure stars of the fit's own law, of which flux, sky and centre are known: 1, 0 and drawn.
+    images, position, centre = fitted.draw_stars(HeldOutStars.min_images, rng)
     noisy = images + noise * rng.normal(size=images.shape)
     prediction = model.predict(noisy, position=position)
     usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
@@ -418,10 +419,12 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
 
     def lacking(off: np.ndarray, stated: np.ndarray) -> float:
         """√(e² − stated²) for the e within which 68 % of normal errors are, or 95 % within 1.96."""
+        # e in units of what is stated, from both quantiles; the model's part of e² is the rest.
         ratio = np.abs(off) / stated
-        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, COVERAGE95) / 1.96)
+        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, 0.95) / 1.96)
         return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
+    # The errors of the flux, of the sky, and of the centre, both axes together.
     fitted_flux, growth = fitted.fitted_flux_error()
     flux = lacking((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
@@ -444,17 +447,17 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     What the method does not know of a star's shape would pass for flux, if there is little noise
     beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
     """
-    if not issubclass(method(bundle.info.method), FindsFlux):
+    if not method(bundle.info.method).finds_flux:
         return bundle
     info, nodes = bundle.info, bundle.errors.noise
-    names = ("images", "references", "position")
-    test_stars = replace(stars, **{name: getattr(stars, name)[:MIN_IMAGES] for name in names})
+    test_stars = replace(stars, images=stars.images[: stars.min_images])
     # Bright stars: the lower half of the noise nodes.
     noisy = [test_stars.draw(node, rng) for node in nodes[: len(nodes) // 2]]
     # Geometric mean over the nodes of the MSE of PSFs of flux 1, until it rises.
     log_mse: list[float] = []
     misfits = (0.0, *nodes)
     for misfit in misfits:
+        # The same stars with another idea of the noise of the flux's estimate.
         model = PsfModel(replace(bundle, info=info.model_copy(update={"misfit": misfit})))
         logs = []
         for images, star in noisy:
@@ -495,6 +498,7 @@ def crossed_coverage(
         width95 = (width * other_half.ratio95()[:, None, None]).astype(width.dtype)
         halves.append((half, {"coverage68": width, "coverage95": width95}))
 
+    # Each half by the map of the other half, at the noise that is asked for; then their mean.
     def covered(error: np.ndarray, noise: float) -> dict[str, float]:
         parts: dict[str, list[float]] = {}
         for half, widths in halves:

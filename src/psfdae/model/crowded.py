@@ -17,18 +17,17 @@ import numpy as np
 from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
-from psfdae.model.flux_model import FAINT_SNR
-from psfdae.model.joint_fit import JointFit, chains, fit_stars, pairs_within
+from psfdae.model.flux_model import is_faint
+from psfdae.model.joint_fit import fit_stars, pairs_within
+from psfdae.model.photon_noise import pixel_error
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_shares
+from psfdae.model.restoration import MAX_CHI2
+from psfdae.model.wings import StarFluxes, Wings, aperture_correction, around_stars, outer_shares
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from psfdae.model.field_psfs import FieldPsfs
-
-SAME_FWHM = 0.5
-"""Distance in FWHM below which two stars cannot be told apart: they are one."""
 
 
 @dataclass(frozen=True)
@@ -96,17 +95,19 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
+    same_px = 0.5 * fwhm  # two stars nearer to each other cannot be told apart: they are one
     # The image with its sky; saturated pixels are not fitted.
     sky = observation.sky()
-    image, bad = sky.flat + sky.level, sky.bad
-    if observation.saturate is not None:
-        bad = bad | (image >= observation.saturate)
-        sky = replace(sky, bad=bad)
+    image = sky.flat + sky.level
+    limit = np.inf if observation.saturate is None else observation.saturate
+    saturated = image >= limit
+    bad = sky.bad | saturated
+    sky = replace(sky, bad=bad)
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
     wings, wing_light = None, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
-    error = _pixel_error(sky.noise, sky.flat, observation.gain)
+    error = pixel_error(sky.noise, sky.flat, observation.gain)
     for turn in range(3):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
@@ -115,45 +116,44 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
-        outer_parts = outer_shares(model.on_pixels, place)
+        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place))
         sky, wing_light, wings, sigma = around_stars(
-            image, sky, error, fit.light, place, flux, outer_parts, side, wings
+            image, sky, error, fit.light, fluxes, side, wings
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
-        error = _pixel_error(sky.noise, fit.light + wing_light, observation.gain)
+        error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
         if turn == 0 and observation.detections is not None:
-            place, flux = _with_hidden(sky, sigma, place, flux, threshold, fwhm)
+            place, flux = with_hidden_stars(sky, sigma, place, flux, threshold, fwhm)
             origin = np.concatenate([origin, place[len(origin) :]])
         elif turn > 0:
             # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
             # or if it has moved to another star.
             sigma = _psf_doubt(place, flux, side, area_px)
             real = flux > 3.0 * np.hypot(fit.flux_error, sigma)
-            real[pairs_within(place, SAME_FWHM * fwhm)] = False
+            real[pairs_within(place, same_px)] = False
             real[: observation.count] = True
             if real.all() or turn == 2:
                 break
             place, flux, origin = place[real], flux[real], origin[real]
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    result = _described(model, fit, 2.4 * fwhm, sky.flat, fit.light + wing_light, wings_used)
-    stars = result.stars
+    total: np.ndarray | float = 1.0
+    if wings_used is not None:
+        total, _ = wings_used.total(outer_shares(model.on_pixels, fit.place))
+    stars = fit.table(total, 2.4 * fwhm)
     # The error of the PSF is no noise, and is as large a part of each flux.
     model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1)) * stars["flux"]
     stars["flux_error"] = np.hypot(stars["flux_error"], model_error)
-    saturated = np.zeros(image.shape, dtype=bool)
-    if observation.saturate is not None:
-        saturated = image >= observation.saturate
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Farther from where it was expected than noise explains, a star may be another one.
     distance_px = np.hypot(*(fit.place - origin).T)
     sigma_px = np.hypot(stars["x_error"], stars["y_error"])
-    is_far = distance_px > np.maximum(SAME_FWHM * fwhm, 3.0 * sigma_px)
+    is_far = distance_px > np.maximum(same_px, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
     if observation.detections is None:
         stars["id"] = observation.stars.id
         stars["flags"] |= observation.stars.flags
-    return result
+    return CrowdedPhotometry(model, stars, sky.flat, fit.light + wing_light, wings_used)
 
 
 def star_flags(
@@ -188,17 +188,12 @@ def star_flags(
     # Flux, fit and neighbours.
     flux, error = np.array(stars["flux"]), np.array(stars["flux_error"])
     raise_flag(flags, StarFlag.NO_FLUX, ~np.isfinite(flux))
-    raise_flag(flags, StarFlag.FAINT, flux < FAINT_SNR * error)
+    raise_flag(flags, StarFlag.FAINT, is_faint(flux, error))
     # Not at rest, or a place at its bound.
-    raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > 10.0) | (photutils & 8 > 0))
+    raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > MAX_CHI2) | (photutils & 8 > 0))
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
     raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
     return flags
-
-
-def _pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
-    """Return σ (h, w) of pixels, σ² = noise² of the sky + light of stars over the gain."""
-    return np.hypot(noise, np.sqrt(np.maximum(light, 0.0) / gain)) if gain else noise
 
 
 def _box(fwhm: float) -> int:
@@ -206,7 +201,7 @@ def _box(fwhm: float) -> int:
     return 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
 
 
-def _with_hidden(
+def with_hidden_stars(
     sky: Sky, error: np.ndarray, place: np.ndarray, flux: np.ndarray, threshold: float, fwhm: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return places and fluxes with those of stars in what is left of an image with this error."""
@@ -220,7 +215,7 @@ def _with_hidden(
     # X_IMAGE counts from 1. Those at a star that was fitted are its residuals.
     candidates = np.stack([residual_stars["X_IMAGE"], residual_stars["Y_IMAGE"]], axis=1) - 1.0
     located = place[np.isfinite(place).all(axis=1)]
-    is_alone = cKDTree(located).query(candidates)[0] > SAME_FWHM * fwhm
+    is_alone = cKDTree(located).query(candidates)[0] > 0.5 * fwhm
     return np.concatenate([place, candidates[is_alone]]), np.append(
         flux, residual_stars["FLUX_ISO"][is_alone]
     )
@@ -239,35 +234,3 @@ def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -
     for first, second in ((0, 1), (1, 0)):
         np.add.at(square, pairs[:, first], np.square(flux[pairs[:, second]]))
     return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))
-
-
-def _described(
-    model: FieldPsfs,
-    fit: JointFit,
-    group_px: float,
-    residual: np.ndarray,
-    light: np.ndarray,
-    wings: Wings | None,
-) -> CrowdedPhotometry:
-    """Return the stars of a fit with their fluxes, wings included, and their chains.
-
-    Chains hold stars that are nearer than `group_px` to the next one.
-    """
-    from astropy.table import Table
-
-    # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as much
-    # in the fluxes as in the residuals.
-    excess = np.sqrt(np.fmax(fit.chi2, 1.0))
-    stars = Table({"id": np.arange(1, len(fit.flux) + 1)})
-    stars["x"], stars["y"] = fit.place.T
-    stars["x_error"], stars["y_error"] = excess * fit.place_error.T
-    total: np.ndarray | float = 1.0
-    if wings is not None:
-        total, _ = wings.total(outer_shares(model.on_pixels, fit.place))
-    stars["flux"], stars["flux_error"] = total * fit.flux, total * excess * fit.flux_error
-    stars["flux_model"] = fit.flux
-    # Chains of neighbours, numbered from 1.
-    group = chains(fit.place, group_px)
-    stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
-    stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
-    return CrowdedPhotometry(model, stars, residual, light, wings)

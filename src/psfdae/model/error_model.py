@@ -66,6 +66,7 @@ class ModelErrors(NamedTuple):
 
         1 where the place is not known (NaN).
         """
+        # v = (a, b, c, d) · (1, u², w², u² w²).
         u2, w2 = np.square(place - np.array(self.growth[:2])).T
         terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
         return np.where(np.isfinite(u2 + w2), np.sqrt(np.array(self.growth[2:]) @ terms), 1.0)
@@ -94,6 +95,7 @@ class ModelErrors(NamedTuple):
         variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
         known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
         model_sigma[np.sqrt(variance) < known_sigma] = 0.0
+        # Both errors are independent, and those of the model in each number are taken to be, too.
         return np.asarray(covariance + model_sigma[:, :, None] ** 2 * np.eye(4))
 
 
@@ -143,6 +145,7 @@ class ErrorModel:
     @staticmethod
     def shapes(nodes: int, stamp_px: int) -> dict[str, tuple[int, ...]]:
         """Return the shape of every array of errors at S nodes, in stamps of a side, by name."""
+        # Noise stated or estimated; what of flux and sky was estimated; faint or bright pixels.
         case = (nodes, 2, len(Estimated), 2)
         return {
             "noise": (nodes,),
@@ -160,12 +163,14 @@ class ErrorModel:
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
         values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
+        # Ten numbers of the model's own errors: four of them, and the six of their growth.
         flux, sky, centre, fitted_flux, *growth = arrays["measured"].tolist()
         measured = ModelErrors(flux, sky, centre, fitted_flux, tuple(growth))
         return cls(**values | {"measured": measured})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
+        # The reverse of `of_arrays`.
         values = {table.name: getattr(self, table.name) for table in fields(self)}
         values["measured"] = [*self.measured[:4], *self.measured.growth]
         return {
@@ -204,6 +209,7 @@ class ErrorModel:
         half_width = at_noise(noise, self.noise, self.half_width68)
         if sigma is not None:
             half_width = half_width * sigma
+        # The half-width of 95 %, as a multiple of that of 68 %.
         ratio95 = np.interp(noise, self.noise, self.ratio95)
         # Factors of the case of each star, for faint and bright pixels, shape (n, 2).
         estimates_noise, estimates_flux, estimates_sky = (
@@ -213,14 +219,17 @@ class ErrorModel:
 
         def at_case(table: np.ndarray) -> np.ndarray:
             """Interpolate a table of all cases (S, 2, 3, 2) at the noise and case of each star."""
+            # Linear in the noise, each of the 12 numbers of a node by itself.
             columns = table.reshape(len(table), -1).T
             values = np.stack([np.interp(noise, self.noise, column) for column in columns], axis=1)
             of_case = values.reshape(-1, *table.shape[1:])
             return np.asarray(of_case[np.arange(len(noise)), estimates_noise.astype(int), case])
 
+        # A pixel has the factor of its brightness; ratios of 95 % follow from both factors.
         scale68, scale95 = at_case(self.scale68), at_case(self.scale95)
         faint_scale, bright_scale = scale68.T.astype(np.float32)[:, :, None, None]
         half_width = half_width * np.where(brightest(psf), bright_scale, faint_scale)
+        # The stated error of a flux is scaled where it was counted: with flux and sky estimated.
         flux_scale = np.interp(noise, self.noise, self.flux_scale)
         flux_scale = np.where(estimates_flux & estimates_sky, flux_scale, 1.0)
         return half_width, ratio95[:, None] * scale95 / scale68, flux_scale
@@ -229,6 +238,7 @@ class ErrorModel:
         self, noise: np.ndarray, distance: np.ndarray, outlier_score: np.ndarray
     ) -> np.ndarray:
         """Return True for stars beyond the limits of distance or score; all of shape (n,)."""
+        # A distance is in units of the training set at any noise; a score has a limit at each node.
         is_unlike = distance > self.distance_limit
         if self.outlier_limit is not None:
             is_unlike |= outlier_score > np.interp(noise, self.noise, self.outlier_limit)
@@ -260,6 +270,7 @@ def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarr
     lower = np.where(np.isfinite(position), np.minimum(position, len(nodes) - 1), 0).astype(np.intp)
     upper = np.minimum(lower + 1, len(nodes) - 1)
     fraction = (position - lower).astype(maps.dtype)[:, None, None]
+    # (1 − f) · lower map + f · upper map; a noise that is NaN has a fraction that is NaN.
     return np.asarray(maps[lower] * (1 - fraction) + maps[upper] * fraction)
 
 

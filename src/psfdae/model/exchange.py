@@ -176,7 +176,7 @@ class PsfexField(FieldPsfs):
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: files of PSFEx do not say how large pixels are."""
 
-    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         position = position[:, :2]  # neither magnitude nor colour
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T

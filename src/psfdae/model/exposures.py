@@ -14,13 +14,11 @@ from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import creation_date
 from psfdae.model.field_psfs import PredictionError
-from psfdae.model.psf_model import PsfModel
+from psfdae.model.psf_model import PsfModel, other_instrument
 from psfdae.model.settings import of_config
+from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
 from psfdae.model.stars import Stars
 from psfdae.version import __version__
-
-MIN_STARS = 5
-"""Number of bright stars of an exposure from which cross-validation can judge a change."""
 
 
 def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, str]:
@@ -57,6 +55,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     info, field = model.info, model.method
     if not isinstance(field, FieldMixture):
         raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
+    # How much an exposure may change is judged from the field of the training.
     if info.adapted:
         raise PredictionError(
             f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
@@ -71,13 +70,13 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
             f"the model {model.name!r} does not say how its stars were chosen"
         ) from None
     # Its bright stars, chosen as those of the training, but few are enough.
-    calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS})
+    calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
     observation = source.open(info.stamp_px, calibration.margin_px).assuming()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
-    difference = model.other_instrument(observation.instrument, observation.colour_column)
+    difference = other_instrument(model, observation)
     bright = collect(observation, calibration, settings.framing).bright
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
@@ -107,10 +106,11 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
         Adapted models, by the images' names without suffix; `model` itself where its method knows
         no field, or an image has fewer than 5 bright stars.
     """
+    # An image with too few bright stars keeps the model of all images.
     field, models = model.method, {}
     for image in stars.exposures:
         bright, models[image.name] = image.candidates.bright, model
-        if isinstance(field, FieldMixture) and len(bright) >= MIN_STARS:
+        if isinstance(field, FieldMixture) and len(bright) >= MIN_STARS_WITH_ERROR:
             models[image.name] = _adapt(model, field, image.observation, bright, image.name)
     return models
 

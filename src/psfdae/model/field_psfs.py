@@ -94,7 +94,7 @@ class FieldPsfs(ABC):
         """
 
     @abstractmethod
-    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         """Return PSFs (n, m, m) as `psf_at`, at checked positions (n, 2) to (n, 4).
 
         Columns are x, y, magnitude and colour; NaN stands for an average over the training stars.
@@ -152,8 +152,9 @@ class FieldPsfs(ABC):
         # Memory grows as its square; the PSF has no structure at a 32nd of a pixel.
         if not 1 <= oversampling <= 32:
             raise PredictionError(f"oversampling {oversampling}: 1 to 32")
+        # A position far outside the image may overflow, which is refused below.
         with np.errstate(all="ignore"):
-            psfs = self._psfs(position.reshape(-1, count), oversampling)
+            psfs = self.draw_psfs(position.reshape(-1, count), oversampling)
         # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
         # give anything.
         flux = psfs.sum(axis=(1, 2))
@@ -248,6 +249,7 @@ def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
         If the values, called `name` in the message, are no real numbers.
     """
     # Floats of up to 32 bits become float32, all other numbers float64.
+    # Texts, complex numbers and objects are refused.
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")

@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.fits import described_by
-from psfdae.method import KnowsField, Method
+from psfdae.method import Method
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import model_of, with_wings
@@ -86,6 +86,7 @@ def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Metho
     Too few stars are left to choose a method by validation, and only the field falls back to one
     PSF for all.
     """
+    # Without the field among them, all are tried, however few the stars are.
     field = [kind for kind in kinds if kind.name == "field"]
     return field if field and len(stars) < ENOUGH_STARS else [*kinds]
 
@@ -111,6 +112,7 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
     MissingExtraError
         If the method needs a package that is not installed.
     """
+    # The stars as the method takes them: of the image, without those that are held out.
     data = training_set(
         stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
     )
@@ -189,7 +191,7 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
     description = described(stars, type(fitted))
     with fixed_threads(settings.evaluation.threads):
         model = model_of(fitted, stars.product, REFERENCE, settings, description, name, licence)
-        if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
+        if not fitted.knows_field or stars.observation.shape is None:
             return model
         # Light beyond the stamps, by all stars of each image; neighbours may have measured it.
         measured = (

@@ -20,24 +20,18 @@ are known should be NaN. No star influences another one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.moments import SIGMA_OF_MAD
 
-FAINT_SNR = 3.0
-"""Flux over its standard error below which a star has the flag FAINT."""
-
-MIN_GOOD_PIXELS = 0.5
-"""Fraction of the pixels of a stamp that a fit needs."""
-
 NOISE_FLOOR = 1e-6
 """Least σ in units of a typical pixel of the star, as images may have no noise."""
-
-CLIP_SIGMA = 5.0
-"""σ of the noise by which good pixels may leave the range of the training set."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +50,14 @@ class FluxModel:
         Least and greatest value of every pixel in the set.
     other_variance : float
         Variance along all directions that `basis` leaves out.
+    min_good_pixels : float
+        Fraction of the pixels of a stamp that a fit needs.
+    clip_sigma : float
+        σ of the noise by which good pixels may leave the range of the training set.
     """
+
+    min_good_pixels: ClassVar[float] = 0.5
+    clip_sigma: ClassVar[float] = 5.0
 
     mean: np.ndarray
     basis: np.ndarray
@@ -107,14 +108,16 @@ class FluxModel:
         variance, basis = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
         return cls(mean, basis, np.maximum(variance, 0.0), flat.min(axis=0), flat.max(axis=0))
 
+    @cached_property
     def with_free_sky(self) -> FluxModel:
-        """Return the model of stars on an unknown constant sky."""
+        """Model of stars on an unknown constant sky, which few stars need."""
         # An unknown sky is one more direction of C, of a variance that is as good as infinite in
         # units of the flux squared: C + 10⁴ c cᵀ, with the constant c of length 1.
         free_sky_variance = 1e4
         constant = np.full((self.mean.size, 1), self.mean.size**-0.5)
         if not self.is_complete:
-            # All but the rest of the covariance lives in the space of basis and constant.
+            # All but the rest of the covariance, which is the same along all directions, lives in
+            # the space of basis and constant.
             space = np.linalg.qr(np.hstack([self.basis, constant]))[0]
             modes, sky = space.T @ self.basis, space.T @ constant
             inside = (modes * (self.variance - self.other_variance)) @ modes.T
@@ -124,6 +127,11 @@ class FluxModel:
         covariance = (self.basis * self.variance) @ self.basis.T
         variance, basis = np.linalg.eigh(covariance + free_sky_variance * constant @ constant.T)
         return replace(self, basis=basis, variance=np.maximum(variance, 0.0))
+
+
+def is_faint(flux: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return True for stars whose flux is below 3 times its standard error: the flag FAINT."""
+    return flux < 3.0 * error
 
 
 def signal_to_noise(noise: float, area: float) -> float:
@@ -140,35 +148,60 @@ def signal_to_noise(noise: float, area: float) -> float:
 
 
 @dataclass(frozen=True)
-class FluxEstimate:
-    """Fluxes of n stars, in the unit of their stamps.
+class Photometry:
+    """Photometry of n stamps, in the unit of the stamps; NaN where it is not possible.
 
     Attributes
     ----------
-    flux : ndarray, shape (n,)
-        NaN where no fit was possible.
-    error : ndarray, shape (n,)
+    flux, background, noise : ndarray, shape (n,)
+        Flux of the star, sky per pixel, and RMS of a pixel by the noise of the sky.
+    flux_error : ndarray, shape (n,)
         Standard error from the noise of the sky and the variation of the PSF, without the photon
-        noise of the star.
-    noise : ndarray, shape (n,)
-        RMS of a pixel, from the residuals.
-    flags : ndarray of uint16, shape (n,)
-        MASKED, OUTLIER, FAINT or NO_FLUX.
-    images : ndarray, shape (n, d, d), float64
-        Stamps with bad pixels replaced; zeros where no fit was possible.
+        noise of the star; NaN where the flux was given.
+    images : ndarray, shape (n, d, d)
+        Stamps without sky and repaired, zero without flux: as they are by `robust_flux`, of flux 1
+        and float32 by `psfdae.model.photometry.Photometer`.
     used : ndarray of bool, shape (n, d, d)
         Pixels that were measured; the others are repaired.
+    flags : ndarray of uint16, shape (n,)
+        Sum of the values of `StarFlag`.
     """
 
     flux: np.ndarray
-    error: np.ndarray
+    flux_error: np.ndarray
+    background: np.ndarray
     noise: np.ndarray
-    flags: np.ndarray
     images: np.ndarray
     used: np.ndarray
+    flags: np.ndarray
+
+    def part(self, rows: slice) -> Photometry:
+        """Return the photometry of a part of the stamps."""
+        return Photometry(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Photometry]) -> Photometry:
+        """Return the photometry of the stamps of several, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        # Column by column, from all parts.
+        columns = ([getattr(p, field.name) for p in parts] for field in fields(cls))
+        return cls(*map(np.concatenate, columns))
+
+    def with_flux(self, factor: np.ndarray) -> Photometry:
+        """Return the same light with fluxes times a factor (n,), the rest of it being sky."""
+        # F image + b = f F image' + b', where image' has the sum 1 as well: what the flux has less,
+        # the sky has more, b' = b + F (1 − f)/P.
+        sky, scale = (1.0 - factor) / self.images[0].size, factor[:, None, None]
+        return replace(
+            self,
+            flux=self.flux * factor,
+            background=self.background + self.flux * sky,
+            images=((self.images - sky[:, None, None]) / scale).astype(self.images.dtype),
+        )
 
 
-def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
+def robust_flux(images: np.ndarray, model: FluxModel) -> Photometry:
     """Fit flux and noise of every stamp, without its bad pixels.
 
     | stamp | flux | flags |
@@ -200,7 +233,7 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
     flat = np.where(finite, flat, 0.0)
     maximum = flat.max(axis=1, where=finite, initial=-np.inf)
     minimum = flat.min(axis=1, where=finite, initial=np.inf)
-    possible = (finite.mean(axis=1) >= MIN_GOOD_PIXELS) & (maximum > minimum)
+    possible = (finite.mean(axis=1) >= model.min_good_pixels) & (maximum > minimum)
     # A stand-in for hopeless stars: linear algebra on fewer rows would round the others anew.
     x = np.where(possible[:, None], flat, model.mean)
     usable_pixel = finite | ~possible[:, None]
@@ -213,18 +246,18 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
         scaled = np.clip(x / unit[:, None], -1e15, 1e15)
     flux, error, sigma, is_used, repaired = _robust_fit(scaled, usable_pixel, model)
     # Flags: a star has no flux if too few pixels are left, or the flux is below its error.
-    fitted = possible & (is_used.mean(axis=1) >= MIN_GOOD_PIXELS)
+    fitted = possible & (is_used.mean(axis=1) >= model.min_good_pixels)
     usable = fitted & (flux > error)
     flags = np.zeros(len(images), np.uint16)
     raise_flag(flags, StarFlag.MASKED, ~finite.all(axis=1))
     raise_flag(flags, StarFlag.OUTLIER, possible & (is_used < usable_pixel).any(axis=1))
-    raise_flag(flags, StarFlag.FAINT, usable & (flux < FAINT_SNR * error))
+    raise_flag(flags, StarFlag.FAINT, usable & is_faint(flux, error))
     raise_flag(flags, StarFlag.NO_FLUX, ~usable)
     flux, error, sigma = (np.where(fitted, v * unit, np.nan) for v in (flux, error, sigma))
     repaired = np.where(fitted[:, None], repaired * unit[:, None], 0.0)
     used = is_used & fitted[:, None]
     stamps = (repaired.reshape(images.shape), used.reshape(images.shape))
-    return FluxEstimate(flux, error, sigma, flags, *stamps)
+    return Photometry(flux, error, np.zeros(len(flux)), sigma, *stamps, flags)
 
 
 def _robust_fit(
@@ -268,19 +301,19 @@ def _robust_fit(
     # Flux, noise and outliers settle in three or four rounds.
     for _ in range(5):
         positive = np.maximum(flux, 0.0)[:, None]
-        noise = CLIP_SIGMA * sigma[:, None]
+        noise = model.clip_sigma * sigma[:, None]
         is_used = finite & (x <= positive * high + noise) & (x >= positive * low - noise)
         # A star without enough pixels is given up; its numbers only have to be defined.
-        used = np.where((is_used.mean(axis=1) >= MIN_GOOD_PIXELS)[:, None], is_used, finite)
+        used = np.where((is_used.mean(axis=1) >= model.min_good_pixels)[:, None], is_used, finite)
         # F² in S, from the last round, and never below the variance of F by the noise alone.
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
-        flux, error, score, repaired = _generalised_least_squares(x, used, prior, sigma, model)
+        flux, error, score, repaired = generalised_least_squares(x, used, prior, sigma, model)
         # Scores have a standard deviation of 1 if σ is right.
         sigma = np.maximum(sigma * np.clip(scatter(score, used), 0.2, 1.5), NOISE_FLOOR)
     return flux, error, sigma, is_used, repaired
 
 
-def _generalised_least_squares(
+def generalised_least_squares(
     x: np.ndarray, used: np.ndarray, prior: np.ndarray, sigma: np.ndarray, model: FluxModel
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Fit the flux with S = prior · C + σ²I over the used pixels of every star.
@@ -321,10 +354,21 @@ def _generalised_least_squares(
             mean[star, bad] = -mean[star] @ gain
             precision[star] -= (gain * columns).sum(axis=1)
         else:
-            fill, is_visible = _reduced(model.basis[bad], weight[star], common[star])
+            # The same by Woodbury's identity, in the space of K eigenvectors: S⁻¹_ub (S⁻¹_bb)⁻¹ =
+            # B_u R B_bᵀ with R = (w₀ + (w − w₀) G)⁻¹ (w − w₀) and G = B_bᵀB_b.
+            rows, excess = model.basis[bad], weight[star]
+            gram, identity = rows.T @ rows, np.eye(excess.size)
+            # Modes that lie in the unused pixels alone would make it singular, but for the last
+            # digits.
+            system = common[star] * (1.0 + 1e-12) * identity + excess[:, None] * gram
+            solution = np.linalg.solve(system, np.diag(excess))
+            reduced = excess[:, None] * (identity - gram @ solution) / common[star]
+            fill = reduced @ rows.T
             data[star, bad] = -(data[star] @ model.basis) @ fill
             mean[star, bad] = -(mean[star] @ model.basis) @ fill
-            precision[star] -= ((model.basis @ is_visible) * model.basis).sum(axis=1)
+            # The diagonal of S⁻¹ falls by that of B R G (w − w₀) Bᵀ.
+            loss = (reduced @ gram) * excess
+            precision[star] -= ((model.basis @ loss) * model.basis).sum(axis=1)
     # F = mᵀS⁻¹x / mᵀS⁻¹m, and its variance 1 / mᵀS⁻¹m.
     data_modes, mean_modes = data @ model.basis, mean @ model.basis
     information = (mean_modes**2 * weight).sum(axis=1) + common * (mean**2).sum(axis=1)
@@ -336,30 +380,3 @@ def _generalised_least_squares(
     score = np.abs(residual) / np.sqrt(np.where(used, precision, 1.0))
     repaired = np.where(used, x, data + flux[:, None] * (model.mean - mean))
     return flux, 1.0 / np.sqrt(information), score, repaired
-
-
-def _reduced(rows: np.ndarray, weight: np.ndarray, common: float) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate unused pixels by Woodbury's identity, in the space of K eigenvectors.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (b, K)
-        Rows of the basis of the unused pixels.
-    weight : ndarray, shape (K,)
-        Weights w − w₀ of the eigenvectors.
-    common : float
-        Weight w₀ of all other directions.
-
-    Returns
-    -------
-    fill : ndarray, shape (K, b)
-        Factor from a star's modes to what its unused pixels lack.
-    loss : ndarray, shape (K, K)
-        Form by which the precision of the used pixels falls.
-    """
-    gram = rows.T @ rows
-    # Modes that lie in the unused pixels alone would make it singular, but for the last digits.
-    system = common * (1.0 + 1e-12) * np.eye(weight.size) + weight[:, None] * gram
-    solution = np.linalg.solve(system, np.diag(weight))
-    reduced = weight[:, None] * (np.eye(weight.size) - gram @ solution) / common
-    return reduced @ rows.T, (reduced @ gram) * weight

@@ -21,10 +21,8 @@ import numpy as np
 from psfdae.model.psf_grid import PsfGrid
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from scipy.sparse import csc_array
-
-PARAMETERS = 3
-"""Number of parameters of a star: flux, and position x and y."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,28 @@ class JointFit:
     chi2: np.ndarray
     flags: np.ndarray
     light: np.ndarray
+
+    def table(self, flux_factor: np.ndarray | float, group_px: float) -> Table:
+        """Return a row for each star, with its chain of stars nearer to each other than `group_px`.
+
+        Fluxes have the factor (n,) by which a star has more light than its model.
+        """
+        from astropy.table import Table
+
+        # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as
+        # much in the fluxes as in the residuals.
+        excess = np.sqrt(np.fmax(self.chi2, 1.0))
+        stars = Table({"id": np.arange(1, len(self.flux) + 1)})
+        stars["x"], stars["y"] = self.place.T
+        stars["x_error"], stars["y_error"] = excess * self.place_error.T
+        stars["flux"] = flux_factor * self.flux
+        stars["flux_error"] = flux_factor * excess * self.flux_error
+        stars["flux_model"] = self.flux
+        # Chains of neighbours, numbered from 1.
+        group = chains(self.place, group_px)
+        stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
+        stars["chi2"], stars["photutils_flags"] = self.chi2, self.flags
+        return stars
 
 
 def fit_stars(
@@ -105,6 +125,7 @@ def fit_stars(
         moving = (expected > 0.01)[group]
         if not moving.any():
             break
+        # Stars of a group at rest stay where they are.
         rows = np.flatnonzero(moving)
         fit.move(rows, step[rows])
         # Levenberg (1944, Q. Appl. Math. 2, 164): a step of a group after which it fits worse is
@@ -116,7 +137,8 @@ def fit_stars(
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.squares() if len(back) else squares
-    return fit.result(len(place), fit.design(), prior, moving, middle, range_px)
+    bound = np.abs(fit.place - middle) > 0.999 * range_px
+    return fit.result(len(place), prior, moving, bound)
 
 
 def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
@@ -127,6 +149,7 @@ def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
     from scipy.spatial import cKDTree
 
     located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    # Numbers of the tree are those of the located stars.
     pairs = cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")
     return np.asarray(located[pairs])
 
@@ -139,6 +162,7 @@ def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    # Chains are the connected components of the graph of these pairs.
     pairs = pairs_within(place, distance_px)
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])
@@ -151,6 +175,8 @@ class _Fit:
     stars at its edge are whole.
     """
 
+    parameters = 3  # of a star: flux, and position x and y
+
     def __init__(
         self,
         psfs: PsfGrid,
@@ -161,6 +187,7 @@ class _Fit:
         box_px: int,
     ) -> None:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
+        # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
         side = psfs.side_px
         self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float64), side)
         weight = np.pad(np.where(bad, 0.0, 1.0 / error), side)
@@ -173,7 +200,7 @@ class _Fit:
         self.stars = np.flatnonzero(on_image)
         self._middle = np.rint(place[self.stars]).astype(int)
         pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
-        fitted = pixels >= PARAMETERS
+        fitted = pixels >= self.parameters
         self.stars, self._middle, self.pixels = (
             values[fitted] for values in (self.stars, self._middle, pixels)
         )
@@ -181,11 +208,12 @@ class _Fit:
         # are the pixels of all boxes.
         self.boxes, self._stamps = map(self._pixel_numbers, (box_px, side))
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
+        # Places and fluxes at the start, the stars' light and its derivatives there.
         self.weight = weight.ravel()[self.boxes]
         self.start = place[self.stars].astype(np.float64)
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
         self._light = np.empty((len(self.stars), side, side))
-        self._derivatives = np.empty((len(self.stars), PARAMETERS, box_px, box_px))
+        self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         self._draw(np.arange(len(self.stars)))
 
     def _pixel_numbers(self, side_px: int) -> np.ndarray:
@@ -196,6 +224,7 @@ class _Fit:
 
     def _draw(self, rows: np.ndarray) -> None:
         """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
+        # Of a stamp, the box in its middle decides. 512 stars at a time, for memory.
         side = self.psfs.side_px
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
@@ -205,6 +234,7 @@ class _Fit:
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""
+        # Stamps of stars overlap: pixels that several have are subtracted from several times.
         light = flux[:, None, None] * self._light[rows]
         np.subtract.at(self.residual.reshape(-1), self._stamps[rows], light)
 
@@ -219,6 +249,7 @@ class _Fit:
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
         """Change flux, x and y of some stars by (k, 3)."""
+        # The light as it was goes back into the residuals, and that of the new place is taken off.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
         self.place[rows] += change[:, 1:]
@@ -227,11 +258,13 @@ class _Fit:
 
     def design(self) -> np.ndarray:
         """Return the derivatives (m, 3, b, b) of the light by flux, x and y, in units of σ."""
+        # ∂(F P)/∂F = P, ∂(F P)/∂x = F ∂P/∂x, and the same by y.
         factor = np.stack([np.ones_like(self.flux), self.flux, self.flux], axis=1)
         return np.asarray(self._derivatives * factor[..., None, None] * self.weight[:, None])
 
     def squares(self) -> np.ndarray:
         """Return the sums (m,) of the squared residuals in the boxes, in units of σ."""
+        # χ² of each box; the light of all other stars is subtracted there, too.
         residual = self.weight * self.residual.ravel()[self.boxes]
         return np.asarray(np.square(residual).sum(axis=(1, 2)))
 
@@ -242,6 +275,7 @@ class _Fit:
         from scipy.sparse import diags_array
         from scipy.sparse.linalg import splu
 
+        # Levenberg's damping is a part of the diagonal, which is 1 in these units.
         matrix, unit = _normal_matrix(design, self._rows, prior)
         added = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
         matrix = (matrix + diags_array(added)).tocsc()
@@ -256,28 +290,24 @@ class _Fit:
         return factors.solve((gradient / unit).ravel()).reshape(unit.shape) / unit, gradient
 
     def result(
-        self,
-        count: int,
-        design: np.ndarray,
-        prior: np.ndarray,
-        moving: np.ndarray,
-        middle: np.ndarray,
-        range_px: float,
+        self, count: int, prior: np.ndarray, moving: np.ndarray, bound: np.ndarray
     ) -> JointFit:
-        """Return the fit of `count` stars, these among them; `moving` ones were not at rest."""
+        """Return the fit of `count` stars, these among them.
+
+        `moving` stars (m,) were not at rest; x or y at the end of its range is in `bound` (m, 2).
+        """
         # Standard errors, and the reduced χ² of the pixels of each box.
-        error = _standard_errors(*_normal_matrix(design, self._rows, prior))
-        residual = self.weight * self.residual.ravel()[self.boxes]
-        freedom = np.maximum(self.pixels - PARAMETERS, 1)
-        chi2 = np.square(residual).sum(axis=(1, 2)) / freedom
-        # Flags as photutils has them.
+        error = standard_errors(*_normal_matrix(self.design(), self._rows, prior))
+        chi2 = self.squares() / np.maximum(self.pixels - self.parameters, 1)
+        # Flags as photutils has them: 1 not all pixels, 2 off the image, 4 no flux above 0, 8 not
+        # at rest, 32 at the bound of its range.
         height, width = self.image.shape
         outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
-        bound = np.abs(self.place - middle) > 0.999 * range_px
         flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
         flags += 8 * moving + 32 * bound.any(axis=1)
 
         def of_all(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
+            # Rows of all stars of the list; those that were not fitted have no value.
             column = np.full((count, *values.shape[1:]), missing, values.dtype)
             column[self.stars] = values
             return column
@@ -320,6 +350,7 @@ def _normal_matrix(
     """
     from scipy.sparse import csc_array, diags_array
 
+    # Root of the diagonal of DᵀD + prior.
     stars, parameters, *box = design.shape
     unit = np.sqrt(np.square(design).sum(axis=(2, 3)) + prior)
     # A column for each parameter, a row for each pixel.
@@ -333,12 +364,13 @@ def _normal_matrix(
     return (columns.T @ columns + diagonal).tocsc(), unit
 
 
-def _standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
+def standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
     """Return the standard errors (m, k) of the parameters of m stars.
 
     Those of a star are from the inverse of the part of the matrix that belongs to it and to the
     stars whose boxes overlap with its own; what these share with others changes little.
     """
+    # Blocks of 3 × 3 numbers, one for each pair of stars that overlap.
     stars, parameters = unit.shape
     blocks = matrix.tobsr((parameters, parameters))
     blocks.sort_indices()

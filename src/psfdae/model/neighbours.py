@@ -55,7 +55,7 @@ class _Field(FieldPsfs):
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: the fit is used on its own image."""
 
-    def _psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         return self.fitted.psf_at(position, oversampling)
 
 
@@ -98,6 +98,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"
             return replace(stars, notes=(*stars.notes, note))
+        # The next round starts from these stars, on the image as it was; the wings are kept.
         message = (
             f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
             f"stamps; bright stars before: {len(stars)}, no neighbour above "
@@ -130,6 +131,7 @@ def light_of_others(
     """
     from scipy.spatial import cKDTree
 
+    # Fluxes without the wings, which belong to no stamp alone.
     stars = photometry.stars
     centre = np.stack([stars["x"], stars["y"]], axis=1)
     flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model)

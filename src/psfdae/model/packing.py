@@ -17,7 +17,7 @@ import numpy as np
 
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
-from psfdae.method import DrawsStars, Method
+from psfdae.method import Method
 from psfdae.metrics import all_metrics
 from psfdae.model.bundle import Bundle, BundleError, creation_date, estimator
 from psfdae.model.calibration import (
@@ -84,7 +84,7 @@ def model_of(
         fitted, stars, reference, config, trained, name, licence, largest_mb
     )
     unpacked = estimator(bundle)  # errors are those of the fit as it is packed
-    if isinstance(fitted, DrawsStars):
+    if fitted.knows_field:
         bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
     # Errors on test stars; in an image, limits of outliers by its training stars, too.
     bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from psfdae.model.field_psfs import FieldPsfs
 
 
+def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
+    """Return σ (h, w) of pixels, σ² = noise² of the sky + light of stars over the gain."""
+    return np.hypot(noise, np.sqrt(np.maximum(light, 0.0) / gain)) if gain else noise
+
+
 def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
     """Return the observation with the gain that its stars show, if it is not known.
 
@@ -112,7 +117,7 @@ def measure_gain(
         # Stars that are off by far more than others have neighbours that are on no list.
         chi2 = (residual**2 / variance).mean(axis=1)
         is_fitted = chi2 < 4.0 * np.median(chi2)
-        photons, error, off = _slopes_of_variance(
+        photons, error, off = photon_transfer(
             light[is_fitted], residual[is_fitted], sigma[is_fitted]
         )
         # Centres stay in their pixel, about which the box lies.
@@ -149,7 +154,7 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     return is_alone
 
 
-def _slopes_of_variance(
+def photon_transfer(
     light: np.ndarray, residual: np.ndarray, sigma: np.ndarray
 ) -> tuple[float, float, float]:
     """Return 1/g, its standard error, and ε from pixels of any shape, by robust variances.
@@ -167,29 +172,23 @@ def _slopes_of_variance(
     bins = np.array_split(order, max(len(order) // 60, 1))
     if len(bins) < 6:
         return 0.0, np.inf, 0.0
-    linear, square, variance, count = (
-        np.array(values)
-        for values in zip(
-            *(
-                (
-                    scaled[members].mean(),
-                    (light[members] * scaled[members]).mean(),
-                    (SIGMA_OF_MAD * np.median(np.abs(residual[members] / sigma[members]))) ** 2,
-                    len(members),
-                )
-                for members in bins
-            ),
-            strict=True,
-        )
+    count = np.array([len(members) for members in bins])
+    # Terms of the law in each bin, L/σ² and L²/σ², and the variance of r/σ.
+    linear, square = (
+        np.array([values[members].mean() for members in bins])
+        for values in (scaled, light * scaled)
     )
-    # Weighted least squares; weights follow from the variances that the last fit expects.
+    modulus = np.abs(residual / sigma)
+    variance = np.array([SIGMA_OF_MAD * np.median(modulus[members]) for members in bins]) ** 2
+    # Weighted least squares of a and b ≥ 0 in v/σ² − 1 = a L/σ² + b L²/σ²; weights follow from the
+    # variances that the last fit expects.
     expected = np.maximum(variance, 1.0)
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected)
         design = np.stack([linear, square], axis=1) * weight[:, None]
         coefficients, residual_norm = nnls(design, (variance - 1.0) * weight)
         expected = 1.0 + coefficients[0] * linear + coefficients[1] * square
-    # Where the law does not hold, it is known as badly as that.
+    # Standard error of a; where the law does not hold, it is known as badly as χ² says.
     excess = max(residual_norm**2 / (len(bins) - 2), 1.0)
     error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])
     return float(coefficients[0]), float(error), float(np.sqrt(coefficients[1]))

@@ -31,7 +31,6 @@ from psfdae.image.tables import COLUMNS, as_fits, fits_values, html_table, star_
 from psfdae.version import __version__
 
 if TYPE_CHECKING:
-    from astropy.io.fits import Header
     from astropy.table import QTable, Table
 
     from psfdae.model.bundle import Bundle
@@ -142,6 +141,7 @@ class Prediction:
 
     def _repr_html_(self) -> str:
         """Counts of the stars and of their flags, for a notebook."""
+        # Flags that no star has are left out.
         side, clean = self.psf.shape[-1], int((self.flags == 0).sum())
         rows = [["stars", str(len(self))], ["stamps", f"{side}×{side} px"]]
         rows += [["without a flag", str(clean)]]
@@ -176,6 +176,7 @@ class Prediction:
         first = parts[0]
         if len(parts) == 1:
             return first
+        # astropy joins tables, numpy the arrays.
         list_columns = None
         if first.list_columns is not None:
             from astropy.table import vstack
@@ -213,16 +214,33 @@ class PredictionFile:
     """
 
     def __init__(self, file: IO[bytes], primary: bytes, example: Prediction, count: int) -> None:
+        from astropy.io import fits
+
         self._file = file
         side, unit = example.psf.shape[-1], example.unit or "adu"
+        # Headers of the cubes (n, d, d), made from a cube of one image.
+        headers = {}
+        for name, (extension, meaning) in CUBES.items():
+            cube = fits.ImageHDU(np.zeros((1, side, side), np.float32), name=extension)
+            header = headers[name] = cube.header
+            header["NAXIS3"] = count
+            header["BUNIT"] = (ascii_line(unit), "as in the input")
+            header["COMMENT"] = meaning
+            header["COMMENT"] = "The star is about pixel (d/2, d/2), 0-based."
+        # Header of the table of stars, with the meaning of their flags.
         table = as_fits(example.to_table(), "STARS")
         self._row = table.data.dtype.newbyteorder(">")
-        headers = {name: _cube_header(*CUBES[name], count, side, unit) for name in CUBES}
+        header = headers["stars"] = table.header
+        header["NAXIS2"] = count
+        for flag in StarFlag:
+            # A FITS keyword has eight characters.
+            header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name
+            header["COMMENT"] = f"{int(flag)} {flag.name}: {flag.meaning}"
         # Bytes of a star in each data unit, and where the unit starts.
         self._star_bytes = dict.fromkeys(CUBES, 4 * side**2) | {"stars": self._row.itemsize}
         self._start: dict[str, int] = {}
         file.write(primary)
-        for name, header in {**headers, "stars": _table_header(table.header, count)}.items():
+        for name, header in headers.items():
             file.write(header.tostring().encode("ascii"))
             self._start[name] = file.tell()
             # A data unit ends with a whole block; its stars are written later.
@@ -232,6 +250,7 @@ class PredictionFile:
 
     def write(self, start: int, prediction: Prediction) -> None:
         """Write the stars from number `start` on."""
+        # Rows of the table as FITS has them, big-endian.
         table = prediction.to_table()
         rows = np.zeros(len(table), dtype=self._row)
         for name in table.colnames:
@@ -239,6 +258,7 @@ class PredictionFile:
             # FITS keeps truth values as the letters T and F.
             is_truth = values.dtype.kind == "b"
             rows[name] = np.where(values, ord("T"), ord("F")) if is_truth else values
+        # Each piece goes behind the stars before it in its data unit.
         cubes = {name: getattr(prediction, name).astype(">f4") for name in CUBES}
         for name, values in {**cubes, "stars": rows}.items():
             self._file.seek(self._start[name] + start * self._star_bytes[name])
@@ -265,14 +285,9 @@ def prediction_file(
     history : str
         The command.
     """
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        yield PredictionFile(file, _primary_header(bundle, cards, history), example, count)
-
-
-def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> bytes:
-    """Return the primary header: the model, further cards, and the command."""
     from astropy.io import fits
 
+    # The primary header: the model, further cards, and the command.
     info, header = bundle.info, fits.PrimaryHDU().header
     header["EXTEND"] = True
     model_cards: list[Card] = [
@@ -294,27 +309,6 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> byte
             text = ascii_line(value) if isinstance(value, str) else value
             header[key] = (text, ascii_line(comment))
         header["HISTORY"] = ascii_line(history)
-        encoded: bytes = header.tostring().encode("ascii")
-    return encoded
-
-
-def _cube_header(name: str, meaning: str, count: int, stamp_px: int, unit: str) -> Header:
-    """Return the header of a cube of n images of a side, in the unit of the stamps."""
-    from astropy.io import fits
-
-    header = fits.ImageHDU(np.zeros((1, stamp_px, stamp_px), np.float32), name=name).header
-    header["NAXIS3"] = count
-    header["BUNIT"] = (ascii_line(unit), "as in the input")
-    header["COMMENT"] = meaning
-    header["COMMENT"] = "The star is about pixel (d/2, d/2), 0-based."
-    return header
-
-
-def _table_header(header: Header, count: int) -> Header:
-    """Return the header of a table of so many stars, with the meaning of their flags."""
-    header["NAXIS2"] = count
-    for flag in StarFlag:
-        # A FITS keyword has eight characters.
-        header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name
-        header["COMMENT"] = f"{int(flag)} {flag.name}: {flag.meaning}"
-    return header
+        primary = header.tostring().encode("ascii")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        yield PredictionFile(file, primary, example, count)

@@ -97,7 +97,7 @@ class PsfGrid:
         # Stamps with at least one pixel within the PSF; all others stay 0.
         stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
         node, share = self._nodes(centre)
-        weights, slopes = _cubic(first - knot)
+        weights, slopes = cubic_splines(first - knot)
         span = self.oversampling * (side_px - 1) + 1
         taps = [slice(t, t + span, self.oversampling) for t in range(4)]
         # Batches, for memory: a pixel needs some 20 coefficients.
@@ -160,12 +160,13 @@ class PsfGrid:
         return number.reshape(4, -1).T, share.reshape(4, -1).T
 
 
-def _cubic(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cubic_splines(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights (…, 4) of the cubic B-splines around a position, and their slopes.
 
     `phase` (…) is the fraction t of the way from a knot to the next one. The four B-splines that
     are not 0 there are, times 6, (1 − t)³, 3t³ − 6t² + 4, the same of 1 − t, and t³.
     """
+    # Slopes are the derivatives by t: −3u²/6 = −u²/2, (9t² − 12t)/6 = (3t² − 4t)/2, and so on.
     t, u = phase[..., None], 1.0 - phase[..., None]
     weights = [u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]
     slopes = [-(u**2), 3 * t**2 - 4 * t, 4 * u - 3 * u**2, t**2]

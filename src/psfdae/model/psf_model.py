@@ -6,7 +6,7 @@ flags comes out. What happens between is in `psfdae.model.restoration`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -18,7 +18,7 @@ from psfdae.bundle_info import BundleInfo
 from psfdae.image.camera import other_instruments
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
-from psfdae.method import KnowsField, Method
+from psfdae.method import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.prediction import Prediction
@@ -30,9 +30,6 @@ from psfdae.threads import available_cores, in_order, one_thread_each, side_by_s
 
 SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
-
-MAX_STARS_READ = 1024
-"""Stars that are read at a time; fewer if their stamps are large."""
 
 
 def load_model(path: str | Path | None = None) -> PsfModel:
@@ -90,9 +87,13 @@ class PsfModel(FieldPsfs):
     margin_px: ClassVar[int] = 2
     """Pixels by which a star of an image may be moved to the middle of its stamp."""
 
+    max_stars_read: ClassVar[int] = 1024
+    """Stars of an image that are read at a time; fewer if their stamps are large."""
+
     def __init__(self, bundle: Bundle, method: Method | None = None) -> None:
         self.bundle = bundle
         self.restorer = Restorer(bundle, estimator(bundle) if method is None else method)
+        # What every model of a field has, by `FieldPsfs`.
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     def __repr__(self) -> str:
@@ -177,12 +178,12 @@ class PsfModel(FieldPsfs):
         PredictionError
             If shapes or types do not fit.
         """
-        # A margin below 0 leaves no side that fits.
+        # Check the arrays, and make them to stamps. A margin below 0 leaves no side that fits.
         side = self.stamp_px + 2 * margin if margin >= 0 else 0
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
-        # Blocks of stars, side by side.
+        # Blocks of stars, side by side; each is restored as if it were alone.
         blocks = self.restorer.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
         with one_thread_each():
@@ -197,16 +198,18 @@ class PsfModel(FieldPsfs):
         Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
         taken.
         """
+        # Stamps are read in chunks, each of which is restored in blocks by a thread of its own.
         size = self.restorer.block_size
 
         def predicted(stamps: Stamps) -> Prediction:
             blocks = self.restorer.blocks(stamps)
             return Prediction.joined([self.restorer.restore(block, fixed) for block in blocks])
 
-        chunks = observation.chunks(max(size, min(MAX_STARS_READ, 4 * size)))
+        chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
         with one_thread_each(), task("stars", observation.count) as advance:
             for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
+                # Columns of the star list go along with the stars' rows.
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
                 # The star on the sky, by its own centre where the model measures one.
@@ -245,6 +248,7 @@ class PsfModel(FieldPsfs):
         middle of the field, they are not below those of the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
+        # The light L of wings is known to σ_L, and with it the whole flux to σ_L / (1 + L) of it.
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         errors = self.bundle.errors.measured
         fitted_error = errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0)
@@ -256,54 +260,27 @@ class PsfModel(FieldPsfs):
         size = self.info.config.get("stars", {}).get("image_px")
         return None if size is None else (size[0], size[1])
 
-    def other_instrument(
-        self, instrument: Mapping[str, str], colour_column: str | None = None
-    ) -> str:
-        """Describe how an image's telescope, camera or filter differs from the training image.
-
-        Parameters
-        ----------
-        instrument : mapping
-            By the key of the header, as `Observation.instrument`.
-        colour_column : str, optional
-            Of the star list, if its colours are used.
-
-        Returns
-        -------
-        difference : str
-            Empty if all that both headers and lists name is the same.
-        """
-        stars = self.info.config.get("stars", {})
-        trained_on = dict(stars.get("instrument", {}))
-        if colour_column and "colour_column" in stars:
-            key = "the column of colours"
-            trained_on[key] = stars["colour_column"]
-            instrument = {**instrument, key: colour_column}
-        return "; ".join(
-            f"{key} is {value!r}, the model {self.name!r} was trained on {trained_value!r}"
-            for key, trained_value, value in other_instruments(trained_on, instrument)
-        )
-
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and greatest position (x, y) of training stars; raises as `psf_at`."""
         self._field()
+        # The field's polynomial has its range in its arrays.
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
         # Stars without places leave zeros; a star alone is at one place.
         if not ((high > low) | ((high == low) & (low > 0))).all():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
 
-    def _field(self) -> KnowsField:
+    def _field(self) -> Method:
         """Return the method as one that knows the PSF at every place of the field."""
         field = self.method
-        if not isinstance(field, KnowsField):
+        if not field.knows_field:
             raise PredictionError(
                 f"the model {self.name!r}: {field.look.label}: knows the PSF of a star alone, "
                 "not that of a place; psfdae from-stars --method field makes one that does"
             )
         return field
 
-    def _psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         return self._field().psf_at(place, oversampling)
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
@@ -321,6 +298,7 @@ class PsfModel(FieldPsfs):
         PredictionError
             If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
         """
+        # A PSF in pixels holds for pixels of one size.
         model_scale = self.info.pixel_scale_arcsec
         advice = "; psfdae from-stars trains one on an image of yours"
         if pixel_scale_arcsec is None:
@@ -335,3 +313,26 @@ class PsfModel(FieldPsfs):
                 f"{self.info.name!r} was trained on {model_scale:.6g} arcsec{assumed} "
                 f"(tolerance {100 * SCALE_TOLERANCE:g} %){advice}"
             )
+
+
+def other_instrument(model: PsfModel, observation: Observation) -> str:
+    """Describe how an image's telescope, camera or filter differs from the training image.
+
+    The colours of the star lists count as well, where the image's list has any.
+
+    Returns
+    -------
+    difference : str
+        Empty if all that both headers and lists name is the same.
+    """
+    # What the headers of both images name: telescope, camera, filter; and the lists: a colour.
+    stars, instrument = model.info.config.get("stars", {}), observation.instrument
+    trained_on = dict(stars.get("instrument", {}))
+    if observation.colour_column and "colour_column" in stars:
+        key = "the column of colours"
+        trained_on[key] = stars["colour_column"]
+        instrument = {**instrument, key: observation.colour_column}
+    return "; ".join(
+        f"{key} is {value!r}, the model {model.name!r} was trained on {trained_value!r}"
+        for key, trained_value, value in other_instruments(trained_on, instrument)
+    )

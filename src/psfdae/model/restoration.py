@@ -28,18 +28,11 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import (
-    FindsFlux,
-    KnowsField,
-    MeasuresStars,
-    Method,
-    Packing,
-    ScoresOutliers,
-)
+from psfdae.method import Method, Packing
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
-from psfdae.model.flux_model import FAINT_SNR, MIN_GOOD_PIXELS, NOISE_FLOOR
-from psfdae.model.photometry import Photometer, Photometry
+from psfdae.model.flux_model import NOISE_FLOOR, FluxModel, Photometry, is_faint
+from psfdae.model.photometry import Photometer
 from psfdae.model.prediction import Prediction
 from psfdae.model.wings import Wings, outer_shares
 from psfdae.moments import measure_shapes
@@ -79,6 +72,40 @@ class CentredStars(NamedTuple):
     border_level: np.ndarray
     photometry: Photometry
 
+    def measurable(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return stamps above the level of their border, repaired, with their noise.
+
+        Returns
+        -------
+        data : ndarray, shape (n, d, d), float64
+            0 in stamps that are unusable.
+        noise : ndarray, shape (n,)
+            Standard deviation of a pixel.
+        is_unusable : ndarray of bool, shape (n,)
+            True if a stamp has nothing to measure: bad, constant, or beyond any number.
+        """
+        photometry, stamps, bad = self.photometry, self.stamps, self.bad
+        # Bad pixels as the photometry repaired them, or the level of the border where it could not.
+        is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
+        level = self.border_level[:, None, None]
+        repaired = (
+            photometry.images * photometry.flux[:, None, None]
+            + photometry.background[:, None, None]
+        )
+        repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
+        data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
+        # Stamps need as many good pixels as the photometry asks for, and any contrast.
+        modulus = np.abs(data).max(axis=(1, 2))
+        has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
+        is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
+        is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
+        data = np.where(is_unusable[:, None, None], 0.0, data)
+        # σ² of a pixel: that of the sky, and the mean of the star's photons.
+        noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
+        photons = np.maximum(photometry.flux, 0.0) / self.stars.gain / stamps[0].size
+        noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
+        return data, noise, is_unusable
+
 
 class RestoredStars(NamedTuple):
     """PSFs of stars as a method gives them.
@@ -108,6 +135,30 @@ class RestoredStars(NamedTuple):
     outlier_score: np.ndarray
     centre: np.ndarray
     covariance: np.ndarray
+
+    def part(self, rows: slice) -> RestoredStars:
+        """Return some of the stars."""
+        values: dict[str, Any] = {
+            name: array[rows] if isinstance(array, np.ndarray) else array
+            for name, array in self._asdict().items()
+        }
+        return RestoredStars(**values | {"photometry": self.photometry.part(rows)})
+
+    def centre_columns(self) -> dict[str, np.ndarray]:
+        """Return the columns on centres, and on errors beside that of the flux.
+
+        A number that is known has the error 0, and correlates with nothing.
+        """
+        sigma = np.sqrt(np.maximum(np.einsum("nii->ni", self.covariance), 0.0))
+        names = ("flux", "background", "y", "x")
+        columns = {"y_fit": self.centre[:, 0], "x_fit": self.centre[:, 1]}
+        columns |= {f"{name}_error": sigma[:, i] for i, name in enumerate(names) if i}
+        # ρ_ij = C_ij / (σ_i σ_j).
+        for i, j in combinations(range(4), 2):
+            product = sigma[:, i] * sigma[:, j]
+            correlation = self.covariance[:, i, j] / np.where(product > 0, product, 1.0)
+            columns[f"corr_{names[i]}_{names[j]}"] = np.where(product == 0, 0.0, correlation)
+        return columns
 
 
 class Restorer:
@@ -151,12 +202,17 @@ class Restorer:
         """
         count = len(stars)
         if count < self._padded_count:
-            stars = _padded(stars, self.bundle, self._padded_count)
+            # Stars repeated up to that number, which are dropped again; a blank one if there is
+            # none.
+            columns = (getattr(stars, column.name) for column in fields(stars))
+            size = self._padded_count
+            stars = Stamps(*(np.resize(values, (size, *values.shape[1:])) for values in columns))
+        # Unusable stars are NaN or infinite on the way, and are flagged.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             # 2048 stars at a time are measured and described: their arrays fit in memory.
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
             centred = [self._centred(part, fixed) for part in parts]
-            if isinstance(self.method, MeasuresStars):
+            if self.method.knows_field:
                 errors = self.bundle.errors
                 restored = [restored_by_measurement(part, self.method, errors) for part in centred]
             else:
@@ -171,12 +227,14 @@ class Restorer:
         has_exact_centre = fixed & np.isfinite(stars.listed).all(axis=1)
         side = self.bundle.info.stamp_px
         margin = (stars.data.shape[-1] - side) // 2
-        # Saturated pixels show where the star is; the other bad ones would mislead.
+        # The light in the middle of the stamp shows where the star is. Saturated pixels belong to
+        # it; the other bad ones would mislead, and get the level of the border.
         data, hidden = stars.data, stars.bad & ~stars.saturated
         if hidden.any():
             data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
         shift = displacement(data, self.bundle.info.jitter_px, self._centring_px)
         shift[has_exact_centre] = 0
+        # A star cannot be moved farther than the pixels around its stamp reach.
         is_too_far = np.abs(shift).max(axis=1) > margin
         shift[is_too_far] = 0
         stamps, bad, saturated = (
@@ -187,7 +245,7 @@ class Restorer:
         raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.OFF_CENTRE, is_too_far)
         bad = bad | saturated
-        # A sky that is given and is not that of the border is flagged.
+        # A sky that is given and is more than 5 σ off that of the border is flagged.
         border_level = border_median(stamps, bad)
         if np.isfinite(stars.background).any():
             limit = 5.0 * border_scatter(stamps)
@@ -210,12 +268,13 @@ class Restorer:
         photometry = Photometry.joined([part.photometry for part in centred])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
         has_flux = ~has_no_flux
-        # Factors of the fluxes, within what a correction may be.
+        # Factors of the fluxes, between 1/2 and 2; more would be no correction. A method is told
+        # the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
         near_clusters: dict[str, Any] = {}
         is_free = has_flux & np.concatenate(
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
-        if is_free.any() and isinstance(self.free_flux, FindsFlux):
+        if is_free.any() and self.method.finds_flux:
             images, noise = self._normalised(photometry, has_no_flux)
             level = np.hypot(noise, info.misfit) / info.kappa
             factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
@@ -223,7 +282,7 @@ class Restorer:
             photometry = photometry.with_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
         psf, sigma = np.full_like(photometry.images, np.nan), None
         score = np.full(len(has_flux), np.nan)
-        # Stars of a catalogue that reaches far beyond the image have all no flux.
+        # The PSFs; stars of a catalogue that reaches far beyond the image have all no flux.
         if has_flux.any():
             images, noise = self._normalised(photometry, has_no_flux)
             level = noise / info.kappa
@@ -232,26 +291,17 @@ class Restorer:
             psf[has_no_flux] = np.nan
             if sigma is not None:
                 sigma[has_no_flux] = np.nan
+            # Only a model with a limit asks how unlike the training stars they are.
             if self.bundle.errors.outlier_limit is not None:
-                assert isinstance(self.free_flux, ScoresOutliers)
                 clusters = {name: values[has_flux] for name, values in near_clusters.items()}
                 score[has_flux] = self.free_flux.outlier_score(
                     images[has_flux], level[has_flux], **clusters
                 )
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred)])
-        return [
-            RestoredStars(
-                psf[rows],
-                None if sigma is None else sigma[rows],
-                photometry.part(rows),
-                has_no_flux[rows],
-                score[rows],
-                np.full((rows.stop - rows.start, 2), np.nan),
-                np.full((rows.stop - rows.start, 4, 4), np.nan),
-            )
-            for rows in (slice(*pair) for pair in pairwise(ends))
-        ]
+        unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
+        whole = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [whole.part(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalised(
         self, photometry: Photometry, has_no_flux: np.ndarray
@@ -271,27 +321,29 @@ class Restorer:
         info, errors = self.bundle.info, self.bundle.errors
         stars, flags, photometry = centred.stars, centred.flags, restored.photometry
         psf, sigma = restored.psf, restored.sigma
-        measures_stars = isinstance(self.method, MeasuresStars)
+        measures_stars = self.method.knows_field
         # Noise over the flux: the unit of the training, on which errors and limits depend.
         noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
         snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
         distance = mahalanobis(photometry.images, noise, self.bundle.flux_model, info.components)
-        # PSFs, their errors and what is left of the stamps, in the unit of the stamps.
+        # PSFs, their errors and what is left of the stamps, in the unit of the stamps: errors of
+        # PSFs of flux 1 times the flux, and r = x − b − F psf.
         flux = photometry.flux.astype(np.float32)[:, None, None]
         half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
         psf *= flux
         residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
         residual[~photometry.used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
-        chi2 = _chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
+        chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
         # A method that measures stars has the star's photons in its errors. It knows the noise of
         # bright stars, and comes ever nearer to the star itself: it has no upper limit of the S/N.
         photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
         photons = np.where(measures_stars, 0.0, photons)
         flux_error = np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons)
-        # Flags beside those of centring, photometry and method.
+        # Flags beside those of centring, photometry and method. The S/N of a star is known to its
+        # tolerance.
         is_unlike = errors.is_unlike_training(noise, distance, restored.outlier_score)
         flags |= photometry.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
@@ -321,7 +373,7 @@ class Restorer:
             "flags": flags,
         }
         columns |= self._total_fluxes(stars, photometry, flux_error)
-        columns |= _centre_columns(restored.centre, restored.covariance)
+        columns |= restored.centre_columns()
         return Prediction(
             columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
         )
@@ -331,10 +383,11 @@ class Restorer:
     ) -> dict[str, Any]:
         """Return fluxes with the light beyond the stamps, and skies without that in the stamps."""
         flux, sky = photometry.flux, photometry.background
-        if self.wings is None or not isinstance(self.method, KnowsField):
+        if self.wings is None or not self.method.knows_field:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
+        # A wider PSF has more light beyond its stamp.
         outer_part = outer_shares(self.method.psf_at, place)
         factor, factor_error = self.wings.total(outer_part)
         # The error of a flux that was given is not known: it is NaN.
@@ -346,7 +399,7 @@ class Restorer:
 
 
 def restored_by_measurement(
-    centred: CentredStars, method: MeasuresStars, errors: ErrorModel
+    centred: CentredStars, method: Method, errors: ErrorModel
 ) -> RestoredStars:
     """Restore stars with the fluxes that the method measures in place of the photometry.
 
@@ -355,12 +408,14 @@ def restored_by_measurement(
     Parameters
     ----------
     centred : CentredStars
-    method : MeasuresStars
+    method : Method
+        One with the capability `knows_field`.
     errors : ErrorModel
         Errors of measured stars due to errors of the model, which are added to those of the method.
     """
     stars, photometry, border_level = centred.stars, centred.photometry, centred.border_level
-    data, noise, is_unusable = _measurable_stamps(centred)
+    # Stamps above the level of their border; the sky that is measured counts from it, too.
+    data, noise, is_unusable = centred.measurable()
     has_flux = np.isfinite(stars.flux)
     # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
     # that of its flux.
@@ -377,7 +432,7 @@ def restored_by_measurement(
         sky=stars.background - border_level,
         gain=stars.gain,
     )
-    # Errors of the method, by noise, and those of its model add up.
+    # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
     measured = estimate.measured
     assert measured is not None and estimate.sigma is not None
     covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
@@ -388,10 +443,10 @@ def restored_by_measurement(
     has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
     flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
-    is_faint = ~has_flux & ~has_no_flux & (flux < FAINT_SNR * flux_error)
-    raise_flag(flags, StarFlag.FAINT, is_faint)
+    is_measured = ~has_flux & ~has_no_flux
+    raise_flag(flags, StarFlag.FAINT, is_measured & is_faint(flux, flux_error))
     raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
-    # The same photometry with the method's fluxes and skies.
+    # The same photometry with the method's fluxes and skies: images are (x − b) / F.
     unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
     images = (data - measured.background[:, None, None]) / unit
     sky = border_level + measured.background
@@ -408,6 +463,7 @@ def restored_by_measurement(
     middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
     middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
     centre = middle + centred.shift + measured.centre
+    # Stars without a flux are told nothing.
     score = estimate.outlier_score
     score = np.full(len(flux), np.nan) if score is None else score.copy()
     for array in (estimate.psf, estimate.sigma, centre, covariance, score):
@@ -417,64 +473,7 @@ def restored_by_measurement(
     )
 
 
-def _measurable_stamps(centred: CentredStars) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return stamps above the level of their border, repaired, with their noise.
-
-    Returns
-    -------
-    data : ndarray, shape (n, d, d), float64
-        0 in stamps that are unusable.
-    noise : ndarray, shape (n,)
-        Standard deviation of a pixel.
-    is_unusable : ndarray of bool, shape (n,)
-        True if a stamp has nothing to measure: bad, constant, or beyond any number.
-    """
-    photometry, stamps, bad = centred.photometry, centred.stamps, centred.bad
-    # Bad pixels as the photometry repaired them, or the level of the border where it could not.
-    is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
-    level = centred.border_level[:, None, None]
-    repaired = (
-        photometry.images * photometry.flux[:, None, None] + photometry.background[:, None, None]
-    )
-    repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
-    data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
-    # Stamps need as many good pixels as the photometry asks for, and any contrast.
-    modulus = np.abs(data).max(axis=(1, 2))
-    has_pixels = bad.mean(axis=(1, 2)) <= 1 - MIN_GOOD_PIXELS
-    is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
-    is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
-    data = np.where(is_unusable[:, None, None], 0.0, data)
-    # σ² of a pixel: that of the sky, and the mean of the star's photons.
-    noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
-    photons = np.maximum(photometry.flux, 0.0) / centred.stars.gain / stamps[0].size
-    noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
-    return data, noise, is_unusable
-
-
-def _centre_columns(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns on centres, and on errors beside that of the flux.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (n, 2)
-        (row, column), or NaN.
-    covariance : ndarray, shape (n, 4, 4)
-        Covariance of flux, sky, row and column, or NaN. A number that is known has the error 0,
-        and correlates with nothing.
-    """
-    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
-    names = ("flux", "background", "y", "x")
-    columns = {"y_fit": centre[:, 0], "x_fit": centre[:, 1]}
-    columns |= {f"{name}_error": sigma[:, i] for i, name in enumerate(names) if i}
-    # ρ_ij = C_ij / (σ_i σ_j).
-    for i, j in combinations(range(4), 2):
-        product = sigma[:, i] * sigma[:, j]
-        correlation = covariance[:, i, j] / np.where(product > 0, product, 1.0)
-        columns[f"corr_{names[i]}_{names[j]}"] = np.where(product == 0, 0.0, correlation)
-    return columns
-
-
-def _chi2(
+def reduced_chi2(
     residual: np.ndarray,
     psf: np.ndarray,
     flux_sigma: np.ndarray | None,
@@ -496,10 +495,12 @@ def _chi2(
     noise, gain : ndarray, shape (n,)
         σ of the sky in a pixel, and electrons per unit, NaN where unknown: v = σ² + PSF/gain.
     """
+    # v = σ² + PSF/gain, where the gain is known.
     variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
         per_electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]
         variance = variance + np.maximum(psf, 0.0) * per_electron
+    # What is expected of r²/v in each pixel: 1, or less by what the star follows of its own noise.
     is_used = np.isfinite(residual) & np.isfinite(variance)
     expected = np.ones(residual.shape)
     if flux_sigma is not None:
@@ -512,19 +513,3 @@ def _chi2(
     )
     chi2 = total / np.where(expected_total > 0, expected_total, np.inf)
     return np.where(is_used.any(axis=(1, 2)), chi2, np.nan)
-
-
-def _padded(stars: Stamps, bundle: Bundle, size: int) -> Stamps:
-    """Return stars made up to `size`, the last ones mean PSFs of which nothing is known."""
-    count, side = len(stars), bundle.info.stamp_px
-    columns = {}
-    for column in fields(stars):
-        values = getattr(stars, column.name)
-        blank = np.nan if values.dtype.kind == "f" else 0
-        blanks = np.full((size - count, *values.shape[1:]), blank, values.dtype)
-        columns[column.name] = np.concatenate([values, blanks])
-    margin = (stars.data.shape[-1] - side) // 2
-    core = slice(margin, margin + side)
-    columns["data"][count:] = 0.0
-    columns["data"][count:, core, core] = bundle.flux_model.mean.reshape(side, side)
-    return Stamps(**columns)

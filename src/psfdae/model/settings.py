@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field, create_model, model_validator
 
+from psfdae.errors import did_you_mean
 from psfdae.joined import joined
 from psfdae.methods import MethodNames, known
 from psfdae.reading import read_yaml
@@ -27,14 +28,12 @@ from psfdae.settings import (
     Parts,
     Seed,
     Stamp,
+    keys_of,
     parse_settings,
 )
 
 DATASET_CHOICE = "dataset=from_stars"
 """Word that chooses the files of the configuration with the same values as these defaults."""
-
-IMAGE_GROUPS = ("calibration_stars", "framing", "parts", "seed")
-"""Groups that determine which stars are used, and which images are made of them."""
 
 
 class Settings(Group):
@@ -56,7 +55,11 @@ class Settings(Group):
         Numbers of training, validation and test images.
     evaluation : Evaluation
         Settings of metrics and of the linear algebra.
+    image_groups : tuple of str
+        Names of the groups that determine which stars are used, and which images are made of them.
     """
+
+    image_groups: ClassVar[tuple[str, ...]] = ("calibration_stars", "framing", "parts", "seed")
 
     seed: Seed = 20200611
     # Without a network, which takes longer than all of these together.
@@ -71,7 +74,7 @@ class Settings(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _stated_size(cls, tree: Any) -> Any:
+    def keep_stated_size(cls, tree: Any) -> Any:
         """Keep a stated size of stamps: the light that they hold shall not change it."""
         # What is no tree, or has a group that is none, is refused later with its key.
         if not isinstance(tree, Mapping) or not isinstance(tree.get("framing"), Mapping):
@@ -83,13 +86,7 @@ class Settings(Group):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the values alone: the class of all settings is made at run time."""
-        return _unpickled, (), self.__getstate__()
-
-
-def _unpickled() -> Settings:
-    """Return settings without values, which pickle fills in."""
-    model = settings_model()
-    return model.__new__(model)
+        return of_config, (self.model_dump(exclude_unset=True),)
 
 
 @cache
@@ -114,6 +111,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
     """
     import yaml
 
+    # A tree of groups, keys and values, as a file would have it.
     groups, tree = tuple(settings_model().model_fields), dict[str, Any]()
     for word in words:
         key, equals, text = word.lstrip("+").partition("=")
@@ -127,8 +125,8 @@ def from_words(words: Sequence[str] = ()) -> Settings:
                 words = ("++calibration_stars.light_min=0", *words)
             for point in joined("settings"):
                 return of_config(point.load()(groups, (DATASET_CHOICE, *words)))
-            names = ", ".join(groups)
-            raise ConfigError(f"{word}: expected group.key=value, the group one of {names}")
+            names, hint = ", ".join(groups), did_you_mean(key, keys_of(settings_model()))
+            raise ConfigError(f"{word}: expected group.key=value, the group one of {names}{hint}")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
@@ -199,5 +197,6 @@ def with_keywords(
 
 def _keys(group: str) -> set[str]:
     """Return the keys of a group of settings; none if it is a single value such as the seed."""
+    # The type of the group's field: a class of settings, or that of a number.
     kind = settings_model().model_fields[group].annotation
     return {*kind.model_fields} if isinstance(kind, type) and issubclass(kind, Group) else set()

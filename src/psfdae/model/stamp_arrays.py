@@ -48,6 +48,7 @@ def stamps_of_arrays(
     PredictionError
         If shapes, types or units do not fit.
     """
+    # The stamps; a single one has two axes, and counts as a cube of one.
     values, masked, sigma, unit = _unpacked(stamps)
     data = real_numbers("stamps", values)
     is_single = data.ndim == 2
@@ -63,7 +64,17 @@ def stamps_of_arrays(
         numbers = {**numbers, "noise": np.nanmedian(sigma, axis=(-2, -1))}
     star_columns = {}
     for name, value in numbers.items():
-        number = real_numbers(name, np.nan if value is None else _without_unit(name, value, unit))
+        number = np.nan if value is None else value
+        if hasattr(value, "to_value"):
+            # In the unit of the stamps, counts where they have none; a gain in electrons per that.
+            stamp_unit = f"electron / ({unit or 'ct'})" if name == "gain" else unit or "ct"
+            try:
+                number = value.to_value(stamp_unit)
+            except (ValueError, TypeError):
+                raise PredictionError(
+                    f"{name} in {value.unit}, but that of the stamps is {stamp_unit}"
+                ) from None
+        number = real_numbers(name, number)
         if number.shape not in ((), (count,)):
             raise PredictionError(
                 f"{name} of shape {number.shape}, expected one for {count} stamps"
@@ -79,6 +90,7 @@ def stamps_of_arrays(
                 f"{name} of shape {array.shape}, but stamps of shape {data.shape}"
             )
         pixel_masks[name] = array
+    # Pixels that are not finite, or masked in their container, are bad, too.
     bad = pixel_masks["bad"] | ~is_finite
     x, y, magnitude, colour = _columns("position", position, count, 4).T
     checked = Stamps(
@@ -112,28 +124,15 @@ def _unpacked(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | 
     return values, mask, None, unit
 
 
-def _without_unit(name: str, value: Any, unit: str) -> Any:
-    """Return a quantity as numbers in the unit of the stamps, or electrons per that for a gain."""
-    if not hasattr(value, "to_value"):
-        return value
-    stamp_unit = unit or "ct"
-    if name == "gain":
-        stamp_unit = f"electron / ({stamp_unit})"
-    try:
-        return value.to_value(stamp_unit)
-    except (ValueError, TypeError):
-        raise PredictionError(
-            f"{name} in {value.unit}, but that of the stamps is {stamp_unit or 'none'}"
-        ) from None
-
-
 def _columns(name: str, values: ArrayLike | None, count: int, max_columns: int) -> np.ndarray:
     """Return two numbers per star, or up to `max_columns` (n, max_columns); NaN where unknown."""
+    # Two columns of NaN where nothing is stated.
     numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
     if numbers.shape not in [(count, columns) for columns in range(2, max_columns + 1)]:
         raise PredictionError(
             f"{name} of shape {numbers.shape}, expected ({count}, 2)"
             + f" to ({count}, {max_columns})" * (max_columns > 2)
         )
+    # Columns that are not stated are NaN.
     missing = np.full((count, max_columns - numbers.shape[1]), np.nan)
     return np.hstack([numbers, missing], dtype=np.float64)

@@ -26,7 +26,7 @@ ENOUGH_STARS = 20
 """Number of bright stars below which the limits on S/N and neighbours are relaxed."""
 
 MIN_STARS_WITH_ERROR = 5
-"""Number of bright stars below which no error of the model is stated."""
+"""Number of bright stars below which neither errors of a model nor changes of it can be judged."""
 
 
 def choose_bright_stars(

@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars, places
 from psfdae.files import Product, ProductError, read_product
 from psfdae.fits import learnt
-from psfdae.method import MeasuresStars, Method, TrainingSet
+from psfdae.method import Method, TrainingSet
 from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.settings import Config, OfFit, WithNoise
@@ -176,7 +176,7 @@ def training_set(
     parts = split_stars(stars, split, config)
     if of_image(stars):
         fields["own_noise"] = star_noise
-        if issubclass(kind, MeasuresStars):
+        if kind.knows_field:
             fields |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
     else:
         fields["simulation"] = stars.config

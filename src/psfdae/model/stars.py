@@ -23,7 +23,7 @@ from psfdae.image.selection import Candidates, Verdict
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
-from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
+from psfdae.model.settings import Settings, settings_model, with_keywords
 from psfdae.model.star_choice import (
     ENOUGH_STARS,
     MIN_STARS_WITH_ERROR,
@@ -136,7 +136,7 @@ class Stars:
         stated = {name: value for name, value in statements.items() if name in names}
         # All images are opened with the same statements.
         source = ImageInput(images[0], catalogue=catalogue, **stated)
-        settings_of_all = with_keywords(settings_model()(), IMAGE_GROUPS, settings)
+        settings_of_all = with_keywords(settings_model()(), Settings.image_groups, settings)
         return cls.of(source.of_each(images), settings_of_all)
 
     @classmethod

@@ -17,24 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import sky_level
+from psfdae.model.photon_noise import pixel_error
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
     from psfdae.image.observation import Observation
     from psfdae.model.field_psfs import FieldPsfs
     from psfdae.model.psf_model import PsfModel
-
-PSF_ERROR = 0.03  # part of a star's light in a pixel by which its PSF may be off
-OUTER_RADIUS = 0.7  # inner radius of the outer part of a stamp, over half its side
-STEEPNESS = 3.0  # of the power of 1/r in the tents: light that mirrors and air scatter
-TENTS = 6
-CLIPPED_SIGMA = 4.0  # deviation of a pixel beyond which it is left out
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,14 @@ class Wings:
         Of p_k.
     outer_share : float
         Mean of the stars' `outer_shares`, for which s = 1.
+    outer_radius : float
+        Inner radius of the outer part of a stamp, over half its side.
+    steepness : float
+        Power of 1/r in the tents: that of light that mirrors and air scatter.
     """
+
+    outer_radius: ClassVar[float] = 0.7
+    steepness: ClassVar[float] = 3.0
 
     radius_px: np.ndarray
     profile: np.ndarray
@@ -68,6 +70,7 @@ class Wings:
         ValueError
             If it is damaged.
         """
+        # A number of another type, or one that is missing, is as wrong as one that does not fit.
         names = ("radius_px", "profile", "covariance")
         try:
             arrays = {name: np.array(plain[name], dtype=np.float64) for name in names}
@@ -140,9 +143,11 @@ class Wings:
     @classmethod
     def joined(cls, several: Sequence[Wings]) -> Wings:
         """Average the wings of several images with one model, by the variance of their light."""
+        # Weights 1/σ² of the light of each image.
         weight = np.array([wings.light()[1] ** -2.0 for wings in several])
         weight /= weight.sum()
-        # Profiles of one outer share, that of the average.
+        # Profiles for one outer share, that of the average: p grows with it. The images are
+        # independent, C = Σ w² C_i.
         outer_share = float(weight @ [wings.outer_share for wings in several])
         weight *= [outer_share / wings.outer_share for wings in several]
         profile = np.tensordot(weight, [wings.profile for wings in several], 1)
@@ -152,6 +157,7 @@ class Wings:
     @property
     def is_measured(self) -> bool:
         """True if the pixels of the image say something of the light, more than is expected."""
+        # The error of the light, beside that of what is expected before any pixel is seen.
         sigma = expected_profile(self.radius_px, self.outer_share)[1]
         return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
@@ -173,11 +179,13 @@ def aperture_correction(
     radius_max = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
     if not 0 < radius_px <= radius_max:
         raise ValueError(f"radius {radius_px} px, expected above 0 up to {radius_max:g}")
+    # Light of the PSF in the aperture, about the star's place in the stamp.
     psf = model.psf_at(x, y, 1)
     middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
+    # All light over that in the aperture, each with the wings of this PSF.
     scale = float(wings.scale(outer_shares(model.on_pixels, np.array([[x, y]])))[0])
     all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
     return (1.0 + all_wings) / (inside + inner_wings)
@@ -196,9 +204,10 @@ def outer_shares(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) ->
         part = located[first : first + 2048]
         psf = draw(np.rint(place[part]))
         side = psf.shape[-1]
+        # Pixels by their distance from the middle of the stamp.
         axis = np.arange(side) - side // 2
         radius = np.hypot(axis[:, None], axis)
-        ring = (radius >= OUTER_RADIUS * side / 2) & (radius < side / 2)
+        ring = (radius >= Wings.outer_radius * side / 2) & (radius < side / 2)
         shares[part] = psf[:, ring].sum(axis=1)
     return shares
 
@@ -208,37 +217,58 @@ def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
 
     h_k = max(1 − |ln(r/r_1)/ln(r_2/r_1) − (k − 1)|, 0) (r/r_1)^-3: tops are equidistant in ln r.
     """
+    # ln(r/r_1), 0 inside of the stamp; tops are at multiples of ln(r_2/r_1).
     radius = radius_px.astype(r.dtype)
     log_radius = np.log(np.maximum(r / radius[0], 1.0))
     top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
     off = np.abs(log_radius / np.log(radius[1] / radius[0]) - top)
-    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-STEEPNESS * log_radius))
+    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-Wings.steepness * log_radius))
+
+
+class StarFluxes(NamedTuple):
+    """Places and fluxes of n stars, in whose light wings are looked for.
+
+    Attributes
+    ----------
+    place : ndarray, shape (n, 2)
+        x and y; NaN where unknown.
+    flux : ndarray, shape (n,)
+        Stars whose flux is NaN or not above 0 have no wings.
+    outer_share : ndarray, shape (n,)
+        Part of the light in the outer part of the stamp, as `outer_shares` gives it.
+    """
+
+    place: np.ndarray
+    flux: np.ndarray
+    outer_share: np.ndarray
 
 
 def star_tents(
     rows: slice,
     width: int,
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     wings: Wings,
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
     """Yield windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = np.where(np.isfinite(outer_share), flux * wings.scale(outer_share), np.nan)
-    has_light = np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1)
+    # F s, the factor of all tents of a star.
+    light = stars.flux * wings.scale(stars.outer_share)
+    light = np.where(np.isfinite(stars.outer_share), light, np.nan)
+    has_light = np.isfinite(light) & (light > 0) & np.isfinite(stars.place).all(axis=1)
     # In a crowded image, the thousand brightest stars have most of the light of all wings.
     lit_stars = np.flatnonzero(has_light)
     brightest = lit_stars[np.argsort(-light[lit_stars])[:1000]]
     # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
-    middle = np.rint(place[brightest]).astype(int)
+    middle = np.rint(stars.place[brightest]).astype(int)
     first = np.maximum(middle - reach, [0, rows.start])
     end = np.minimum(middle + reach + 1, [width, rows.stop])
     for index in np.flatnonzero((first < end).all(axis=1)):
         star = brightest[index]
         # Distances of the pixels from the star along either axis, and from its centre.
         across, down = (
-            (np.arange(first[index, axis], end[index, axis]) - place[star, axis]).astype(np.float32)
+            (np.arange(first[index, axis], end[index, axis]) - stars.place[star, axis]).astype(
+                np.float32
+            )
             for axis in (0, 1)
         )
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
@@ -255,9 +285,7 @@ def star_tents(
 
 def tented_light(
     shape: tuple[int, ...],
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     wings: Wings,
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
@@ -266,22 +294,20 @@ def tented_light(
     for top in range(0, height, 128):
         rows = slice(top, min(top + 128, height))
         tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
-        for window, light in star_tents(rows, width, place, flux, outer_share, wings):
+        for window, light in star_tents(rows, width, stars, wings):
             tented[:, *window] += light
         yield rows, tented
 
 
 def wing_light(
     shape: tuple[int, ...],
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     wings: Wings | None,
 ) -> np.ndarray:
     """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
-        for window, light in star_tents(rows, shape[1], place, flux, outer_share, wings):
+        for window, light in star_tents(rows, shape[1], stars, wings):
             image[window] += np.tensordot(wings.profile, light, 1)
     return image
 
@@ -297,9 +323,9 @@ def expected_profile(radius_px: np.ndarray, outer_share: float) -> tuple[np.ndar
     """
     half = radius_px[0]
     # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
-    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER_RADIUS**-3.0 - 1.0))
+    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (Wings.outer_radius**-3.0 - 1.0))
     # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
-    expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (STEEPNESS - 5.0))
+    expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0))
     sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
     # The model may have 1.5 % too much or too little light in its stamp.
     sigma[0] = 0.015 / (2.0 * half) ** 2
@@ -310,9 +336,7 @@ def wings_of(
     residual: np.ndarray,
     sigma: np.ndarray,
     bad: np.ndarray,
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> Wings | None:
@@ -326,10 +350,7 @@ def wings_of(
     residual, sigma : ndarray, shape (h, w)
         What is left of the image, and σ of its pixels, in its unit.
     bad : ndarray of bool, shape (h, w)
-    place : ndarray, shape (n, 2)
-        x and y of the stars.
-    flux, outer_share : ndarray, shape (n,)
-        Of the stars; those that are NaN or not above 0 take no part.
+    stars : StarFluxes
     stamp_px : int
         Side of the models' stamps.
     earlier : Wings, optional
@@ -341,8 +362,10 @@ def wings_of(
     """
     from scipy.ndimage import uniform_filter
 
-    # Wings reach 2.5 stamps far.
-    radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, TENTS + 1)
+    # Six tents, of which the last one ends 2.5 stamps from the star.
+    radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
+    # The mean of the outer share by light, for which s = 1.
+    flux, outer_share = stars.flux, stars.outer_share
     has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
     if not has_light.any():
         return None
@@ -362,11 +385,12 @@ def wings_of(
     # of A is (F s h_k, 1)/σ of a pixel and d its residual over σ; the same in blocks of a stamp.
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
     square, pixels, blocks = 0.0, 0, []
-    for band, tented in tented_light(residual.shape, place, flux, outer_share, unfitted):
+    for band, tented in tented_light(residual.shape, stars, unfitted):
         is_used = ~bad[band]
         if earlier is not None:
             deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
-            is_used &= np.abs(deviation) < CLIPPED_SIGMA * sigma[band]
+            # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
+            is_used &= np.abs(deviation) < 4.0 * sigma[band]
         weight = np.where(is_used, 1.0 / even_sigma[band].astype(np.float64), 0.0)
         design = np.concatenate([tented, np.full((1, *weight.shape), unit_sigma)]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
@@ -399,6 +423,11 @@ def wings_of(
     return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
 
 
+def error_beside_models(error: np.ndarray, star_light: np.ndarray) -> np.ndarray:
+    """Return σ (h, w) of what models of stars leave, to 3 % of whose light in a pixel they hold."""
+    return np.asarray(np.hypot(error, 0.03 * star_light))
+
+
 def block_sums(values: np.ndarray, side: int) -> np.ndarray:
     """Return sums over blocks of side × side pixels of the last two axes of an array.
 
@@ -409,26 +438,15 @@ def block_sums(values: np.ndarray, side: int) -> np.ndarray:
     return values
 
 
-class StarSurroundings(NamedTuple):
-    """Sky, light of wings (h, w) and wings of an image beside the models of its stars."""
-
-    sky: Sky
-    wing_light: np.ndarray
-    wings: Wings | None
-    sigma: np.ndarray  # σ of every pixel without models and wings, with what these may be off by
-
-
 def around_stars(
     image: np.ndarray,
     sky: Sky,
     error: np.ndarray,
     star_light: np.ndarray,
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     stamp_px: int,
     earlier: Wings | None = None,
-) -> StarSurroundings:
+) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
     """Return wings and sky of an image (h, w), found by turns beside the models of its stars.
 
     A map of the sky takes wings that are wider than its meshes for sky, until these are known.
@@ -439,21 +457,29 @@ def around_stars(
         Sky included, σ of its pixels, and light of the stars.
     sky : Sky
         As it is known so far; its `bad` pixels do not count.
-    place, flux, outer_share : ndarray, shape (n, 2) and (n,)
-        Of the stars, see `outer_shares`.
+    stars : StarFluxes
     stamp_px : int
     earlier : Wings, optional
+
+    Returns
+    -------
+    sky : Sky
+    light_of_wings : ndarray, shape (h, w)
+    wings : Wings or None
+    sigma : ndarray, shape (h, w)
+        σ of every pixel without models and wings, with what these may be off by.
     """
-    sigma = np.hypot(error, PSF_ERROR * star_light)
-    without_stars, stars = image - star_light, (place, flux, outer_share)
-    wings = _wings_beside(without_stars, sky, sigma, *stars, stamp_px, earlier)
-    light_of_wings = wing_light(image.shape, *stars, wings)
+    sigma = error_beside_models(error, star_light)
+    without_stars = image - star_light
+    wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier)
+    light_of_wings = wing_light(image.shape, stars, wings)
+    # The sky without them, with its noise map if it has one.
     has_noise_map = np.isfinite(sky.noise_scale)
     sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if has_noise_map else None)
     # The map has the most frequent value of the pixels, which is below the mean where noise is that
     # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
-    clipped = sky.bad | (np.abs(deviation) > CLIPPED_SIGMA)
+    clipped = sky.bad | (np.abs(deviation) > 4.0)
     # Mean deviation Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
     unit_sigma = float(sigma.mean(dtype=np.float64))
     weight = np.where(clipped, 0.0, unit_sigma / sigma)
@@ -463,23 +489,21 @@ def around_stars(
     even_light = unit_sigma * float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
     # Wings are round here; those of a telescope may differ from that by 30 % in a pixel.
-    return StarSurroundings(sky, light_of_wings, wings, np.hypot(sigma, 0.3 * light_of_wings))
+    return sky, light_of_wings, wings, np.hypot(sigma, 0.3 * light_of_wings)
 
 
 def _wings_beside(
     without_stars: np.ndarray,
     sky: Sky,
     sigma: np.ndarray,
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer_share: np.ndarray,
+    stars: StarFluxes,
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> Wings | None:
     """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
     from scipy.ndimage import uniform_filter
 
-    wings = earlier
+    wings, all_stars = earlier, stars
     # Galaxies, blends and saturated stars say nothing of the wings of stars: in 5 × 5 px about a
     # star, most pixels are good, and their residuals are within twice σ, which has what the PSF may
     # be off by.
@@ -488,19 +512,19 @@ def _wings_beside(
     mean_square = uniform_filter(squares, 5, mode="constant")
     good_part = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
     height, width = bad.shape
-    column, row = np.rint(np.nan_to_num(place, nan=-9.0)).astype(int).T
+    column, row = np.rint(np.nan_to_num(stars.place, nan=-9.0)).astype(int).T
     is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
     is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
-    star_flux = np.where(is_star, flux, np.nan)
+    stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
+    # Each turn finds the sky without the wings so far, then the wings on this sky.
     for turn in range(8):
         latest = wings
         if turn:
-            without_light = without_stars - wing_light(bad.shape, place, flux, outer_share, latest)
+            without_light = without_stars - wing_light(bad.shape, all_stars, latest)
             without_light[bad] = 0.0
             residual = without_stars - sky_level(without_light, bad, sky.steps).level
-        stars = place, star_flux, outer_share
-        wings = wings_of(residual, sigma, bad, *stars, stamp_px, latest)
+        wings = wings_of(residual, sigma, bad, stars, stamp_px, latest)
         if wings is None:
             break
         # Until their light changes by less than a tenth of its error.
@@ -524,6 +548,7 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     middles, fluxes, shares = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
     star_light = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
+    # The light of each restored star at the pixels that its stamp has in the image.
     for stamps, prediction in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
         shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
@@ -538,10 +563,8 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         middles.append(np.where(is_restored[:, None], corner - side + 0.5 * (side - 1), np.nan))
         fluxes.append(np.where(is_restored, prediction.flux, np.nan))
     core = np.s_[side:-side, side:-side]
-    light, gain = star_light[core], observation.gain
-    middle, flux, outer_share = (np.concatenate(parts) for parts in (middles, fluxes, shares))
-    # σ² = sky noise² + photons of the stars + (3 % of their light)².
-    photon_sigma = np.sqrt(np.maximum(light, 0.0) / gain) if gain else 0.0
-    sigma = np.hypot(np.hypot(sky.noise, photon_sigma), PSF_ERROR * light)
+    light = star_light[core]
+    stars = StarFluxes(*map(np.concatenate, (middles, fluxes, shares)))
+    sigma = error_beside_models(pixel_error(sky.noise, light, observation.gain), light)
     without_stars = sky.flat + sky.level - light
-    return _wings_beside(without_stars, sky, sigma, middle, flux, outer_share, side)
+    return _wings_beside(without_stars, sky, sigma, stars, side)

@@ -13,8 +13,9 @@ from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Seidel
+from psfdae_paper.bounds.mode_search import climb, search
+from psfdae_paper.bounds.modes import Knowledge, Modes, separate
 from psfdae_paper.bounds.posterior import (
-    MIRROR_MARGIN,
     Bank,
     Likelihood,
     PosteriorSums,
@@ -23,18 +24,8 @@ from psfdae_paper.bounds.posterior import (
     nested_means,
     posterior_sums,
 )
-from psfdae_paper.bounds.sampling import (
-    Knowledge,
-    Modes,
-    SampledPosterior,
-    Search,
-    StampModel,
-    StarPosteriors,
-    climb,
-    sample_posterior,
-    search,
-    separate,
-)
+from psfdae_paper.bounds.sampling import SampledPosterior, sample_posterior
+from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
 from psfdae_paper.bounds.tight import Evidence
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, relative_field
@@ -201,7 +192,8 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     optics = config.optics.model_copy(update={"pupil_samples": grid_sizes, "threads": threads})
     framing = config.framing
     propagation = Propagation(source, config.telescope, optics, framing, config.stars.search_px)
-    framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
+    margin = framing.jitter_px + Bank.mirror_margin
+    framed, peak = propagation.framed(framing.stamp_px + 2 * margin)
     return {
         "framed": Column(
             framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
@@ -264,12 +256,10 @@ def sample_stars(
 
     They are returned for an unknown and for a known field.
     """
-    model, noisy = stamp_model(config), stars.noisy[level]
-    posteriors = StarPosteriors(likelihood.counts(noisy), likelihood, model)
+    posteriors = StarPosteriors(stars.noisy[level], likelihood, stamp_model(config))
     # Bounds need every mode: more starts than a method takes, and more for doubtful stars.
-    effort = Search(fields=16, offsets=16, misfit_sigma=2.0)
-    modes, _ = search(bank, noisy, likelihood, model, stars.field, effort=effort)
-    modes = separate(modes + climb(true_modes(model, product, stars), posteriors))
+    modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=2.0)
+    modes = separate(modes + climb(true_modes(posteriors.model, product, stars), posteriors))
     # A star's draws do not depend on the other stars: each has a stream by its number.
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]

@@ -47,10 +47,6 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     return np.asarray(trace / jacobian.shape[-1])
 
 
-RELATIVE_TOLERANCE = 0.05
-"""Part of a bound by which an estimator may lie below it: its approximation and its noise."""
-
-
 @dataclass(frozen=True)
 class Comparison:
     """An estimator's errors beside a bound, over the same stars.
@@ -62,14 +58,26 @@ class Comparison:
     difference, stderr : float
         Mean of their paired difference and its standard error, clustered by field.
     tolerance : float
-        Part of the bound by which the estimator may lie below it.
+        Part of the bound by which the estimator may lie below it: its approximation and its noise.
     """
 
     mse: float
     bound: float
     difference: float
     stderr: float
-    tolerance: float = RELATIVE_TOLERANCE
+    tolerance: float = 0.05
+
+    @classmethod
+    def paired(
+        cls,
+        errors: np.ndarray,
+        bounds: np.ndarray,
+        field: np.ndarray,
+        tolerance: float = tolerance,
+    ) -> Comparison:
+        """Compare squared errors and bounds of the same stars, which lie in `field`, all (n,)."""
+        difference, stderr = clustered_mean(errors - bounds, field)
+        return cls(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)
 
     @property
     def efficiency(self) -> float:
@@ -80,24 +88,3 @@ class Comparison:
     def beaten(self) -> bool:
         """True if the estimator is below the bound by more than tolerance and two errors."""
         return self.difference < -(2.0 * self.stderr + self.tolerance * self.bound)
-
-
-def compare_errors(
-    errors: np.ndarray,
-    bounds: np.ndarray,
-    field: np.ndarray,
-    tolerance: float = RELATIVE_TOLERANCE,
-) -> Comparison:
-    """Compare an estimator with a bound.
-
-    Parameters
-    ----------
-    errors, bounds : ndarray, shape (n,)
-        Squared error and bound of every star.
-    field : ndarray of int, shape (n,)
-        Field of every star.
-    tolerance : float
-        Part of the bound by which the estimator may lie below it.
-    """
-    difference, stderr = clustered_mean(errors - bounds, field)
-    return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import lgamma
+from typing import ClassVar
 
 import numpy as np
-
-FREEDOM = 5.0
-"""Degrees of freedom of Student's t; its tails are heavier than those of any normal posterior."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +24,14 @@ class Mixture:
         Lower Cholesky factor L of each scale matrix.
     evidence : ndarray, shape (M,)
         Logarithm of the mass of each mode.
+    freedom : float
+        Degrees of freedom ν; the tails are heavier than those of any normal posterior.
     """
 
     mean: np.ndarray
     factor: np.ndarray
     evidence: np.ndarray
+    freedom: ClassVar[float] = 5.0
 
     def squared_distance(self, draws: np.ndarray) -> np.ndarray:
         """Return (x − μ)ᵀ (LLᵀ)⁻¹ (x − μ) of draws x (n, D) from every mode, shape (M, n)."""
@@ -45,16 +46,16 @@ class Mixture:
         """
         terms = self.mean.shape[1]
         log_determinant = np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(axis=1)
-        constant = lgamma(0.5 * (FREEDOM + terms)) - lgamma(0.5 * FREEDOM)
-        constant -= 0.5 * terms * np.log(FREEDOM * np.pi)
-        tail = 0.5 * (FREEDOM + terms) * np.log1p(squared_distance / FREEDOM)
+        constant = lgamma(0.5 * (self.freedom + terms)) - lgamma(0.5 * self.freedom)
+        constant -= 0.5 * terms * np.log(self.freedom * np.pi)
+        tail = 0.5 * (self.freedom + terms) * np.log1p(squared_distance / self.freedom)
         return np.asarray(constant - log_determinant[:, None] - tail)
 
     def draw(self, mode: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw once around each of the modes `mode` (n,); shape (n, D)."""
         # Student's t is a normal variable times √(ν/χ²).
         normal = rng.standard_normal((mode.size, self.mean.shape[1]))
-        stretch = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, mode.size))
+        stretch = np.sqrt(self.freedom / rng.chisquare(self.freedom, mode.size))
         offset = (self.factor[mode] @ (normal * stretch[:, None])[:, :, None])[:, :, 0]
         return np.asarray(self.mean[mode] + offset)
 
@@ -90,7 +91,7 @@ class Mixture:
         effective = mass**2 / np.maximum((share**2).sum(axis=1), smallest)
         gain = (effective / (effective + 10.0))[:, None]
         # Distant draws weigh (ν + D)/(ν + distance²), as in the maximum-likelihood fit of t.
-        share *= (FREEDOM + terms) / (FREEDOM + squared_distance)
+        share *= (self.freedom + terms) / (self.freedom + squared_distance)
         share /= np.maximum(share.sum(axis=1, keepdims=True), smallest)
         mean = self.mean + gain * (share @ draws - self.mean * share.sum(axis=1, keepdims=True))
         offset = draws - mean[:, None]

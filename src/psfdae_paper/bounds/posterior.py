@@ -12,16 +12,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
-
-MIRROR_MARGIN = 1
-"""Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`)."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +39,11 @@ class Bank:
         Field points P along a side.
     jitter_px : int
         Largest centring error in pixels per axis.
+    chunk : int
+        Stars per matrix product, which does not change results; scores of 420 test stars then fit
+        the cache.
+    mirror_margin : int
+        Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`).
     """
 
     framed: np.ndarray
@@ -50,6 +52,8 @@ class Bank:
     seidel: np.ndarray
     points: int
     jitter_px: int
+    chunk: int = 512
+    mirror_margin: ClassVar[int] = 1
 
     @classmethod
     def of(cls, columns: Mapping[str, np.ndarray], points: int, jitter_px: int) -> Self:
@@ -63,12 +67,12 @@ class Bank:
     @property
     def margin(self) -> int:
         """Pixels m on either side of the stamp."""
-        return self.jitter_px + MIRROR_MARGIN
+        return self.jitter_px + self.mirror_margin
 
     def take(self, stars: np.ndarray) -> Bank:
         """Return the bank of the stars with these numbers, in the order given."""
         part = (self.framed[stars], self.field[stars], self.peak[stars], self.seidel[stars])
-        return Bank(*part, self.points, self.jitter_px)
+        return Bank(*part, self.points, self.jitter_px, self.chunk)
 
     def stamps(self, window: tuple[int, int]) -> np.ndarray:
         """Cut stamps at a window (first row, first column), sum 1, shape (M, d, d), float64."""
@@ -136,10 +140,6 @@ def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
     framed = framed.astype(np.float64)
     cuts = [crop_jittered(framed, np.array(jitter), jitter_px) for jitter in jitters(jitter_px)]
     return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1).astype(np.float32)
-
-
-BANK_CHUNK = 512
-"""Stars of the bank per matrix product; scores of 420 test stars then fit the cache."""
 
 
 @dataclass(frozen=True)
@@ -369,9 +369,7 @@ def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
     return total
 
 
-def score_bank(
-    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, chunk: int = BANK_CHUNK
-) -> Iterator[ScoredStars]:
+def score_bank(bank: Bank, noisy: np.ndarray, likelihood: Likelihood) -> Iterator[ScoredStars]:
     """Weigh all stars of a bank at all jitters and symmetries; parameters as `posterior_sums`."""
     residuals = likelihood.residuals(noisy).reshape(noisy.shape)
     # Instead of mirroring every image of the bank, the test stars are mirrored back.
@@ -385,8 +383,8 @@ def score_bank(
         for j, jitter in enumerate(jitters(bank.jitter_px)):
             by_window[symmetry.window(jitter, bank.margin)].append((s, j))
     order = np.argsort(bank.field, kind="stable")  # stars of a field are adjacent
-    for start in range(0, order.size, chunk):
-        stars = order[start : start + chunk]
+    for start in range(0, order.size, bank.chunk):
+        stars = order[start : start + bank.chunk]
         part = bank.take(stars)
         with np.errstate(divide="ignore"):  # −∞ where a symmetry does not count
             log_prior = np.log(symmetry_weights(part.field, part.peak, part.points))
@@ -435,11 +433,7 @@ def groups_by_field(
 
 
 def posterior_sums(
-    bank: Bank,
-    noisy: np.ndarray,
-    likelihood: Likelihood,
-    chunk: int = BANK_CHUNK,
-    star_field: np.ndarray | None = None,
+    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, star_field: np.ndarray | None = None
 ) -> PosteriorSums:
     """Sum over all stars of a bank, at all jitters and symmetries, weighed by noisy images.
 
@@ -450,15 +444,13 @@ def posterior_sums(
         Noisy images of one noise level.
     likelihood : Likelihood
         Likelihood at that noise level.
-    chunk : int
-        Stars of the bank per matrix product; does not change the result.
     star_field : ndarray of int, shape (n,), optional
         Field of every noisy image: only stars that a symmetry takes there count. Each star
         of the bank must have one that does.
     """
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
-    for part in score_bank(bank, noisy, likelihood, chunk):
+    for part in score_bank(bank, noisy, likelihood):
         # Images in other fields are impossible if the field is known.
         if star_field is not None:
             part.scores[star_field[:, None] != part.field] = -np.inf

@@ -22,24 +22,13 @@ from psfdae_paper.bounds.estimates import (
     stamp_model,
     weigh_bank,
 )
-from psfdae_paper.bounds.floor import RELATIVE_TOLERANCE, Comparison, compare_errors, local_error
+from psfdae_paper.bounds.floor import Comparison, local_error
 from psfdae_paper.bounds.posterior import Bank, Likelihood, exact_posterior, extrapolate
-from psfdae_paper.bounds.tight import MAX_SPARSE_FRACTION, calibration
+from psfdae_paper.bounds.tight import Evidence, calibration
 from psfdae_paper.configuration.schema import Config
 
 if TYPE_CHECKING:
     import pandas as pd
-
-COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric", "value"]
-COLUMNS += ["stderr", "n", "ci_low", "ci_high", "median", "variance", "calibration"]
-COLUMNS += ["missing", "missing_stars", "tight", "found", "draws", "sampled"]
-COLUMNS += ["ess_median", "ess_low", "last_change", "undetected"]
-
-PAPER_COLUMNS = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bound", "stderr"]
-PAPER_COLUMNS += ["tight", "paper_over_bound", "verdict"]
-
-GROWTH_COLUMNS = ["dataset", "reference", "method", "noise_level", "draws", "mse", "ess_mean"]
-GROWTH_COLUMNS += ["ess_median", "last_change", "limit", "exponent", "fit_rms"]
 
 POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
 """Bounds that are posterior means; True if the star's field is known."""
@@ -53,7 +42,25 @@ class Tables:
     dataset : str
         Name in the tables.
     stars : BoundedStars
+
+    Attributes
+    ----------
+    summary, growth : list of dict
+        Rows with `summary_columns`, and with `growth_columns`.
+    per_star : list of DataFrame
+        Values of every star, a table for each row of the bounds.
     """
+
+    summary_columns = (
+        *("dataset", "split", "reference", "method", "noise_level", "metric", "value"),
+        *("stderr", "n", "ci_low", "ci_high", "median", "variance", "calibration"),
+        *("missing", "missing_stars", "tight", "found", "draws", "sampled"),
+        *("ess_median", "ess_low", "last_change", "undetected"),
+    )
+    growth_columns = (
+        *("dataset", "reference", "method", "noise_level", "draws", "mse", "ess_mean"),
+        *("ess_median", "last_change", "limit", "exponent", "fit_rms"),
+    )
 
     def __init__(self, dataset: str, stars: BoundedStars) -> None:
         self.dataset = dataset
@@ -318,14 +325,14 @@ def compare_methods(
             estimated = paired.mse_bound.notna()
             if method in POSTERIOR_MEANS:
                 estimated &= paired.mse.notna()
-            is_judged = (is_floor or is_tight) and (~estimated).mean() <= MAX_SPARSE_FRACTION
+            is_judged = (is_floor or is_tight) and (~estimated).mean() <= Evidence.max_sparse
             paired = paired[estimated]
-            comparison = compare_errors(
+            comparison = Comparison.paired(
                 paired["mse"].to_numpy(),
                 paired["mse_bound"].to_numpy(),
                 paired["field"].to_numpy(),
                 # The floor is an approximation that the posterior mean itself may undercut by 15 %.
-                0.2 if is_floor else RELATIVE_TOLERANCE,
+                0.2 if is_floor else Comparison.tolerance,
             )
             yield {
                 **key,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.metrics import clustered_mean
-
-MAX_SPARSE_FRACTION = 0.01
-"""Largest fraction of the stars that may have fewer samples than needed, or no estimate."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +17,7 @@ class Evidence:
     Attributes
     ----------
     ess_low : float
-        Effective sample size that all but `MAX_SPARSE_FRACTION` of the stars have at least.
+        Effective sample size that all but `max_sparse` of the stars have at least.
     calibration : float
         Mean squared error minus mean posterior variance in standard errors of this
         difference. For the exact posterior of stars drawn from the prior the two are equal:
@@ -28,12 +26,15 @@ class Evidence:
         Relative change of the error by the last fourfold growth of the samples.
     undetected : float
         Part of the error that vanishes if modes are added that only the truth leads to.
+    max_sparse : float
+        Largest fraction of the stars that may have fewer samples than needed, or no estimate.
     """
 
     ess_low: float
     calibration: float
     last_change: float
     undetected: float
+    max_sparse: ClassVar[float] = 0.01
 
     @classmethod
     def of(
@@ -51,7 +52,7 @@ class Evidence:
         """
         has_estimate = np.isfinite(mse)
         ascending_ess = np.sort(np.where(has_estimate, ess, 0.0))
-        ess_low = float(ascending_ess[int(MAX_SPARSE_FRACTION * ess.size)])
+        ess_low = float(ascending_ess[int(cls.max_sparse * ess.size)])
         score = calibration(mse[has_estimate], variance[has_estimate], field[has_estimate])
         return cls(ess_low, score, last_change, undetected)
 

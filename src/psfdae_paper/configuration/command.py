@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from psfdae import cli
 from psfdae.settings import ConfigError
@@ -30,10 +30,20 @@ class Groups:
         Names of the groups, or a function of the command's options that returns them.
     choice : tuple of str
         Overrides that precede those of the command line, such as the dataset of the command.
+    foreign_options : mapping
+        Options of Hydra's own programs, with what does the same here.
     """
 
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
     choice: tuple[str, ...] = ()
+    foreign_options: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(
+            ("-m", "--multirun"),
+            "several values are a sweep: name them in a file config/sweep/NAME.yaml, then "
+            "snakemake sweep --config sweep=NAME (docs/sweeps.md)",
+        ),
+        "--cfg": "psfdae config OVERRIDES prints the composed configuration",
+    }
 
     def names(self, options: Mapping[str, Any]) -> tuple[str, ...]:
         """Return the names of the groups that a command with these options reads."""

@@ -21,9 +21,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from psfdae.errors import did_you_mean
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
-from psfdae.settings import NEUTRAL, ConfigError, Group, parse_settings
+from psfdae.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
 from psfdae_paper.configuration.aligners import trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
@@ -129,9 +130,24 @@ def _reason(error: Exception, folder: Path) -> str:
     Hydra's own refusals name the key or option. Any other error comes from a damaged file, which
     Hydra does not name: the files are read one by one until one of them fails.
     """
-    from hydra.errors import HydraException
+    from hydra.errors import HydraException, MissingConfigException, OverrideParseException
     from omegaconf.errors import OmegaConfBaseException
 
+    # An option of a group that does not exist: those that there are, the likeliest first.
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, option = str(error.missing_cfg_file).rpartition("/")
+        options = [name for name in error.options if not name.startswith("_")]
+        hint = did_you_mean(option, options)
+        return f"{group}={option}: no such option; there are {', '.join(options)}{hint}"
+    if isinstance(error, OverrideParseException):
+        # Lines of Hydra's message but its heading and the address of its manual.
+        lines = re.sub("^(Error parsing override|See) .*", "", str(error), flags=re.M).split("\n")
+        problem = " ".join(filter(None, lines))
+        return f"{error.override}: expected key=value as Hydra reads it ({problem})"
+    # A key that does not exist: Hydra's advice is to add it, which the check would refuse.
+    if unknown := re.match("Could not override '(.+?)'", str(error)):
+        keys = [*_group_classes(), *(key for key, _ in leaves(compose()))]
+        return f"{unknown[1]}: unknown key{did_you_mean(unknown[1], keys)}"
     # A damaged file: the first that cannot be read is named.
     if not isinstance(error, HydraException | OmegaConfBaseException):
         for path in sorted(folder.rglob("*.yaml")):

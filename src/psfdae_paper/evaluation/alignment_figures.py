@@ -13,19 +13,19 @@ import numpy as np
 import pandas as pd
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation import drawing
-from psfdae_paper.evaluation.alignment_tables import PARAMETERS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-PARAMETER_LABELS = dict(
-    zip(PARAMETERS, ("decentre x", "decentre y", "tilt x", "tilt y"), strict=True)
-)
-"""Names of the parameters of a state in titles."""
+
+def parameter_label(parameter: str) -> str:
+    """Return the name of a parameter of a state in titles, such as "decentre x"."""
+    return parameter.replace("decenter", "decentre").replace("_", " ")
 
 
 @styled
@@ -95,8 +95,8 @@ def predicted_against_true(
         # Long labels are broken where a comma or the training data begin.
         label = ALIGNERS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
         row_panels[0].set_ylabel(label)
-    for parameter, top, bottom in zip(PARAMETERS, panels[0], panels[-1], strict=True):
-        top.set_title(PARAMETER_LABELS[parameter])
+    for parameter, top, bottom in zip(DEGREES_OF_FREEDOM, panels[0], panels[-1], strict=True):
+        top.set_title(parameter_label(parameter))
         bottom.set_xlabel("true / range")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=2, markerscale=5)
@@ -198,7 +198,7 @@ def twin_ambiguity(
         axes.grid(True)
     panels[0].set_ylabel("χ² from the state's stamps")
     panels[0].legend(loc="lower left")
-    named_values = zip(PARAMETER_LABELS.values(), state, strict=True)
+    named_values = zip(map(parameter_label, DEGREES_OF_FREEDOM), state, strict=True)
     text = ", ".join(f"{name} {value:+.2f}" for name, value in named_values)
     top.suptitle(f"State: {text} (range)", fontsize=10)
     # Stamps on a common grey scale, without a quarter of their side at each edge.

@@ -13,20 +13,9 @@ import numpy as np
 import pandas as pd
 
 from psfdae_paper.alignment.likelihood import expected_abs_error
+from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.paper import published
-
-PARAMETERS = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
-"""The four numbers of a state of misalignment."""
-
-CORRELATED = ("decenter_x-tilt_y", "decenter_y-tilt_y", "tilt_x-tilt_y")
-"""Pairs of parameters whose correlation the paper tabulates."""
-
-TEST_SETS = (
-    "Test set `grid`: the very states that the networks were trained on, with new noise; "
-    "`uniform`: other states of the same range."
-)
-"""Explanation of the column `test_set` below tables that include the paper's."""
 
 Row = dict[str, object]
 """Row of a table: values by column."""
@@ -89,7 +78,7 @@ def _in_both_units(
     """Return a row in units of the range and one in SI units for each parameter."""
     rows: list[Row] = []
     si_units = ("m", "m", "rad", "rad")
-    for index, (parameter, si_unit) in enumerate(zip(PARAMETERS, si_units, strict=True)):
+    for index, (parameter, si_unit) in enumerate(zip(DEGREES_OF_FREEDOM, si_units, strict=True)):
         for unit_name, scale in (("range", 1.0), (si_unit, unit[index])):
             # Variances scale with the square of the unit.
             values = {
@@ -110,8 +99,8 @@ def correlation_rows(
     return [
         {
             **key,
-            "parameter_a": PARAMETERS[a],
-            "parameter_b": PARAMETERS[b],
+            "parameter_a": DEGREES_OF_FREEDOM[a],
+            "parameter_b": DEGREES_OF_FREEDOM[b],
             "correlation": matrix[a, b],
             "ci_low": low[a, b],
             "ci_high": high[a, b],
@@ -180,7 +169,7 @@ def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
     # One row for the mean and one for the variance of the absolute error.
     rows = rows.melt(columns[:4], var_name="quantity", value_name="value")
     index = ["source", "test_set", "method", "quantity"]
-    return _pivoted(rows, "parameter", list(PARAMETERS), index)
+    return _pivoted(rows, "parameter", list(DEGREES_OF_FREEDOM), index)
 
 
 def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
@@ -192,15 +181,16 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
         Columns source, test_set, noise_level, method and one per pair.
     """
     # Pairs of parameters that the paper has, at levels with noise.
+    pairs = [f"{parameter}-tilt_y" for parameter in ("decenter_x", "decenter_y", "tilt_x")]
     paper = published("correlation").assign(source="paper", test_set="")
     measured = correlations.assign(
         source="psfdae", pair=correlations.parameter_a + "-" + correlations.parameter_b
     )
     columns = ["source", "test_set", "noise_level", "method", "pair", "correlation"]
-    rows = pd.concat([paper[columns], measured.loc[measured.pair.isin(CORRELATED), columns]])
+    rows = pd.concat([paper[columns], measured.loc[measured.pair.isin(pairs), columns]])
     rows = rows[rows.noise_level > 0].rename(columns={"correlation": "value"})
     index = ["source", "test_set", "noise_level", "method"]
-    return _pivoted(rows, "pair", list(CORRELATED), index)
+    return _pivoted(rows, "pair", pairs, index)
 
 
 def _pivoted(
@@ -234,7 +224,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
     # Numbers as text; a value that was not measured or published is left empty.
     formatted = table.copy()
     quantities = table.get("quantity", pd.Series("", index=table.index))
-    for column in (c for c in table.columns if c in PARAMETERS or c in CORRELATED):
+    for column in table.columns[4:]:  # four columns of keys come first
         formatted[column] = [
             "" if pd.isna(value) else format(value, digits[quantity])
             for value, quantity in zip(table[column], quantities, strict=True)

@@ -28,6 +28,7 @@ from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Panel, Style
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -41,9 +42,6 @@ MEANS: dict[str, Style] = {
 }
 """Looks of both posterior means; a marker is open where the bank has too few similar stars."""
 
-FLOOR = {"color": "#7f7f7f", "label": "local floor: field and centring known"}
-"""Look of the floor."""
-
 
 @styled
 def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
@@ -55,8 +53,6 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
         Tables of the stages of these names.
     dataset : str
     """
-    from matplotlib.patches import Patch
-
     measured = efficiency[efficiency.dataset == dataset]
     limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
     figure, panels = drawing.reference_panels(limits)
@@ -71,9 +67,8 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     # One logarithmic axis for all panels, down to the floor, with room for the zeros below it.
     first = panels[0][0]
     first.set_yscale("log")
-    bottom = _draw_floor(panels, limits)
-    if bottom is not None:
-        first.set_ylim(bottom=bottom)
+    floor = limits[limits.method == "floor"].sort_values("noise_level")
+    floor_entries = [] if floor.empty else [_draw_floor(panels, floor)]
     if (limits["value"] == 0).any():
         first.set_ylim(bottom=0.5 * first.get_ylim()[0])
     # Legend; an open marker is explained if a posterior mean is not tight at some level.
@@ -85,10 +80,8 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
         if "no" in tightness:
             open_marker = {**look, "mfc": "white", "label": "its draws too few: upper limit"}
             handles.append(drawing.legend_entry(**open_marker, ls="--", lw=1.2, ms=6))
-    if "floor" in set(limits["method"]):
-        handles.append(Patch(facecolor=FLOOR["color"], alpha=0.35, label=FLOOR["label"]))
     title = f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars"
-    drawing.finish_panels(figure, panels, title, handles, 3)
+    drawing.finish_panels(figure, panels, title, [*handles, *floor_entries], 3)
     return figure
 
 
@@ -191,21 +184,26 @@ def _draw_posterior_mean(axes: Axes, rows: pd.DataFrame, look: Style) -> None:
         axes.plot(level[selected], value[selected], zorder=3, **style)
 
 
-def _draw_floor(panels: Sequence[Panel], limits: pd.DataFrame) -> float | None:
-    """Shade the area below the floor; return the lower end of the axis, None without a floor."""
-    floor = limits[limits.method == "floor"].sort_values("noise_level")
-    if floor.empty:
-        return None
-    # The axis ends a factor of two below the lowest value.
+def _draw_floor(panels: Sequence[Panel], floor: pd.DataFrame) -> Artist:
+    """Draw the local floor, down to which the axis reaches; return its entry in the legend."""
+    from matplotlib.patches import Patch
+
+    # The axis ends a factor of two below the lowest value. Not all references have a floor.
     bottom = 0.5 * float(floor["value"].min())
     for axes, reference, _ in panels:
         rows = floor[floor.reference == reference]
-        if rows.empty:
-            continue
-        level, value = rows["noise_level"], rows["value"]
-        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
-        axes.plot(level, value, color=FLOOR["color"], lw=1.6)
-    return bottom
+        if len(rows):
+            color = _shade_below(axes, rows, bottom)
+            axes.plot(rows["noise_level"], rows["value"], color=color, lw=1.6)
+    panels[0][0].set_ylim(bottom=bottom)
+    return Patch(facecolor=color, alpha=0.35, label="local floor: field and centring known")
+
+
+def _shade_below(axes: Axes, floor: pd.DataFrame, bottom: float) -> str:
+    """Shade the area from `bottom` to the local floor; return the colour."""
+    color = "#7f7f7f"
+    axes.fill_between(floor["noise_level"], bottom, floor["value"], color=color, alpha=0.25, lw=0)
+    return color
 
 
 @styled
@@ -251,11 +249,18 @@ def _draw_errors(
     axes: Axes, methods: Sequence[Method], efficiency: pd.DataFrame, bounds: pd.DataFrame
 ) -> None:
     """Draw errors of the methods and both bounds, each line with its name."""
+
+    def draw_line(method_class: type[Method], marker_size: int) -> pd.DataFrame:
+        """Draw the errors of a method; return its rows, one for each noise level."""
+        # Every bound that the method is compared with has a row with the same error.
+        rows = efficiency[efficiency.method == method_class.name].drop_duplicates("noise_level")
+        rows = rows.sort_values("noise_level")
+        style = {**drawing.method_line(method_class), "lw": 1.6, "ms": marker_size}
+        axes.plot(rows["noise_level"], rows["mse"], **style)
+        return rows
+
     for estimator in methods:
-        line = efficiency[efficiency.method == estimator.name].drop_duplicates("noise_level")
-        line = line.sort_values("noise_level")
-        style = {**drawing.method_line(type(estimator)), "lw": 1.6, "ms": 5}
-        axes.plot(line["noise_level"], line["mse"], **style)
+        line = draw_line(type(estimator), 5)
         # The name of the lowest line is below its first point, because the next line is near.
         is_lowest = estimator is methods[-1]
         named = line[:1] if is_lowest else line
@@ -263,18 +268,13 @@ def _draw_errors(
         name = estimator.look.label.partition(" (")[0]
         color = estimator.look.color
         _write_name(axes, named["noise_level"], named["mse"], name, color, below=is_lowest)
-    # Errors if the optics of the telescope are known.
+    # Errors if the optics of the telescope are known. The line nearly coincides with the posterior
+    # mean: its name is below that one's name.
     optics = method("wavefront")
-    line = efficiency[efficiency.method == optics.name].drop_duplicates("noise_level")
-    if len(line):
-        line = line.sort_values("noise_level")
-        axes.plot(
-            line["noise_level"], line["mse"], **{**drawing.method_line(optics), "lw": 1.6, "ms": 8}
-        )
-        # The line nearly coincides with the posterior mean: its name is below that one's name.
-        color = optics.look.color
-        label_height = 0.6 * line["mse"]
-        _write_name(axes, line["noise_level"], label_height, "telescope known", color, below=True)
+    if (efficiency.method == optics.name).any():
+        line = draw_line(optics, 8)
+        height, color = 0.6 * line["mse"], optics.look.color
+        _write_name(axes, line["noise_level"], height, "telescope known", color, below=True)
     # Posterior mean, with markers where it is tight, and the area below the local floor.
     bayes = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = bayes[bayes.tight == "yes"]
@@ -287,10 +287,10 @@ def _draw_errors(
     axes.set_yscale("log")
     if not floor.empty:
         bottom = 0.6 * float(floor["value"].min())
-        level, value = floor["noise_level"], floor["value"]
-        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
+        _shade_below(axes, floor, bottom)
         axes.set_ylim(bottom=bottom)
-        _write_name(axes, level, 0.7 * value, "local floor", "#555555", below=True)
+        height = 0.7 * floor["value"]
+        _write_name(axes, floor["noise_level"], height, "local floor", "#555555", below=True)
     drawing.noise_axis(axes, np.unique(bayes["noise_level"]))
     drawing.readable_log_axis(axes)
     axes.grid(True, which="major")

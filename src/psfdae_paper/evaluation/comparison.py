@@ -7,7 +7,7 @@ counts beside the standard error of the stars.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from itertools import combinations
@@ -21,23 +21,11 @@ from psfdae_paper.evaluation.measure import CELL
 SIGNIFICANT = 3.0
 """Standard errors beyond which a difference is called significant; 1 of 370 is chance."""
 
-NEGLIGIBLE = 0.1
-"""Part of the test stars' standard error below which a difference is called rounding.
-
-Another kind of processor rounds differently; nearly all such differences are smaller.
-"""
-
 Scatter = Mapping[tuple[str, str, str], float]
 """Relative scatter of a method's MSE between seeds by dataset, reference and method."""
 
 FITTED = ["dataset", "reference", "method"]
 """Columns that identify a fit."""
-
-PAPER_ORDER = ("dae", "pca_som", "noisy")
-"""The paper's methods by ascending error, as it concludes."""
-
-SMALLER_IS_BETTER = {"mse": True, "ssim": False}
-"""Metrics that are compared."""
 
 
 @cache
@@ -112,7 +100,9 @@ def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     return same_stars and bool(np.allclose(first_mse, second_mse, rtol=1e-5, atol=0.0))
 
 
-def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
+def compare_evaluations(
+    first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter
+) -> pd.DataFrame:
     """Compare the mean errors of two evaluations, with the significance of their difference.
 
     Paired star by star where both saw the same noisy images, else as independent
@@ -142,7 +132,7 @@ def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) 
         second_stars = second_groups.get((method, level))
         if second_stars is None:
             continue
-        for metric in SMALLER_IS_BETTER:
+        for metric in ("mse", "ssim"):
             values = _difference(first_stars, second_stars, metric, paired, scatter)
             rows.append({"metric": metric, "method": method, "noise_level": level, **values})
     columns = [
@@ -156,7 +146,7 @@ def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) 
 def _difference(
     first: pd.DataFrame, second: pd.DataFrame, metric: str, paired: bool, scatter: Scatter
 ) -> dict[str, float | str]:
-    """Return a row of `compare_errors` for one method and noise level, without its keys."""
+    """Return a row of `compare_evaluations` for one method and noise level, without its keys."""
     if paired:
         # Mean of the differences of the same stars.
         first, second = (table.sort_values("star") for table in (first, second))
@@ -183,7 +173,8 @@ def _difference(
     sigmas = float(0.0 if difference == 0 else difference / error if error > 0 else np.inf)
     verdict = "same"
     if abs(sigmas) >= SIGNIFICANT:
-        verdict = "better" if (sigmas < 0) == SMALLER_IS_BETTER[metric] else "worse"
+        # A smaller MSE is better, and a larger SSIM.
+        verdict = "better" if (sigmas < 0) == (metric == "mse") else "worse"
     return {
         "first": first_mean,
         "second": second_mean,
@@ -205,7 +196,11 @@ def with_seed_stderr(table: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
 
 
 def compare_tables(
-    first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    scatter: Scatter,
+    negligible: float,
+    ascending: Sequence[str],
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Compare the rows that two tables of mean errors share, and the order of the methods.
 
@@ -215,17 +210,21 @@ def compare_tables(
         Rows of `psf_metrics.csv`.
     scatter : mapping
         See `seed_scatter`.
+    negligible : float
+        Part of the test stars' standard error up to which a difference is called rounding.
+    ascending : sequence of str
+        Methods by ascending error, as the paper has them.
 
     Returns
     -------
     rows : DataFrame
         The keys, value_first, value_second, and verdict: "equal"; "rounding" for differences
-        that are `NEGLIGIBLE`; "within" `SIGNIFICANT` standard deviations of the difference of
+        that are negligible; "within" `SIGNIFICANT` standard deviations of the difference of
         two fits with different seeds; "beyond" that; "not measured" for rows that differ, but
         whose scatter is not known.
     order : DataFrame
-        For each column of the paper's tables: True if errors ascend as in `PAPER_ORDER` in the
-        `first` and in the `second` table, and if two methods are `exchanged`, by more than the
+        For each column of the paper's tables: True if errors ascend in the order of the paper in
+        the `first` and in the `second` table, and if two methods are `exchanged`, by more than the
         scatter in both.
     """
     # Rows that both tables have, with the standard errors of both.
@@ -235,7 +234,7 @@ def compare_tables(
     rows = columns[0].merge(columns[1], on=keys, suffixes=("_first", "_second"))
     # The first condition that holds decides, from equal to beyond the scatter.
     difference = (rows.value_second - rows.value_first).abs()
-    rounding = NEGLIGIBLE * rows[["stderr_first", "stderr_second"]].min(axis=1)
+    rounding = negligible * rows[["stderr_first", "stderr_second"]].min(axis=1)
     limit = SIGNIFICANT * np.hypot(rows.seed_stderr_first, rows.seed_stderr_second)
     rows["verdict"] = pd.Series("beyond", rows.index).case_when(
         [
@@ -247,36 +246,31 @@ def compare_tables(
     )
     rows = rows[[*keys, "value_first", "value_second", "verdict"]]
     # Signs of the differences between the paper's methods, where both tables have them.
-    signs = [_mse_signs(table) for table in tables]
+    signs = [_mse_signs(table, ascending) for table in tables]
     signs = [s.reindex(signs[0].index.intersection(signs[1].index)) for s in signs]
     order = {name: (s < 0).all(axis=1) for name, s in zip(("first", "second"), signs, strict=True)}
     order["exchanged"] = (signs[0] * signs[1] < 0).any(axis=1)
     return rows, pd.DataFrame(order)
 
 
-def _mse_signs(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the sign of the MSE difference for each pair of `PAPER_ORDER`.
+def _mse_signs(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
+    """Return the sign of the MSE difference for each pair of methods.
 
     −1 if the MSE of the pair's first method is smaller, 1 if larger, 0 if the difference is below
     `SIGNIFICANT` times its scatter between seeds.
     """
     # MSE and its scatter by method, of the columns of the paper's tables that have all methods.
     by_method = table[table.metric == "mse"].pivot(index=CELL, columns="method")
-    columns = pd.MultiIndex.from_product([["value", "seed_stderr"], PAPER_ORDER])
+    columns = pd.MultiIndex.from_product([["value", "seed_stderr"], methods])
     by_method = by_method.reindex(columns=columns)
     mse, scatter = by_method["value"].dropna(), by_method["seed_stderr"].fillna(0.0)
     signs = {}
-    for pair in combinations(PAPER_ORDER, 2):
+    for pair in combinations(methods, 2):
         difference = mse[pair[0]] - mse[pair[1]]
         scatter_of_pair = np.hypot(scatter[pair[0]], scatter[pair[1]])
         is_significant = difference.abs() > SIGNIFICANT * scatter_of_pair
         signs[pair] = np.sign(difference).where(is_significant, 0.0)
     return pd.DataFrame(signs, index=mse.index)
-
-
-HELD_OUT_COLUMNS = ["dataset", "reference", "method", "noise_level", "mse_random", "mse_held_out"]
-HELD_OUT_COLUMNS += ["ratio", "stderr", "n", "fields"]
-"""Columns of the table of held-out ratios."""
 
 
 def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
@@ -294,11 +288,11 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        `HELD_OUT_COLUMNS`: mean errors, their ratio (held out over random) with its
-        standard error clustered by field, numbers of stars and of fields.
+        A row for each method and noise level: mean errors, their ratio (held out over random) with
+        its standard error clustered by field, numbers of stars and of fields.
     """
     rows = []
-    keys = HELD_OUT_COLUMNS[:4]
+    keys = [*FITTED, "noise_level"]
     for key, errors in stars.groupby(keys, sort=False):
         by_split = [errors[errors.split == split] for split in ("random", "held_out")]
         # Stars that both splits test: their two errors differ by what the fit has seen.
@@ -310,7 +304,8 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
             ratio, stderr = clustered_ratio(held_out_mse, random_mse, shared.field.to_numpy())
             means = (random_mse.mean(), held_out_mse.mean())
             rows.append((*key, *means, ratio, stderr, len(shared), shared.field.nunique()))
-    return pd.DataFrame(rows, columns=HELD_OUT_COLUMNS)
+    columns = [*keys, "mse_random", "mse_held_out", "ratio", "stderr", "n", "fields"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def seed_stderr(scatter: float, metric: str, mean: float) -> float:

@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-REFERENCES = {
-    "realisation": "against the star's own noise-free image (realisation)",
-    "template": "against the static PSF of the field (template)",
-}
-"""Names of the references in titles."""
-
 METRIC_LABELS = {
     "mse": "MSE per pixel (stamp sum = 1)",
     "ssim": "SSIM, data range fitted to the paper",
@@ -41,10 +35,18 @@ Panel = tuple["Axes", str, pd.DataFrame]
 """Axes of a reference, its name, and its rows of a table."""
 
 
+def reference_title(reference: str) -> str:
+    """Return the name of a reference in titles."""
+    return {
+        "realisation": "against the star's own noise-free image (realisation)",
+        "template": "against the static PSF of the field (template)",
+    }[reference]
+
+
 def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
     """Make a figure with one titled panel for each reference of a table.
 
-    The panels stand side by side, in the order of `REFERENCES`, and share the axis of errors.
+    The panels stand side by side, realisations first, and share the axis of errors.
 
     Parameters
     ----------
@@ -58,12 +60,11 @@ def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
         Axes, name of the reference and its rows.
     """
     figure = new_figure(4.9, layout="constrained")
-    present = set(table["reference"])
-    references = [name for name in REFERENCES if name in present]
+    references = sorted(set(table["reference"]))
     all_axes = figure.subplots(1, len(references), squeeze=False, sharey=True)[0]
     for axes, name in zip(all_axes, references, strict=True):
         # What is in brackets goes to a second line: two panels share the width of the figure.
-        axes.set_title(REFERENCES[name].replace(" (", "\n("))
+        axes.set_title(reference_title(name).replace(" (", "\n("))
         axes.grid(True, which="major")
     rows = [table[table.reference == name] for name in references]
     return figure, list(zip(all_axes, references, rows, strict=True))

@@ -7,8 +7,9 @@ metric) and a table with the errors of every single star.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -21,9 +22,6 @@ from psfdae.reading import read_table
 
 CELL = ["dataset", "split", "reference", "noise_level"]
 """Columns that identify a column of the paper's tables: methods are compared inside it."""
-
-COLUMNS = [*CELL[:3], "method", "noise_level", "metric", "value", "stderr", "n"]
-"""Columns of the summary."""
 
 
 def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> pd.DataFrame:
@@ -50,7 +48,8 @@ def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> 
     return pd.concat([table[columns] for table in tables], ignore_index=True)
 
 
-class MeasuredStars(NamedTuple):
+@dataclass(frozen=True)
+class MeasuredStars:
     """Stars on which estimates are measured; every array has n rows.
 
     Attributes
@@ -63,7 +62,11 @@ class MeasuredStars(NamedTuple):
         Position in the field, as methods are given it.
     truth : ndarray, shape (n, d, d)
         Noise-free image that the estimate is compared with, sum 1.
+    columns : tuple of str
+        Columns of the summary of `errors`.
     """
+
+    columns: ClassVar = (*CELL[:3], "method", "noise_level", "metric", "value", "stderr", "n")
 
     star: np.ndarray
     field: np.ndarray
@@ -93,7 +96,7 @@ class MeasuredStars(NamedTuple):
         Returns
         -------
         summary : list of dict
-            A row of `COLUMNS` for each metric, with its standard error clustered by field.
+            A row of `columns` for each metric, with its standard error clustered by field.
         per_star : DataFrame
             `row`, star, field, and a column for each metric.
         """

@@ -49,6 +49,23 @@ class Scale:
         constant = np.full(np.shape(coordinate), 0.5)
         return (coordinate - low) / (high - low) if high > low else constant
 
+    def draw_upright(self, panel: Axes, x: float) -> None:
+        """Draw an upright line at `x`, with the ticks of this axis and their labels."""
+        panel.plot([x, x], [0, 1], color="black", lw=0.9, zorder=3)
+        for height, label in zip(self.to_unit(self.ticks), self.labels, strict=True):
+            panel.plot([x - 0.012, x + 0.012], [height, height], color="black", lw=0.9, zorder=3)
+            # Labels are above the lines of the points, on white that lets them shine through.
+            panel.annotate(
+                label,
+                (x, height),
+                xytext=(5, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+                zorder=4,
+                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+            )
+
 
 def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
     """Make the scale of an axis from the texts in its column.
@@ -138,6 +155,51 @@ class SweepPoints:
         """Return the scale of an axis; it is logarithmic if its range is."""
         return scale_of(self.table[name].tolist(), bool(self.definition["space"][name].get("log")))
 
+    def draw(self, panel: Axes, scale: Scale, name: str, line: Style) -> str:
+        """Draw all points, and lines through the best; return the axis that the lines stand for."""
+        table, definition = self.table, self.definition
+        validation, test = self.errors(self.metric)
+        succeeded = np.isfinite(validation)
+        # In a grid of two axes each value of the second axis has a line, if there are at most six.
+        second_axes = [axis for axis in definition["space"] if axis != name]
+        line_axis = second_axes[0] if definition["kind"] == "grid" and len(second_axes) == 1 else ""
+        if line_axis and table[line_axis].nunique() > 6:
+            line_axis = ""
+        for number, value in enumerate(dict.fromkeys(table[line_axis]) if line_axis else [""]):
+            color = SERIES_COLORS[number % len(SERIES_COLORS)]
+            members = succeeded & ((table[line_axis] == value).to_numpy() if line_axis else True)
+            coordinate = scale.coordinate[members]
+            # The line joins the best validation value at each coordinate.
+            positions = np.unique(coordinate)
+            best_of = np.min if definition["direction"] == "minimize" else np.max
+            heights = [best_of(validation[members][coordinate == x]) for x in positions]
+            panel.plot(positions, heights, marker="o", ms=4, color=color, **line, label=value)
+            panel.plot(coordinate, validation[members], ls="", marker="o", ms=4, color=color)
+            panel.plot(coordinate, test[members], **_open_marker(color))
+        star: Style = {"ls": "", "marker": "*", "ms": 14, "mfc": "none", "mec": "black"}
+        panel.plot(scale.coordinate[self.is_best], validation[self.is_best], **star)
+        # Failed points are crosses at the upper edge of the panel.
+        cross: Style = {"ls": "", "marker": "x", "ms": 6, "color": "0.4"}
+        top = np.full((~succeeded).sum(), 0.97)
+        transform = panel.get_xaxis_transform()
+        panel.plot(scale.coordinate[~succeeded], top, transform=transform, **cross)
+        return line_axis
+
+    def draw_noise_levels(self, panel: Axes, scale: Scale, name: str, line: Style) -> str:
+        """Draw the metric at every noise level; return the quantity that the lines stand for."""
+        # The table has a column METRIC_LEVEL for each noise level.
+        prefix = f"{self.metric}_"
+        columns = [column for column in self.table.columns if column.startswith(prefix)]
+        # Validation as a line with filled markers, test as open ones, one colour for each level.
+        order = np.argsort(scale.coordinate)
+        for number, column in enumerate(columns):
+            style = {**line, "color": SERIES_COLORS[number % len(SERIES_COLORS)]}
+            validation, test = self.errors(column)
+            style["label"] = column.removeprefix(prefix)
+            panel.plot(scale.coordinate[order], validation[order], marker="o", ms=4, **style)
+            panel.plot(scale.coordinate, test, **_open_marker(style["color"]))
+        return "noise level λ"
+
 
 @styled
 def parallel_coordinates(points: SweepPoints) -> Figure:
@@ -181,7 +243,8 @@ def parallel_coordinates(points: SweepPoints) -> Figure:
     for i in np.argsort(np.where(succeeded, -metric_values, -np.inf), kind="stable"):
         style = "-" if succeeded[i] else ":"
         panel.plot(heights[i], color=colors[i], ls=style, lw=3.2 if points.is_best[i] else 1.1)
-    _draw_vertical_scales(panel, scales)
+    for i, scale in enumerate(scales):
+        scale.draw_upright(panel, i)
     # Names of the axes below them; the frame of the panel would look like another axis.
     panel.set_xticks(range(len(names) + 1), [*names, f"validation\n{points.label}"])
     bottom = -0.06 if succeeded.all() else failed_height - 0.06
@@ -207,9 +270,9 @@ def response_curves(points: SweepPoints) -> Figure:
     """
     # Name of the axis of each panel, and what is drawn against it.
     names = list(points.definition["space"])
-    contents = [(name, _draw_points) for name in names]
+    contents = [(name, points.draw) for name in names]
     if len(names) == 1:
-        contents.append((names[0], _draw_noise_levels))
+        contents.append((names[0], points.draw_noise_levels))
     # Two panels side by side; panels of a row share the axis of the metric.
     columns = min(len(contents), 2)
     rows = -(-len(contents) // columns)
@@ -219,7 +282,7 @@ def response_curves(points: SweepPoints) -> Figure:
         scale = points.scale(name)
         # Only listed numbers are joined; draws from a range are scattered.
         joined = scale.numeric and points.definition["space"][name].get("low") is None
-        title = draw(panel, points, scale, name, {"ls": "-" if joined else "", "lw": 1.3})
+        title = draw(panel, scale, name, {"ls": "-" if joined else "", "lw": 1.3})
         if points.is_logarithmic:
             panel.set_yscale("log")
         panel.set_xticks(scale.ticks, scale.labels)
@@ -237,73 +300,6 @@ def response_curves(points: SweepPoints) -> Figure:
     return figure
 
 
-def _draw_points(panel: Axes, points: SweepPoints, scale: Scale, name: str, line: Style) -> str:
-    """Draw every point, and lines through the best; return the axis that the lines stand for."""
-    table, definition = points.table, points.definition
-    validation, test = points.errors(points.metric)
-    succeeded = np.isfinite(validation)
-    # In a grid of two axes each value of the second axis has a line, if there are at most six.
-    further_axes = [axis for axis in definition["space"] if axis != name]
-    line_axis = further_axes[0] if definition["kind"] == "grid" and len(further_axes) == 1 else ""
-    if line_axis and table[line_axis].nunique() > 6:
-        line_axis = ""
-    for number, value in enumerate(dict.fromkeys(table[line_axis]) if line_axis else [""]):
-        color = SERIES_COLORS[number % len(SERIES_COLORS)]
-        members = succeeded & ((table[line_axis] == value).to_numpy() if line_axis else True)
-        coordinate = scale.coordinate[members]
-        # The line joins the best validation value at each coordinate.
-        positions = np.unique(coordinate)
-        best_of = np.min if definition["direction"] == "minimize" else np.max
-        heights = [best_of(validation[members][coordinate == x]) for x in positions]
-        panel.plot(positions, heights, marker="o", ms=4, color=color, **line, label=value)
-        panel.plot(coordinate, validation[members], ls="", marker="o", ms=4, color=color)
-        panel.plot(coordinate, test[members], **_open_marker(color))
-    star: Style = {"ls": "", "marker": "*", "ms": 14, "mfc": "none", "mec": "black"}
-    panel.plot(scale.coordinate[points.is_best], validation[points.is_best], **star)
-    # Failed points are crosses at the upper edge of the panel.
-    cross: Style = {"ls": "", "marker": "x", "ms": 6, "color": "0.4"}
-    top = np.full((~succeeded).sum(), 0.97)
-    transform = panel.get_xaxis_transform()
-    panel.plot(scale.coordinate[~succeeded], top, transform=transform, **cross)
-    return line_axis
-
-
-def _draw_noise_levels(
-    panel: Axes, points: SweepPoints, scale: Scale, name: str, line: Style
-) -> str:
-    """Draw the metric at every noise level; return the quantity that the lines stand for."""
-    # The table has a column METRIC_LEVEL for each noise level.
-    prefix = f"{points.metric}_"
-    columns = [column for column in points.table.columns if column.startswith(prefix)]
-    # Validation as a line with filled markers, test as open ones, one colour for each level.
-    order = np.argsort(scale.coordinate)
-    for number, column in enumerate(columns):
-        style = {**line, "color": SERIES_COLORS[number % len(SERIES_COLORS)]}
-        validation, test = points.errors(column)
-        style["label"] = column.removeprefix(prefix)
-        panel.plot(scale.coordinate[order], validation[order], marker="o", ms=4, **style)
-        panel.plot(scale.coordinate, test, **_open_marker(style["color"]))
-    return "noise level λ"
-
-
 def _open_marker(color: str) -> Style:
     """Return the style of test metrics: open markers without a line."""
     return {"ls": "", "marker": "o", "ms": 7, "mfc": "none", "mec": color}
-
-
-def _draw_vertical_scales(panel: Axes, scales: Sequence[Scale]) -> None:
-    """Draw an upright line for each axis, with its ticks and their labels."""
-    for i, scale in enumerate(scales):
-        panel.plot([i, i], [0, 1], color="black", lw=0.9, zorder=3)
-        for height, label in zip(scale.to_unit(scale.ticks), scale.labels, strict=True):
-            panel.plot([i - 0.012, i + 0.012], [height, height], color="black", lw=0.9, zorder=3)
-            panel.annotate(
-                label,
-                (i, height),
-                xytext=(5, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-                zorder=4,
-                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-            )

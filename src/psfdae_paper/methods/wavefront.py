@@ -4,8 +4,8 @@ Given are the telescope, the distribution of its random aberrations, and flux, s
 of the star. The unknowns are the star's Seidel coefficients, its field and the position of its
 stamp. Where enough stars of a simulated bank are similar to the star, they give the posterior
 mean. Elsewhere the modes of the posterior are searched as for the error bounds
-(`psfdae_paper.bounds.sampling`), and importance samples around them give the mean. A star that no
-mode explains gets the PSF of the Gaussian mixture.
+(`psfdae_paper.bounds.mode_search`), and importance samples around them give the mean. A star that
+no mode explains gets the PSF of the Gaussian mixture.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.rng import stream
 
 if TYPE_CHECKING:
+    from psfdae_paper.bounds.modes import Modes
     from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums
-    from psfdae_paper.bounds.sampling import Modes, StampModel
+    from psfdae_paper.bounds.stamp_model import StampModel
     from psfdae_paper.configuration.schema import Config
 
 BANK_STARS = 32000
@@ -155,11 +156,12 @@ class Wavefront(Method):
         unexplained : ndarray of int
             Numbers of the stars without a mode.
         """
-        from psfdae_paper.bounds.sampling import search
+        from psfdae_paper.bounds.mode_search import search
+        from psfdae_paper.bounds.stamp_model import StarPosteriors
 
         star_field = self._fields(position)
-        likelihood, in_all_fields = self.likelihood(level), star_field is None
-        return search(self.bank, noisy, likelihood, self.model, star_field, in_all_fields)
+        posteriors = StarPosteriors(noisy, self.likelihood(level), self.model)
+        return search(self.bank, posteriors, star_field, in_all_fields=star_field is None)
 
     def likelihood(self, level: float) -> Likelihood:
         """Return the likelihood of photon counts at a noise level λ."""
@@ -188,7 +190,8 @@ class Wavefront(Method):
             True where a sample of positive weight and, if it was searched, a mode exists.
         """
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
-        from psfdae_paper.bounds.sampling import StarPosteriors, sample_posterior
+        from psfdae_paper.bounds.sampling import sample_posterior
+        from psfdae_paper.bounds.stamp_model import StarPosteriors
 
         sums = self._sums_over_bank(noisy, level, self._fields(position))
         explained = np.ones(len(noisy), bool)
@@ -202,7 +205,7 @@ class Wavefront(Method):
             # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
-            posteriors = StarPosteriors(likelihood.counts(noisy[block]), likelihood, self.model)
+            posteriors = StarPosteriors(noisy[block], likelihood, self.model)
             no_field = np.full(len(block), -1)
             samples, _ = sample_posterior(modes, posteriors, no_field, DRAWS_PER_STAR, rngs)
             sums.put(block, samples.with_truth)

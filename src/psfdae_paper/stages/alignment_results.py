@@ -25,6 +25,7 @@ from psfdae.threads import limit_threads
 from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
+    DEGREES_OF_FREEDOM,
     StateTracer,
     coma_free_decentre,
     design_states,
@@ -210,11 +211,15 @@ def alignment_paper_tables(
 
     One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
     """
+    test_sets = (
+        "Test set `grid`: the very states that the networks were trained on, with new noise; "
+        "`uniform`: other states of the same range."
+    )
 
     def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
-        text = alignment_tables.as_markdown(table, f"{title}. {alignment_tables.TEST_SETS}", digits)
+        text = alignment_tables.as_markdown(table, f"{title}. {test_sets}", digits)
         write_text(path.with_suffix(".md"), text)
 
     # One table of errors for each of the paper's noise levels.
@@ -403,7 +408,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
         # A row has one pair of parameters; the matrix is symmetric.
         pairs = rows[rows.method == method.name]
         for pair, value in zip(pairs.pair, pairs.correlation, strict=True):
-            a, b = (alignment_tables.PARAMETERS.index(name) for name in pair.split("-"))
+            a, b = (DEGREES_OF_FREEDOM.index(name) for name in pair.split("-"))
             matrix[a, b] = matrix[b, a] = value
         return f"{source}{method.short}, λ = {level:g}", matrix
 

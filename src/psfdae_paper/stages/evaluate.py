@@ -25,7 +25,7 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
-from psfdae_paper.evaluation.measure import COLUMNS, MeasuredStars, read_tables
+from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
 
 READS = (
@@ -170,9 +170,9 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
     """
     # The standard error of a mean over stars does not hold the scatter between seeds.
     table = comparison.with_seed_stderr(
-        read_tables(evaluations, COLUMNS), comparison.seed_scatter()
+        read_tables(evaluations, MeasuredStars.columns), comparison.seed_scatter()
     )
-    write_csv(out, table[[*COLUMNS[:-1], "seed_stderr", "n"]])
+    write_csv(out, table[[*MeasuredStars.columns[:-1], "seed_stderr", "n"]])
 
 
 @command("held-out")
@@ -184,7 +184,7 @@ def held_out(
 
     PER_STAR are the evaluations' Parquet files of both splits.
     """
-    columns = [*comparison.HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
     # Errors in the same fields, as seen in training and as held out.
     parts = [pd.read_parquet(path, columns=columns) for path in per_star]
     write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
@@ -203,7 +203,7 @@ def paper_tables(
     Rows are methods, columns noise levels; measured errors are given for each reference.
     """
     # Each table as CSV, and beside it as Markdown.
-    measured = read_tables(evaluations, COLUMNS)
+    measured = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
         table = paper_table(measured, dataset, metric)
         write_csv(path, table, 6)

@@ -26,9 +26,9 @@ from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import bound_figures, curves
-from psfdae_paper.evaluation.drawing import REFERENCES
+from psfdae_paper.evaluation.drawing import reference_title
 from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
-from psfdae_paper.evaluation.measure import COLUMNS, read_tables
+from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.evaluate import READS, Evaluations, Metric, Models, estimators
 from psfdae_paper.stars.fields import square_grid
@@ -84,7 +84,7 @@ def figure_strip(
     columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[strip_stars.selected]]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
-        f"restored and measured {REFERENCES[reference]}"
+        f"restored and measured {reference_title(reference)}"
     )
     write_png(restoration_strip(strip_stars.rows(config, levels), columns, title), out)
 
@@ -225,7 +225,7 @@ def figure_errors(
     out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
 ) -> None:
     """Draw metrics against the noise level, with the paper's points."""
-    metrics = read_tables(evaluations, COLUMNS)
+    metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
         # An empty figure would hide that a table lacks the dataset.
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():

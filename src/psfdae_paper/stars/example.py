@@ -23,9 +23,6 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
 
-RENDER_PX = 32
-"""Side in pixels of the square into which a star is drawn."""
-
 
 @dataclass(frozen=True)
 class FieldRecipe:
@@ -49,6 +46,7 @@ class FieldRecipe:
     gain: float = 1.6  # electrons per count
     saturation: int = 60000  # counts at which the camera clips
     pixel_scale_arcsec: float = 1.2
+    stamp_px: int = 32  # side of the square into which a star is drawn
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     rng = stream(seed, "example field")
     counts = (recipe.bright, recipe.faint, recipe.saturated, recipe.blended)
     kind = np.repeat(["bright", "faint", "saturated", "blended"], counts)
-    margin = RENDER_PX / 2
+    margin = recipe.stamp_px / 2
     position = rng.uniform(margin, recipe.side_px - margin, size=(kind.size, 2))
     # A companion of each blended star, 4 to 7 px from it, in a random direction.
     distance = rng.uniform(4.0, 7.0, size=recipe.blended)
@@ -91,7 +89,7 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     image = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, 65535))
     # Centres of light from the first moments of the noise-free stamps, whose sum is 1.
     psf = psf[: kind.size]
-    axis = np.arange(RENDER_PX) - RENDER_PX // 2
+    axis = np.arange(recipe.stamp_px) - recipe.stamp_px // 2
     centre_in_stamp = np.stack([psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis], axis=1)
     centroid = np.rint(position) + centre_in_stamp
     return ExampleField(image.astype(np.uint16), position, centroid, flux, psf, kind)
@@ -107,50 +105,40 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
 
     Returns
     -------
-    ndarray, shape (n, RENDER_PX, RENDER_PX), float32
-        Sum 1; the pixel nearest to the position has the index RENDER_PX/2.
+    ndarray, shape (n, d, d), float32
+        Sum 1, d = `recipe.stamp_px`; the pixel nearest to the position has the index d/2.
     """
     # Optics on a grid of 3 × 3 sub-pixels, beyond whose Nyquist frequency seeing leaves nothing.
-    oversampling = 3
-    fine = oversampling * RENDER_PX
+    oversampling, side = 3, recipe.stamp_px
+    fine = oversampling * side
     field = position / (0.5 * recipe.side_px) - 1.0  # −1 … 1 along either axis
     source = seidel_wavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
     pupil = annular_pupil(128, 0.35)
     propagate = StampPropagator(pupil, fine, recipe.pixel / oversampling, precision="complex64")
-    blur = _moffat_transfer(recipe.seeing_px * oversampling, fine)
+    # Seeing: a Moffat profile (1 + r²/α²)^(−3) of sum 1, which falls to 1/2 at
+    # r = α √(2^(1/3) − 1) = FWHM/2.
+    core_radius = 0.5 * recipe.seeing_px * oversampling / np.sqrt(2.0 ** (1.0 / 3.0) - 1.0)
+    axis = np.fft.fftfreq(fine, 1.0 / fine)
+    profile = (1.0 + (axis[:, None] ** 2 + axis**2) / core_radius**2) ** -3.0
+    blur = np.fft.rfft2(profile / profile.sum()).real
     # The chief ray is at the corner between the two middle sub-pixels of the fine image.
     shift = position - np.rint(position) + 0.5
-    stamps = np.empty((len(field), RENDER_PX, RENDER_PX), np.float32)
+    stamps = np.empty((len(field), side, side), np.float32)
     for start in range(0, len(field), 32):
         part = np.arange(start, min(start + 32, len(field)))
         sharp = propagate(source.opd(part, pupil, propagate.real_dtype))
-        # Seeing and sub-pixel position are factors of the Fourier transform.
-        phase = _shift_transfer(shift[part] * oversampling, fine)
+        # Seeing and sub-pixel position are factors of the Fourier transform: a shift by (x, y)
+        # multiplies it by exp(−2πi f_y y) exp(−2πi f_x x).
+        moved = shift[part] * oversampling
+        rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * moved[:, 1, None])
+        columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * moved[:, 0, None])
+        phase = rows[:, :, None] * columns[:, None, :]
         blurred = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
         # Sum of the sub-pixels of each pixel, without ripples below 0, of flux 1.
-        binned = blurred.reshape(len(part), RENDER_PX, oversampling, RENDER_PX, oversampling)
+        binned = blurred.reshape(len(part), side, oversampling, side, oversampling)
         pixels = np.clip(binned.sum(axis=(2, 4)), 0.0, None)
         stamps[part] = pixels / pixels.sum(axis=(1, 2), keepdims=True)
     return stamps
-
-
-def _moffat_transfer(fwhm: float, side: int) -> np.ndarray:
-    """Return the Fourier transform of a centred Moffat profile of exponent 3, sum 1.
-
-    The profile is (1 + r²/α²)^(−3); it falls to 1/2 at r = α √(2^(1/3) − 1) = FWHM/2.
-    """
-    core_radius = 0.5 * fwhm / np.sqrt(2.0 ** (1.0 / 3.0) - 1.0)
-    axis = np.fft.fftfreq(side, 1.0 / side)
-    profile = (1.0 + (axis[:, None] ** 2 + axis**2) / core_radius**2) ** -3.0
-    return np.fft.rfft2(profile / profile.sum()).real
-
-
-def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
-    """Return the factors that move images by (x, y) pixels, shape (n, side, side//2 + 1)."""
-    rows = np.exp(-2j * np.pi * np.fft.fftfreq(side) * shift[:, 1, None])
-    columns = np.exp(-2j * np.pi * np.fft.rfftfreq(side) * shift[:, 0, None])
-    factors: np.ndarray = rows[:, :, None] * columns[:, None, :]
-    return factors
 
 
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:

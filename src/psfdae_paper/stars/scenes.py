@@ -27,16 +27,6 @@ from psfdae_paper.configuration.wavefront import VonKarman
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
 from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, Removal, draw_waves, layer_r0
 
-CYCLES_PER_DIAMETER = 60
-"""Highest spatial frequency of the turbulence, cycles across the pupil.
-
-Anything finer scatters light beyond ±60 λ/D (±6.8″ at 1 m and 550 nm), outside
-every stamp: 0.14 % of the light at D/r0 = 5, lost to the flux normalisation.
-"""
-
-SLOPE_SAMPLES = 128
-"""Samples across the pupil of the grid on which slopes are measured."""
-
 
 class TurbulentWavefronts:
     """Turbulent wavefronts, one per direction, on any pupil grid.
@@ -44,7 +34,19 @@ class TurbulentWavefronts:
     Parameters
     ----------
     footprints : Footprints
+
+    Attributes
+    ----------
+    highest_cycles : int
+        Highest spatial frequency of the turbulence, cycles across the pupil. Anything finer
+        scatters light beyond ±60 λ/D (±6.8″ at 1 m and 550 nm), outside every stamp: 0.14 % of the
+        light at D/r0 = 5, lost to the flux normalisation.
+    slope_samples : int
+        Samples across the pupil of the grid on which slopes are measured.
     """
+
+    highest_cycles = 60
+    slope_samples = 128
 
     def __init__(self, footprints: Footprints) -> None:
         self.footprints = footprints
@@ -56,7 +58,7 @@ class TurbulentWavefronts:
     def slopes(self) -> np.ndarray:
         """Measure the extreme slopes over the disc, in waves per pupil radius.
 
-        They are differences of neighbouring samples of a grid of `SLOPE_SAMPLES`, times 1.35.
+        They are differences of neighbouring samples of a grid of `slope_samples`, times 1.35.
         Obscured samples count, too. The result is kept for the next call.
 
         Returns
@@ -65,7 +67,7 @@ class TurbulentWavefronts:
             [wavefront, axis (x, y), (min, max)].
         """
         if self._slopes is None:
-            pupil = annular_pupil(SLOPE_SAMPLES, 0.0, sharpen=False)
+            pupil = annular_pupil(self.slope_samples, 0.0, sharpen=False)
             # Slopes along x (array axis 2) and y (axis 1), where both neighbours are lit.
             lit = pupil.amplitude > 0
             lit_pairs = ((2, lit[:, 1:] & lit[:, :-1]), (1, lit[1:] & lit[:-1]))
@@ -92,11 +94,12 @@ class TurbulentWavefronts:
             If the grid cannot represent the highest frequency of the turbulence.
         """
         samples = 2.0 / pupil.spacing  # the pupil is 2 radii wide
-        if samples < 2 * CYCLES_PER_DIAMETER - 0.5:
+        needed = 2 * self.highest_cycles
+        if samples < needed - 0.5:
             raise SamplingError(
-                f"optics.pupil_samples: the turbulence has up to {CYCLES_PER_DIAMETER} cycles "
+                f"optics.pupil_samples: the turbulence has up to {self.highest_cycles} cycles "
                 f"per diameter, which {samples:.0f} samples would alias; "
-                f"the grid needs N = {2 * CYCLES_PER_DIAMETER} or more"
+                f"the grid needs N = {needed} or more"
             )
         return self.footprints.opd(index, pupil.axis, dtype)
 
@@ -195,16 +198,17 @@ def turbulent_wavefronts(
     # Phase variance beyond the highest frequency, ∫ 2πf 0.0229 r0^(−5/3) f^(−11/3) df
     # = 1.2 π 0.0229 (r0 f)^(−5/3). It is 0.0014 rad² at D/r0 = 5; 0.1 rad² would scatter
     # a tenth of the light.
-    cycles = wavefront.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
+    highest_cycles = TurbulentWavefronts.highest_cycles
+    cycles = wavefront.r0_m * highest_cycles / telescope.diameter_m
     omitted_variance = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
     if omitted_variance > 0.1:
         raise SamplingError(
             f"wavefront.r0_m = {wavefront.r0_m:g}, telescope.diameter_m = "
             f"{telescope.diameter_m:g}: a phase variance of {omitted_variance:.2g} rad² lies "
-            f"beyond {CYCLES_PER_DIAMETER} cycles per diameter (at most 0.1)"
+            f"beyond {highest_cycles} cycles per diameter (at most 0.1)"
         )
     # Each layer has its own random stream, so that it is the same beside other layers.
-    highest = CYCLES_PER_DIAMETER / telescope.diameter_m
+    highest = highest_cycles / telescope.diameter_m
     layers = [
         draw_waves(
             *(wavefront.waves, r0, wavefront.outer_scale_m, highest),

@@ -18,50 +18,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import gamma, jv, kv
+from scipy.special import gamma, jv
 
 Removal = Literal["none", "piston", "tilt"]
 """Modes that can be taken out of wavefronts; "tilt" includes the piston."""
 
-WAVES_PER_RING = 8
-"""Plane waves in a ring of the frequency plane; their angles are stratified."""
+SPECTRUM = gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
+"""Factor 0.0229 of the phase spectrum.
 
-HALF_FRIED_CONSTANT = (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
-"""Half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/r0)^(5/3)."""
-
-SPECTRUM = gamma(11.0 / 6.0) ** 2 / (2.0 * np.pi ** (11.0 / 3.0)) * HALF_FRIED_CONSTANT
-"""Factor 0.0229 of the phase spectrum."""
-
-
-def structure_function(separation: np.ndarray, r0: float, outer_scale: float) -> np.ndarray:
-    """Return the von Kármán phase structure function D(r) = ⟨[φ(x + r) − φ(x)]²⟩.
-
-    Conan 2000 (thesis, Université de Nice); Lucke & Young 2007, Appl. Opt. 46, 559:
-    with u = 2πr/L0,
-
-        D = (L0/r0)^(5/3) 2^(1/6) Γ(11/6) π^(−8/3) [24/5 Γ(6/5)]^(5/6)
-            × [Γ(5/6) 2^(−1/6) − u^(5/6) K_(5/6)(u)].
-
-    The bracket cancels for small u: six digits are left at r = 2e-7 L0.
-
-    Parameters
-    ----------
-    separation : ndarray, any shape
-        Distance r ≥ 0 in metres.
-    r0, outer_scale : float
-        Fried's parameter and outer scale L0 in metres.
-
-    Returns
-    -------
-    ndarray, shape of `separation`
-        rad² at the wavelength at which r0 is given.
-    """
-    u = 2.0 * np.pi * np.asarray(separation, float) / outer_scale
-    # K_(5/6) is infinite at 0, where D = 0: any other argument avoids a warning.
-    positive = np.where(u > 0, u, 1.0)
-    bracket = gamma(5 / 6) / 2 ** (1 / 6) - positive ** (5 / 6) * kv(5 / 6, positive)
-    scale = (outer_scale / r0) ** (5 / 3) * 2 ** (1 / 6) * gamma(11 / 6) / np.pi ** (8 / 3)
-    return np.where(u > 0, scale * HALF_FRIED_CONSTANT * bracket, 0.0)
+Its last factor is half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/r0)^(5/3).
+"""
 
 
 def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
@@ -90,7 +56,12 @@ class PlaneWaves:
 
 
 def draw_waves(
-    count: int, r0: float, outer_scale: float, highest: float, rng: np.random.Generator
+    count: int,
+    r0: float,
+    outer_scale: float,
+    highest: float,
+    rng: np.random.Generator,
+    per_ring: int = 8,
 ) -> PlaneWaves:
     """Draw plane waves whose ensemble has the von Kármán spectrum up to a frequency.
 
@@ -107,12 +78,15 @@ def draw_waves(
     Parameters
     ----------
     count : int
-        Number K of waves, a multiple of `WAVES_PER_RING`.
+        Number K of waves, a multiple of `per_ring`.
     r0, outer_scale : float
         In metres.
     highest : float
         Highest frequency in cycles per metre. The variance that is missing
         beyond it is 0.086 (r0 · highest)^(−5/3) rad².
+    rng : Generator
+    per_ring : int
+        Waves in a ring of the frequency plane; their angles are stratified.
 
     Raises
     ------
@@ -120,11 +94,10 @@ def draw_waves(
         If `count` does not fill at least two rings or `highest` is not above
         the innermost disc.
     """
-    rings, remainder = divmod(count, WAVES_PER_RING)
+    rings, remainder = divmod(count, per_ring)
     if remainder or rings < 2:
         raise ValueError(
-            f"{count} plane waves: must be a multiple of {WAVES_PER_RING}, "
-            f"at least {2 * WAVES_PER_RING}"
+            f"{count} plane waves: must be a multiple of {per_ring}, at least {2 * per_ring}"
         )
     # Edges of the rings: a disc of radius 1/(2 L0) around f = 0, then equal steps of ln f.
     outer_frequency = 1.0 / outer_scale
@@ -135,12 +108,12 @@ def draw_waves(
     # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6), with f0 = 1/L0.
     integral = (edges**2 + outer_frequency**2) ** (-5.0 / 6.0)
     ring_integral = integral[:-1] - integral[1:]
-    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / WAVES_PER_RING
+    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / per_ring
     # Radii by inversion of that integral; a wave's angle lies in its own part of the half-turn.
-    radius_draw, angle_draw, phase_draw = rng.random((3, rings, WAVES_PER_RING))
+    radius_draw, angle_draw, phase_draw = rng.random((3, rings, per_ring))
     drawn_integral = integral[:-1, None] - radius_draw * ring_integral[:, None]
     radius = np.sqrt(np.maximum(drawn_integral ** (-6.0 / 5.0) - outer_frequency**2, 0.0))
-    angle = np.pi * (np.arange(WAVES_PER_RING) + angle_draw) / WAVES_PER_RING
+    angle = np.pi * (np.arange(per_ring) + angle_draw) / per_ring
     frequency = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     # The real part of a·exp(iφ) has the variance |a|²/2.
     amplitude = np.sqrt(2.0 * power)[:, None] * np.exp(2j * np.pi * phase_draw)
