@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.bright_stars import LEAST_SKY, BrightStars
+from psfdae.bright_stars import BrightStars
 from psfdae.image.stamps import cut, sky_around
 from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, stamp_snr
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
@@ -183,6 +183,6 @@ def test_a_neighbour_s_saturated_rest_makes_no_negative_rates():
         stars, gaussians(np.zeros((1, 2))), star, FRAMING, star == 0, stream(1, "test")
     )
     assert images.min() < -3e-3
-    noise, level = NoiseModel(1.0, LEAST_SKY), 1e-3
+    noise, level = NoiseModel(1.0, BrightStars.min_sky), 1e-3
     off = noise.draw(images, level, stream(2, "test")) - images
     assert np.square(off).mean() == pytest.approx(noise.variance(images, level).mean(), rel=0.1)

@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 
 from psfdae import mixing
 from psfdae.method import Needs, TrainingSet
-from psfdae.methods import gmm
-from psfdae.methods import mixture_law as module
+from psfdae.methods import mixture_fit
+from psfdae.methods.clusters import without_slope
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.model.bundle import BundleError
 from psfdae.model.packing import packed
@@ -74,21 +74,22 @@ def _fitted(clusters, same, kind):
     return kind.fit(training(400, same), Gmm(**{**ONE, "components": [clusters]}))
 
 
-def fitted(clusters=1, same=True, kind=GaussianMixture):
+def fitted(clusters=1, same=True, kind=GaussianMixture, **numbers):
     """A fit without what it remembers of other tests."""
-    return replace(_fitted(clusters, same, kind))
+    return replace(_fitted(clusters, same, kind), **numbers)
 
 
 def noisy_of(images, level=LEVEL):
     return NOISE.draw(images, level, np.random.default_rng(3))
 
 
+EXACT = {"noise_step": 1e-3, "flat_variance": 0.0, "least_variance": 0.0}
+"""Numbers of a mixture that leaves out nothing because it hardly counts."""
+
+
 @pytest.fixture
 def exact(monkeypatch):
-    """Sums without what the mixture leaves out because it hardly counts."""
-    monkeypatch.setattr(module, "NOISE_STEP", 1e-3)
-    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
+    """Sums over all clusters, however small their weight is."""
     monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
 
 
@@ -142,7 +143,7 @@ def dense(mixture, noisy, level, position):
 @pytest.mark.usefixtures("exact")
 def test_sums_are_those_of_dense_matrices(same, kind, level):
     """Those of images of one noise, and those of images that say theirs one by one."""
-    mixture, places = fitted(12, same, kind), where(50, seed=2)
+    mixture, places = fitted(12, same, kind, **EXACT), where(50, seed=2)
     noisy = noisy_of(stars(50, seed=2)[0], level)
     mean, sigma, evidence = dense(mixture, noisy, level, places)
     for levels in (level, np.full(len(noisy), level)):
@@ -155,7 +156,7 @@ def test_sums_are_those_of_dense_matrices(same, kind, level):
 @pytest.mark.parametrize("same", [True, False])
 @pytest.mark.usefixtures("exact")
 def test_a_flux_that_is_an_estimate_is_found(same):
-    mixture, rng, pixels = fitted(12, same), np.random.default_rng(3), D * D
+    mixture, rng, pixels = fitted(12, same, **EXACT), np.random.default_rng(3), D * D
     images, wider = stars(300, seed=2)
     flux = rng.normal(1.0, 0.1, (300, 1, 1))
     noisy = NOISE.draw(images, LEVEL / 5, rng) + (flux - 1) * (images - 1 / pixels)
@@ -182,8 +183,8 @@ def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
     plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
-    assert mixture._total_variance == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
-    assert (mixture.free_flux()._total_variance > 0.9 * moved - 1e-3 * plain.max()).all()
+    assert mixture.total_variance == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
+    assert (mixture.free_flux().total_variance > 0.9 * moved - 1e-3 * plain.max()).all()
     assert (moved > 1.2 * plain).any()
 
 
@@ -213,6 +214,23 @@ def test_positions_have_unit_variance_within_clusters():
     assert p.T @ p / len(p) == pytest.approx(np.eye(2), abs=1e-5)
 
 
+def test_rows_of_a_cluster_have_the_products_of_their_formulas():
+    """Eq. 9: XᵀX − Xᵀp (pᵀp + ν)⁻¹ pᵀX without the slope; eq. 3: XᵀX − N, not negative."""
+    rng, nu = np.random.default_rng(7), 3.0
+    x, p = rng.normal(size=(9, 5)), rng.normal(size=(9, 2))
+    inverse = np.linalg.inv(p.T @ p + nu * np.eye(2))
+    rows, slope = without_slope(x, p, inverse, nu)
+    assert rows.T @ rows == pytest.approx(x.T @ x - x.T @ p @ inverse @ p.T @ x, abs=1e-4)
+    assert slope == pytest.approx(inverse @ p.T @ x, abs=1e-5)
+    small, large = (mixture_fit.rows_without_noise(x, noise * np.eye(5)) for noise in (1e-3, 1e3))
+    assert small.T @ small == pytest.approx(x.T @ x - 1e-3 * np.eye(5))
+    assert not large.any()
+    # A direction in which positions do not vary becomes 0.
+    line = np.outer(rng.normal(size=9), [3.0, 4.0])
+    whitened = (line - line.mean(axis=0)) @ mixture_fit.whitening_matrix(line - line.mean(axis=0))
+    assert np.sort(whitened.var(axis=0)) == pytest.approx([0.0, 1.0], abs=1e-6)
+
+
 def test_validation_stars_choose_and_the_last_value_that_was_tried_is_named(capsys):
     settings = Gmm(**{**ONE, "components": [1, 12], "shrinkage": [5.0, 1e6]})
     wanted = GaussianMixture.fit(training(), settings)
@@ -228,7 +246,7 @@ def test_a_search_goes_both_ways_and_more_clusters_must_pay():
 
     def climbed(errors, start, pays=0.0):
         asked.clear()
-        return gmm.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
+        return mixture_fit.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
 
     falling = {1: 9.0, 4: 5.0, 16: 4.0, 64: 3.98, 256: 1.0}
     assert climbed(falling, 4, pays=0.02) == 16 and 256 not in asked and 1 not in asked
@@ -239,15 +257,14 @@ def test_a_search_goes_both_ways_and_more_clusters_must_pay():
 
 @pytest.mark.parametrize("free", [False, True])
 @pytest.mark.usefixtures("exact")
-def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
-    monkeypatch.setattr(module, "OUTLIER_COORDINATES", 10)
-    mixture = fitted(same=False)
+def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free):
+    mixture = fitted(same=False, outlier_coordinates=10, **EXACT)
     mixture = mixture.free_flux() if free else mixture
     noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(1.0 / D**2, LEVEL)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
-    row = mixture.flux_sigma * mixture._contrast[0, :10].astype(float)
-    usual = np.diag(mixture._total_variance[:10] + s)
+    row = mixture.flux_sigma * mixture.contrast[0, :10].astype(float)
+    usual = np.diag(mixture.total_variance[:10] + s)
     covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
     wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
     wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,11 +16,11 @@ from psfdae.methods.dae import Dae as Fitted
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.metrics import mse
 from psfdae.networks import dae as dae_network
+from psfdae.networks import training as loop
 from psfdae.networks.dae import (
     DaeTraining,
     SingleChannelConv,
     build_dae,
-    train_dae,
 )
 from psfdae.networks.settings import DaeSettings, Train
 from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal
@@ -66,7 +67,8 @@ def data(gaussian_stars, noise):
 
 def train(data, folder, train_config=TRAIN, report=lambda row: None, dae=DAE):
     path = folder / "checkpoint.pt"
-    result = train_dae(data, dae, train_config, 3, path, "config", report)
+    begin = partial(DaeTraining, data, dae, train_config, 3)
+    result = loop.train(begin, path, "config", report, train_config.restarts)
     path.unlink(missing_ok=True)
     return result
 
@@ -193,7 +195,7 @@ def test_he_initialisation_keeps_the_variance(gaussian_stars):
 @pytest.mark.parametrize("widths", [[7, 3, 5, 9], [1] * 4])
 def test_linear_start_has_the_least_squares_of_what_its_last_layer_sees(data, widths, monkeypatch):
     """A linear function of the layer before has no smaller error: the two are uncorrelated."""
-    monkeypatch.setattr(dae_network, "LINEAR_PX", data.images[data.fit].size)
+    monkeypatch.setattr(DaeTraining, "linear_px", data.images[data.fit].size)
     dae = DAE.model_copy(update={"init": "linear", "widths": widths})
     training = DaeTraining(data, dae, TRAIN, 3)
     noisy, _ = data.draw(data.fit, np.random.default_rng(5))
@@ -383,7 +385,7 @@ def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):
         settings = TRAIN.model_copy(update={"optimiser": optimiser, "schedule": "constant"})
         training = DaeTraining(data, DAE, settings, 3, 0)
         start = [p.detach().clone() for p in training.model.parameters()]
-        training._step(next(training.batches(0)), 1)
+        training.take_step(next(training.batches(0)), 1)
         pairs = zip(training.model.parameters(), start, strict=True)
         steps[optimiser] = [(p - b).detach() for p, b in pairs]
     hidden = [f"layers.{i}.weight" for i in range(1, len(training.model.layers) - 1)]

@@ -17,7 +17,7 @@ from psfdae_paper.bounds.floor import local_error
 from psfdae_paper.bounds.modes import largest_of_groups
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.consistency import SIMULATION
-from psfdae_paper.methods import wavefront
+from psfdae_paper.methods.wavefront import Wavefront
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 
 LEVEL = 1e-3
@@ -50,7 +50,7 @@ def data(stars):
 @pytest.fixture(scope="module")
 def fitted(data):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wavefront, "BANK_STARS", 1500)
+        patch.setattr(Wavefront, "bank_stars", 1500)
         yield {name: method(name).fit(data) for name in NAMES}
 
 

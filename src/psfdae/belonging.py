@@ -20,12 +20,17 @@ from psfdae.reading import read_yaml
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
-STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
+STATIC = (
+    *("scene.name", "telescope", "framing.stamp_px", "framing.jitter_px", "framing.tie"),
+    *("grid", "wavefront"),
+)
 """Configuration keys that decide the static PSFs of a scene."""
 
-RANDOM_PARTS = ("telescope.aberrations.jitter_waves", "stars.aberration_fraction")
-STARS = (*STATIC, "framing.subpixel", *RANDOM_PARTS)
+STARS = (
+    *(*STATIC, "framing.subpixel"),
+    # How large the random aberrations of the stars are, and how many stars have them.
+    *("telescope.aberrations.jitter_waves", "stars.aberration_fraction"),
+)
 """Configuration keys that decide the kind of stars; sets of one kind differ by seed and name."""
 
 SAME_STARS = ("seed", "stars.name", "stars.count")
@@ -33,9 +38,6 @@ SAME_STARS = ("seed", "stars.name", "stars.count")
 
 SAME_IMAGE = ("image", "calibration_stars", "parts")
 """Keys that distinguish star sets of images, which are not simulated."""
-
-UNCOMPARED_KEYS = {"name", "jitter_waves"}
-"""Keys that are not compared with their group: titles, and what static PSFs do not depend on."""
 
 TRAINED_ON = "trained_on.yaml"
 """Name of the file with the configuration of the stars or states that a model was trained on."""
@@ -114,7 +116,9 @@ def _difference(
         stated_parts = parts[0] | parts[1] if parts[0] & parts[1] else set()
         keys = sorted({*first} & {*second} | stated_parts)
     for key in keys:
-        if key not in UNCOMPARED_KEYS:
+        # Titles say nothing of the bytes. Static PSFs have no random aberrations, whose size is
+        # compared by its own key in `STARS`.
+        if key not in ("name", "jitter_waves"):
             absent = {} if key in stated_parts else "nothing"
             values = first.get(key, absent), second.get(key, absent)
             is_optional = is_partial and key not in stated_parts

@@ -8,20 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.files import Product
 from psfdae.moments import shift_stamps
-
-DEFECT = 6.0
-"""Depth of a defect below the sky in σ of the sky; deeper pixels are raised to that."""
-
-LEAST_SKY = 2.0 * DEFECT**2
-"""Least sky B in photons per pixel: the deepest pixel, B − DEFECT √B, must not be negative."""
-
-MOST_SKY = 1e12
-"""Greatest sky in photons per pixel, beside which the photons of no star matter."""
 
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
@@ -59,7 +51,16 @@ class BrightStars:
         Colour in the star list, NaN where there is none.
     bad : ndarray of bool, shape (n, s, s)
         Pixels of `stamps` that were not measured, and have values of nearby stars; by default none.
+    defect_sigma : float
+        Depth of a defect below the sky in σ of the sky; deeper pixels are raised to that.
+    min_sky, max_sky : float
+        Limits of the sky B in photons per pixel: the deepest pixel, B − `defect_sigma` √B, must not
+        be negative, and beside the largest sky the photons of no star matter.
     """
+
+    defect_sigma: ClassVar[float] = 6.0
+    min_sky: ClassVar[float] = 2.0 * defect_sigma**2
+    max_sky: ClassVar[float] = 1e12
 
     stamps: np.ndarray
     peak: np.ndarray
@@ -123,12 +124,14 @@ class BrightStars:
         """Return the photons per pixel whose Poisson noise is that of the sky and of reading out.
 
         `gain` is in electrons per count; `otherwise` is the result where it is unknown. It is at
-        most `MOST_SKY`, beside which the photons of no star matter.
+        most `max_sky`, beside which the photons of no star matter.
         """
         # Variance in electrons², N = (σ gain)²: a Poisson variable of mean N has it.
         if gain is None:
             return otherwise
-        return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
+        return float(
+            np.clip(np.median(self.noise) * gain, self.min_sky**0.5, self.max_sky**0.5) ** 2
+        )
 
     def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return frames (n, side, side) with the brightest pixel at index (side//2, side//2).

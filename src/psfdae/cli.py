@@ -342,9 +342,11 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     click.MissingParameter
         If no files are left.
     """
+    # Without files, the words have an argument of their own (`as_click`).
     if "overrides" in values:
         overrides: Sequence[str] = values.pop("overrides")
         return overrides
+    # Otherwise they stand among the files of the only argument that takes several values.
     argument = next(p for p in parameters if p.nargs == -1)
     name = argument.name or ""
     settings = [str(word) for word in values[name] if re.match("[^/]*=", str(word))]

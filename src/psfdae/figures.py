@@ -34,6 +34,7 @@ def in_style() -> AbstractContextManager[None]:
     """Return a context with the style of all figures, whatever matplotlibrc the user has."""
     import matplotlib.style
 
+    # Sizes of text in points, for figures as wide as a page.
     style = {
         "figure.dpi": 150,
         "font.size": 9,

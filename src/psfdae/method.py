@@ -234,9 +234,8 @@ class Storage:
         Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
     per_reference : bool
         Fitted for each reference, or once for both.
-    rule, run, about : str
-        Name of its rule, name of its runs in MLflow, and help of the options that take a fit;
-        by default they follow from the method's name.
+    rule, run : str
+        Name of its rule and of its runs in MLflow; by default they follow from the method's name.
     """
 
     arrays: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -245,7 +244,6 @@ class Storage:
     per_reference: bool = False
     rule: str = ""
     run: str = ""
-    about: str = ""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ maximum they do not hang on a few pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -188,6 +187,9 @@ class Shapes:
 def measure_shapes(psf: np.ndarray) -> Shapes:
     """Return shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
     # The eigenvalues of the moments are (M_xx + M_yy ± spread)/2, the squares of the semi-axes.
+    # With spread² = (M_xx − M_yy)² + 4 M_xy², the ratio of the squared axes gives b/a, and the
+    # direction of the major axis is ½ atan2(2 M_xy, M_xx − M_yy). |M|^¼ is σ of a round Gaussian
+    # of the same area.
     xx, xy, yy = _adaptive_moments(psf)
     with np.errstate(invalid="ignore"):
         determinant = xx * yy - xy**2
@@ -210,8 +212,12 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     lit = np.isfinite(peak) & (peak > 0)
     light /= np.where(lit, peak, 1.0)[:, None]
     light[~lit] = 1.0
+    # Terms 1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²).
+    row, column = (axis.ravel() for axis in np.indices((side, side)) - 0.5 * (side - 1))
+    terms = np.stack(
+        [np.ones_like(row), column, row, column * column, column * row, row * row]
+    ).astype(np.float32)
     # Unweighted moments to start with.
-    terms = _monomials(side)
     x, y, moments = _centre_and_moments(light @ terms.T)
     moments = _bounded(*moments, side)
     weighted = np.empty_like(light)
@@ -230,19 +236,12 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     return np.where(lit, np.array(moments), np.nan)
 
 
-@cache
-def _monomials(side: int) -> np.ndarray:
-    """Return 1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²)."""
-    y, x = (axis.ravel() for axis in np.indices((side, side)) - 0.5 * (side - 1))
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
-
-
 Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Elements xx, xy, yy of n symmetric matrices."""
 
 
 def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matrix]:
-    """Return x, y and central second moments from the sums over `_monomials`, shape (n, 6)."""
+    """Return x, y and central second moments from sums of 1, x, y, x², xy and y², (n, 6)."""
     # Means of x, y and their products; the central ones follow.
     total = np.maximum(sums[:, 0].astype(np.float64), 1e-30)
     x, y, xx, xy, yy = sums[:, 1:].T / total
@@ -295,7 +294,7 @@ def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matri
 def _exponent(
     x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray
 ) -> np.ndarray:
-    """Return the coefficients of `_monomials` in the exponent of the weight, shape (n, 6)."""
+    """Return the coefficients of 1, x, y, x², xy and y² in the exponent of the weight, (n, 6)."""
     # −½ (a (x−x₀)² + 2b (x−x₀)(y−y₀) + c (y−y₀)²) with the inverse (a, b; b, c) of the moments.
     determinant = xx * yy - xy**2
     a, b, c = yy / determinant, -xy / determinant, xx / determinant

@@ -73,6 +73,7 @@ class UniqueKeyLoader(yaml.SafeLoader):
 
 def _text(path: Path) -> str:
     """Return the content of a file in UTF-8; raise ProductError if it cannot be read."""
+    # The whole file at once: the files that people write are small.
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -111,6 +112,7 @@ def from_tree(
     """
     if not isinstance(tree, dict) or key not in tree:
         raise ProductError(f"{path}: key {key!r} is missing")
+    # What `make` raises gets the names of file and key.
     try:
         return make(tree[key])
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -160,6 +162,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     except (ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
+    # Columns beyond those that are asked for are allowed.
     if missing := [name for name in columns if name not in table]:
         raise ProductError(f"{path}: column {missing[0]!r} is missing")
     return table

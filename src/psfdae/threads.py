@@ -121,6 +121,7 @@ def limit_threads(threads: int) -> None:
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """Limit linear algebra, and networks if torch is loaded, to one thread per calling thread."""
+    # torch has threads of its own, which the limit of the libraries does not reach.
     torch = sys.modules.get("torch")
     threads_before = torch.get_num_threads() if torch else 0
     if torch:

@@ -28,12 +28,12 @@ from psfdae.threads import limit_threads
 from psfdae_paper.bounds import mode_search
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.methods import wavefront
+from psfdae_paper.methods.wavefront import Wavefront
 from psfdae_paper.stages.evaluate import estimators
 
 DATASET, LEVEL, REFERENCE = "dataset3", 1e-3, "realisation"
 REPEATS = 3
-DEFAULT = {"starts": None, "draws": wavefront.DRAWS_PER_STAR}
+DEFAULT = {"starts": None, "draws": Wavefront.draws_per_star}
 EFFORTS = (
     {"starts": 1, "draws": 25},
     {"starts": 2, "draws": 50},
@@ -87,7 +87,7 @@ def main(results: Path, out: Path, picture: Path) -> None:
             starts = effort["starts"]
             fewer_starts = {"fields": starts, "offsets": starts} if starts else {}
             mode_search.search = partial(search, **fewer_starts)
-            wavefront.DRAWS_PER_STAR = effort["draws"]
+            Wavefront.draws_per_star = effort["draws"]
             default_starts = defaults["offsets" if kind.needs.position else "fields"].default
             add(kind, fitted, effort | {"starts": starts or default_starts}, repeats=1)
     commit = subprocess.run(

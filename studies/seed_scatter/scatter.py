@@ -62,8 +62,8 @@ class TrialTraining(DaeTraining):
             decay: [p.detach().clone() for p in self.model.parameters()] for decay in AVERAGES
         }
 
-    def _step(self, batch, step: int) -> float:
-        value = super()._step(batch, step)
+    def take_step(self, batch, step: int) -> float:
+        value = super().take_step(batch, step)
         with torch.no_grad():
             now = list(self.model.parameters())
             for decay, mean in self.averages.items():

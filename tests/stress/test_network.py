@@ -10,7 +10,8 @@ import pytest
 import torch
 from scipy.stats import binom
 
-from psfdae.networks.dae import DaeNetwork, run_network, train_dae
+from psfdae.networks import training as loop
+from psfdae.networks.dae import DaeNetwork, DaeTraining, run_network
 from psfdae.networks.training import TrainingError
 from stress.bench import THREADS
 
@@ -70,7 +71,8 @@ def test_seeds(bench, record):
 
 def score(data, dae, settings, folder, seed):
     """Validation error, new starts and first weights of a training in a process of its own."""
-    training = train_dae(data, dae, settings, seed, folder / f"{seed}.pt", "seeds")
+    begin = partial(DaeTraining, data, dae, settings, seed)
+    training = loop.train(begin, folder / f"{seed}.pt", "seeds", restarts=settings.restarts)
     weights = next(iter(training.result.values())).flatten()[:16].tolist()
     return min(row["validation_mse"] for row in training.history), training.attempt, tuple(weights)
 
@@ -87,7 +89,9 @@ def short(bench, **update):
 
 
 def train(bench, data, settings):
-    return train_dae(data, narrow(bench), settings, 0, bench.folder / "checkpoint.pt", "stability")
+    begin = partial(DaeTraining, data, narrow(bench), settings, 0)
+    path = bench.folder / "checkpoint.pt"
+    return loop.train(begin, path, "stability", restarts=settings.restarts)
 
 
 def fate(bench, *settings):

@@ -11,19 +11,6 @@ from psfdae.methods import method
 from psfdae.model.bundle import Bundle, estimator, read_bundle
 from psfdae.options import File
 
-METRIC_COLUMNS = {
-    "noise_level": ("λ", ".2g"),
-    "noise": ("noise/flux", ".2e"),
-    "snr": ("S/N", ".1f"),
-    "mse_noisy": ("MSE noisy", ".2e"),
-    "mse": ("MSE", ".2e"),
-    "gain": ("gain", ".3g"),
-    "ssim": ("SSIM", ".4f"),
-    "coverage68": ("in 68 %", ".1%"),
-    "coverage95": ("in 95 %", ".1%"),
-}
-"""Heading and number format of each column of the table of errors, by the name of the metric."""
-
 
 @command("describe")
 def describe(bundle: Annotated[File | None, {"argument": True}] = None) -> None:
@@ -93,10 +80,22 @@ def _error_table(info: BundleInfo) -> str:
     for metrics in info.metrics:
         mse_noisy, mse = metrics.get("mse_noisy"), metrics.get("mse")
         rows.append(metrics | ({"gain": mse_noisy / mse} if mse_noisy and mse else {}))
+    # Heading and number format of each column, by the name of the metric.
+    formats = {
+        "noise_level": ("λ", ".2g"),
+        "noise": ("noise/flux", ".2e"),
+        "snr": ("S/N", ".1f"),
+        "mse_noisy": ("MSE noisy", ".2e"),
+        "mse": ("MSE", ".2e"),
+        "gain": ("gain", ".3g"),
+        "ssim": ("SSIM", ".4f"),
+        "coverage68": ("in 68 %", ".1%"),
+        "coverage95": ("in 95 %", ".1%"),
+    }
     # Columns that no row has are left out; a row without a value has an empty cell.
     columns = {
         heading: [format(row[key], number_format) if key in row else "" for row in rows]
-        for key, (heading, number_format) in METRIC_COLUMNS.items()
+        for key, (heading, number_format) in formats.items()
         if any(key in row for row in rows)
     }
     if not columns:

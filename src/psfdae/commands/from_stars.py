@@ -276,6 +276,7 @@ def reserved_folder(
     OutputError, FolderError
         If a path is an input, the folder holds a model, or another process works there.
     """
+    # The model of all images and that of one would have the same file.
     if files.name in files.exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
     # No output may be an input, such as the star list of an earlier run.
@@ -284,6 +285,7 @@ def reserved_folder(
     check_outputs([*files.paths(), *lists, page], inputs)
     if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
+    # Models are looked for under the lock, so that no other process writes one meanwhile.
     with locked_folder(files.path):
         bundles = sorted(files.path.glob(f"*{SUFFIX}"))
         if bundles and not overwrite:
@@ -314,6 +316,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
             raise FolderError(f"{folder}: another psfdae from-stars works there") from None
         yield
     finally:
+        # A folder with files in it is no empty one, and stays.
         os.close(descriptor)
         with suppress(OSError):
             folder.rmdir()
@@ -402,6 +405,7 @@ def fit_methods(
         # A network keeps its state here while it trains, for the case that it is killed.
         checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
         fit = fitted_to(stars, method_class, checkpoint)
+        # The checkpoint goes when the fit is stored; until then, a killed run goes on from it.
         fits.store(fit, place, described(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)
         fitted[method_class.name] = fit

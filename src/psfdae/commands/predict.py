@@ -174,6 +174,7 @@ def open_for_model(model: PsfModel, source: ImageInput) -> Observation:
 
 def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
     """Return sentences on another instrument than the training's, and on light beyond stamps."""
+    # Another telescope, camera or filter, as far as both images name theirs.
     notes = []
     if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")

@@ -56,11 +56,13 @@ def psf(
             f"{out}: within {error:.1g} of the brightest value of {model} at the places looked at"
         )
         return
+    # Places as they are stated, or the knots of a grid over the places of the training stars.
     grid_shape = None if grid is None else _grid_shape(grid)
     if grid_shape is None:
         positions = np.array([_position(text) for text in at])
     else:
         positions = loaded.grid(*grid_shape)
+    # What the user should know of these places, then the file.
     for note in _notes(loaded, positions):
         print(f"{model}: {note}")
     if for_stdpsf and grid_shape is not None:
@@ -114,6 +116,7 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
                 f"{x:g},{y:g} is off the image of {columns} columns and {rows} rows that the "
                 f"model {model.name!r} was trained on"
             )
+    # Places beyond the training stars have the PSF of the edge, which is an extrapolation.
     try:
         low, high = model.field_range()
     except PredictionError:  # stars without positions have one PSF, which holds everywhere
@@ -125,6 +128,7 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
             f"x {low[0]:.6g} … {high[0]:.6g}, y {low[1]:.6g} … {high[1]:.6g}; the PSF there is "
             "that of their edge"
         )
+    # A PSF that does not change over the field makes many places useless.
     if order == 0 and len(positions) > 1:
         notes.append(
             "the PSF is the same everywhere (order 0: more is not supported by stars left "

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.bright_stars import DEFECT, BrightStars
+from psfdae.bright_stars import BrightStars
 from psfdae.errors import Error
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
@@ -254,7 +254,7 @@ def measure_stamps(
     off_image = pixels_off_image(stamps, wide_px, shape)
     # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
     # These also make the noise around a star seem large.
-    depth = -DEFECT * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
+    depth = -BrightStars.defect_sigma * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
     bad = (stamps.bad | (light < depth)) & ~off_image
     light = interpolated_stamps(np.maximum(light, depth), bad)
     # Brightest pixel, flux and S/N.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.bright_stars import DEFECT, BrightStars
+from psfdae.bright_stars import BrightStars
 from psfdae.files import Column
 from psfdae.image.stamps import cut
 from psfdae.image.star_criteria import brightest_pixels
@@ -141,7 +141,7 @@ def make_images(
 
     Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
     the sum 1. A template lies at its star's phase, in the same pixels. No pixel of a moved star is
-    below −`DEFECT` σ of its sky, before the sum is made 1.
+    below −`BrightStars.defect_sigma` σ of its sky, before the sum is made 1.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def make_images(
         # Move the star by its phase. Splines ring beside what is left of a saturated
         # neighbour.
         is_moved = subpixel[rows]
-        floor = -DEFECT * stars.noise[star_rows[is_moved], None, None]
+        floor = -BrightStars.defect_sigma * stars.noise[star_rows[is_moved], None, None]
         stamps[is_moved] = np.maximum(
             shift_stamps(stars.stamps, phase[rows][is_moved], star_rows[is_moved]), floor
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
 
 WEIGHTS = "dae.safetensors"
 
-BLOCK_VALUES = 64 * 256 * 32**2
-"""Numbers between two layers of a bundle's network at most: 64 channels of 256 stamps."""
-
 
 class Dae(Method):
     """A network, the factor of its images, and how it was trained.
@@ -58,7 +56,6 @@ class Dae(Method):
         diagnostics=(HISTORY,),
         per_reference=True,
         rule="train",
-        about="Folder of a trained network.",
     )
     packing = Packing(suffix="")
     groups: ClassVar = {"dae": DaeSettings, "train": Train}
@@ -86,14 +83,15 @@ class Dae(Method):
         Raises
         ------
         TrainingError
-            As `train_dae`.
+            As `psfdae.networks.training.train`.
         FitError
             If it is to go on from a network of another shape or scale of images.
         """
-        from psfdae.networks.dae import DaeNetwork, train_dae
-        from psfdae.networks.training import fingerprint, progress
+        from psfdae.networks import training as loop
+        from psfdae.networks.dae import DaeNetwork, DaeTraining
         from psfdae.networks.weights import channels_last
 
+        # All that decides the result: settings, seed, noise, and the stars themselves.
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
         arrays = [data.images, data.references, data.fit, data.validation]
@@ -107,14 +105,19 @@ class Dae(Method):
                     f"dae.kernels, dae.widths, dae.scale = {layers}: the network to go on from "
                     f"has {first_layers}"
                 )
+            # Its training is a part or a multiple of the first one.
             epochs = max(1, round(train.continued_epochs * train.epochs))
             train = train.model_copy(update={"epochs": epochs})
             arrays += [value.numpy() for value in first.state_dict().values()]
         # A checkpoint of other settings or other data is not resumed.
-        digest = fingerprint(described, *arrays)
-        with progress(train.epochs) as report:
+        digest = loop.fingerprint(described, *arrays)
+        # The checkpoint is of an interrupted training; the caller removes it after the fit.
+        with loop.progress(train.epochs) as report:
             assert data.checkpoint is not None
-            training = train_dae(data, dae, train, data.seed, data.checkpoint, digest, report)
+            # A training whose network dies starts anew, with the number of the attempt.
+            begin = partial(DaeTraining, data, dae, train, data.seed)
+            training = loop.train(begin, data.checkpoint, digest, report, train.restarts)
+        # A network of its own with the best weights; that of the training has the last ones.
         network = DaeNetwork(dae.kernels, dae.widths)
         network.load_state_dict(training.result)
         return cls(
@@ -155,12 +158,14 @@ class Dae(Method):
         from psfdae.settings import parse_settings
 
         described, batch = cls.described(place), 256
+        # The shape of the network is in its configuration, its weights are beside it.
         settings = from_tree(
             place / CONFIG,
             described,
             "dae",
             make=lambda tree: parse_settings(DaeSettings, tree),
         )
+        # Threads, and images at a time, change the speed alone.
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)
             batch = evaluation.batch
@@ -171,6 +176,7 @@ class Dae(Method):
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Weights, and the network's shape."""
+        # Contiguous, because networks keep weights in an order of their own (`channels_last`).
         state = self.network.state_dict()
         shape = {"kernels": self.network.kernels, "widths": self.network.widths}
         arrays = {name: value.contiguous().numpy() for name, value in state.items()}
@@ -190,9 +196,11 @@ class Dae(Method):
         from psfdae.networks.weights import channels_last
 
         assert info.dae is not None and info.image_scale is not None
+        # Copies, because torch would share memory with arrays that may be read-only.
         network = DaeNetwork(info.dae.kernels, info.dae.widths)
         network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
-        batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
+        # Numbers between two layers at most: those of 64 channels of 256 stamps of 32 x 32 px.
+        batch = max(1, 64 * 256 * 32**2 // (max(info.dae.widths) * info.stamp_px**2))
         return cls(channels_last(network).eval(), float(info.image_scale), batch)
 
     @classmethod

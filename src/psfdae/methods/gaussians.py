@@ -9,39 +9,16 @@ docs/field_model.md). For one s alone, Woodbury's formula is faster (`WoodburyIn
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 
-class NoisyCovariance(Protocol):
-    """Covariance G = C + s of stars with noise, of which the inverse is known.
+class AxesInverse(NamedTuple):
+    """G_k⁻¹ of a cluster for any noise variance s of a bin or above it (eq. 4).
 
     Noise variances s of n stars are arrays of shape (n, 1). Rows are stars of the same n, or, where
     it says so, all are seen with every noise variance.
-    """
-
-    def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return the product of rows (n, m) with G⁻¹, (n, m)."""
-
-    def mahalanobis2(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of each of the rows x (n, m), with its own noise, (n,)."""
-
-    def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
-
-    def mahalanobis2_of_all(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Return x G⁻¹ xᵀ of every row x (r, m) for every noise variance, (n, r)."""
-
-    def half_log_det(self, s: np.ndarray) -> np.ndarray:
-        """Return ½ ln det G for noise variances s (n,), (n,)."""
-
-
-class AxesInverse(NamedTuple):
-    """G_k⁻¹ of a cluster for any noise variance s above `StarBatch.least_variance` (eq. 4).
-
-    Noise variances s of n stars are arrays of shape (n, 1).
 
     Attributes
     ----------
@@ -59,47 +36,52 @@ class AxesInverse(NamedTuple):
 
     def _inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return 1/(λ + s) along the axes, (n, a), and 1/(λ₀ + s) beyond them, (n, 1)."""
+        # In the precision of the noise variances, so that products with images stay in theirs.
         variance = self.variance.astype(s.dtype)
         return 1 / (variance + s), 1 / (s.dtype.type(self.variance_beyond) + s)
 
     def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return the product of rows (n, m) with G⁻¹, (n, m)."""
-        along, beyond = self._inverse(s)
+        along, gain_beyond = self._inverse(s)
         axes = rows @ self.vectors
-        # One product with the axes for both: V (λ + s)⁻¹ Vᵀ and the projection V Vᵀ of the rows.
-        both = np.vstack([along * axes, axes]) @ self.vectors.T
-        return np.asarray(both[: len(rows)] + beyond * (rows - both[len(rows) :]))
+        # V (λ + s)⁻¹ Vᵀ of the rows, and their projection V Vᵀ, by one product with the axes.
+        weighted, projected = np.split(np.vstack([along * axes, axes]) @ self.vectors.T, 2)
+        return np.asarray(weighted + gain_beyond * (rows - projected))
 
     def mahalanobis2(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of each of the rows x (n, m), with its own noise, (n,)."""
-        along, beyond = self._inverse(s)
+        along, gain_beyond = self._inverse(s)
+        # |x|² is that along the axes and that beyond them.
         squares = np.square(rows @ self.vectors)
         squares_beyond = np.square(rows).sum(axis=1) - squares.sum(axis=1)
-        return np.asarray((squares * along).sum(axis=1) + squares_beyond * beyond[:, 0])
+        return np.asarray((squares * along).sum(axis=1) + squares_beyond * gain_beyond[:, 0])
 
     def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
-        along, beyond = self._inverse(s)
+        along, gain_beyond = self._inverse(s)
+        # x V (λ + s)⁻¹ Vᵀ vᵀ, and (λ₀ + s)⁻¹ times the product of what is beyond the axes.
         row_axes, vector_axes = rows @ self.vectors, vector @ self.vectors
         return np.asarray(
             (along * row_axes) @ vector_axes
-            + beyond[:, 0] * (rows @ vector - row_axes @ vector_axes)
+            + gain_beyond[:, 0] * (rows @ vector - row_axes @ vector_axes)
         )
 
     def mahalanobis2_of_all(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of every row x (r, m) for every noise variance, (n, r)."""
-        along, beyond = self._inverse(s)
+        along, gain_beyond = self._inverse(s)
+        # As `mahalanobis2`, for all pairs of a noise variance and a row.
         squares = np.square(rows @ self.vectors).T
         return np.asarray(
-            along @ squares + beyond * (np.square(rows).sum(axis=1) - squares.sum(axis=0))
+            along @ squares + gain_beyond * (np.square(rows).sum(axis=1) - squares.sum(axis=0))
         )
 
     def half_log_det(self, s: np.ndarray) -> np.ndarray:
         """Return ½ ln det G for noise variances s (n,), in the m coordinates, (n,)."""
         dimensions = len(self.vectors) - len(self.variance)
+        # ½ Σ ln(λ + s) over the axes, and (m − a)/2 times ln(λ₀ + s) beyond them.
         along = np.log(self.variance + s[:, None]).sum(axis=1)
-        beyond = dimensions * np.log(self.variance_beyond + s) if dimensions else 0.0
-        return np.asarray(0.5 * (along + beyond))
+        log_beyond = dimensions * np.log(self.variance_beyond + s) if dimensions else 0.0
+        return np.asarray(0.5 * (along + log_beyond))
 
 
 class ClusterAxes(NamedTuple):
@@ -122,6 +104,7 @@ class ClusterAxes(NamedTuple):
     @classmethod
     def of(cls, covariance: np.ndarray) -> ClusterAxes:
         """Return the eigenvectors of a covariance (w, w)."""
+        # By descending variance; rounding may make the least ones negative.
         variance, vectors = np.linalg.eigh(covariance)
         return cls(
             vectors=np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
@@ -131,10 +114,12 @@ class ClusterAxes(NamedTuple):
 
     def inverse(self, least_variance: float) -> AxesInverse:
         """Return G_k⁻¹ by the axes of a larger variance, with the mean of the others (eq. 4)."""
+        # λ₀: what the axes leave of the trace, over the number of dimensions beyond them.
         variance = self.variance[self.variance > least_variance]
         dimensions = len(self.variance) - len(variance)
-        beyond = (self.total_variance - variance.sum()) / dimensions if dimensions else np.inf
-        return AxesInverse(self.vectors[:, : len(variance)], variance, float(beyond))
+        sum_beyond = self.total_variance - variance.sum()
+        variance_beyond = float(sum_beyond / dimensions) if dimensions else np.inf
+        return AxesInverse(self.vectors[:, : len(variance)], variance, variance_beyond)
 
 
 class WoodburyInverse(NamedTuple):
@@ -157,31 +142,24 @@ class WoodburyInverse(NamedTuple):
     half_log: float
 
     @classmethod
-    def of_stack(cls, diagonal: np.ndarray, rows: np.ndarray) -> Iterator[WoodburyInverse]:
-        """Return G⁻¹ of D + UᵀU for a stack of K covariances (eq. 5).
-
-        Parameters
-        ----------
-        diagonal : ndarray, shape (K, m)
-            D.
-        rows : ndarray, shape (K, r, m)
-            U.
-        """
+    def of(cls, diagonal: np.ndarray, rows: np.ndarray) -> WoodburyInverse:
+        """Return G⁻¹ of D + UᵀU with D (m,) and U (r, m) (eq. 5)."""
         # U D⁻¹, then L with L Lᵀ = 1 + U D⁻¹ Uᵀ, and ln det G = ln det D + 2 ln det L.
-        weighted = rows / diagonal[:, None]
-        lower = np.linalg.cholesky(np.eye(rows.shape[1]) + weighted @ rows.transpose(0, 2, 1))
-        half_log = 0.5 * np.log(diagonal).sum(axis=1)
-        half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        weighted = rows / diagonal
+        lower = np.linalg.cholesky(np.eye(len(rows)) + weighted @ rows.T)
+        half_log = 0.5 * np.log(diagonal).sum() + np.log(lower.diagonal()).sum()
         solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
-        return map(cls, 1.0 / diagonal, solved, half_log)
+        return cls(1.0 / diagonal, solved, float(half_log))
 
     def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return the product of rows (n, m) with G⁻¹, (n, m)."""
+        # x D⁻¹ − x (L⁻¹ U D⁻¹)ᵀ (L⁻¹ U D⁻¹).
         diagonal = self.diagonal.astype(rows.dtype)
         return np.asarray(rows * diagonal - (rows @ self.rows.T) @ self.rows)
 
     def mahalanobis2(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of each of the rows x (n, m), (n,)."""
+        # x D⁻¹ xᵀ less what the rows explain.
         explained = np.square(rows @ self.rows.T).sum(axis=1)
         return np.asarray(np.square(rows) @ self.diagonal.astype(rows.dtype) - explained)
 
@@ -193,12 +171,17 @@ class WoodburyInverse(NamedTuple):
 
     def mahalanobis2_of_all(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of every row x (r, m), the same for every s, (n, r)."""
+        # All noise variances are that for which this was computed.
         distance = np.square(rows) @ self.diagonal - np.square(rows @ self.rows.T).sum(axis=1)
         return np.asarray(np.repeat(distance[None], len(s), axis=0))
 
     def half_log_det(self, s: np.ndarray) -> np.ndarray:
         """Return ½ ln det G, the same for every s (n,), (n,)."""
         return np.full(len(s), self.half_log)
+
+
+NoisyCovariance = AxesInverse | WoodburyInverse
+"""Covariance G = C + s of stars of a cluster with noise, of which the inverse is known."""
 
 
 class NodeAxes(NamedTuple):
@@ -264,7 +247,7 @@ class NodeAxes(NamedTuple):
         # Eigenvectors of C in this space, and the mean variance that is left outside of it.
         projected = rows @ space
         variance, rotation = np.linalg.eigh((space.T * diagonal) @ space + projected.T @ projected)
-        beyond = diagonal.sum() + np.square(rows).sum() - variance.sum()
+        sum_beyond = diagonal.sum() + np.square(rows).sum() - variance.sum()
         basis = np.vstack([derivatives, (space @ rotation[:, ::-1]).T])
         # Products of the derivatives, which every star needs: over all pixels less along the axes.
         along = derivatives @ basis[3:].T
@@ -273,7 +256,9 @@ class NodeAxes(NamedTuple):
         return cls(
             basis=basis,
             variance=variance[::-1].copy(),
-            variance_beyond=float(beyond / (pixels - axis_count)) if axis_count < pixels else 1.0,
+            variance_beyond=float(sum_beyond / (pixels - axis_count))
+            if axis_count < pixels
+            else 1.0,
             images=images @ basis[3:].T,
             derivatives=along,
             derivative_products=np.vstack([products_along, products_beyond.ravel()]),
@@ -289,11 +274,13 @@ class NodeAxes(NamedTuple):
         The first array, (n, 1), is the fraction beyond the axes; the second one, (n, m), by how
         much the fraction along each axis differs from it.
         """
+        # Along all axes the fraction beyond them, and the difference from it.
         fraction = noise_variance * self.inverse(noise_variance)
         return fraction[:, -1:], fraction[:, :-1] - fraction[:, -1:]
 
     def nuisance_precision(self, noise_variance: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
         """Return Λ = 1 + σ L G⁻¹ Lᵀ σ, the inverse covariance of t/σ, (n, 3, 3) (eq. 7)."""
+        # L G⁻¹ Lᵀ: products of the derivatives along each axis and beyond, weighted by G⁻¹ there.
         products = self.inverse(noise_variance) @ self.derivative_products
         products = products.reshape(-1, 3, 3)
         return np.asarray(np.eye(3) + products * (prior_sigma[:, :, None] * prior_sigma[:, None]))
@@ -321,9 +308,11 @@ class NodeAxes(NamedTuple):
         precision : ndarray, shape (n, 3, 3)
             σ L G⁻¹ Lᵀ σ, their part of the inverse covariance of t/σ.
         """
+        # G along the leading axes is diagonal: λ + s.
         residual = residual[:, :count]
         total_variance = self.variance[:count] + noise_variance
         derivatives = prior_sigma[:, :, None] * self.derivatives[:, :count]
+        # σ L G⁻¹, and its products with the residual and with L σ.
         weighted = derivatives / total_variance[:, None]
         gradient = np.einsum("nij,nj->ni", weighted, residual)
         chi2 = (residual**2 / total_variance).sum(axis=1)
@@ -334,18 +323,21 @@ class NodeAxes(NamedTuple):
 
         Shape (n, P), of stars of flux 1 without noise and sky.
         """
-        beyond, along = self.noise_fractions(noise_variance)
+        fraction_beyond, fraction = self.noise_fractions(noise_variance)
+        # Λ⁻¹: the covariance of the nuisance parameters over their prior σ.
         covariance = np.linalg.inv(self.nuisance_precision(noise_variance, prior_sigma))
         derivatives, axes = self.basis[:3], self.basis[3:]
         # σ L s G⁻¹: how the noise that is subtracted changes with the nuisance parameters.
-        rows = ((self.derivatives * along[:, None]).reshape(-1, len(axes)) @ axes).reshape(
+        rows = ((self.derivatives * fraction[:, None]).reshape(-1, len(axes)) @ axes).reshape(
             len(noise_variance), 3, -1
         )
-        rows = (rows + beyond[:, None] * derivatives) * prior_sigma[:, :, None]
+        rows = (rows + fraction_beyond[:, None] * derivatives) * prior_sigma[:, :, None]
         pull = covariance @ rows
         # diag(C − C G⁻¹ C) = s diag(1 − s G⁻¹); then what the nuisance parameters leave open. The
         # sky itself is no part of the star: its row is σ L s G⁻¹ − σ_sky.
-        variance = noise_variance * (1.0 - beyond - along @ axes**2) + (rows * pull).sum(axis=1)
+        variance = noise_variance * (1.0 - fraction_beyond - fraction @ axes**2) + (
+            rows * pull
+        ).sum(axis=1)
         variance += (
             prior_sigma[:, :1] ** 2 * covariance[:, :1, 0] - 2 * prior_sigma[:, :1] * pull[:, 0]
         )

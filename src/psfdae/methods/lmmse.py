@@ -48,17 +48,22 @@ class LinearMmse(Method):
     @classmethod
     def of(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> LinearMmse:
         """Moments of noise-free training images and references, both of shape (n, d, d)."""
+        # Deviations from the mean image and the mean reference, in double precision.
         x = images.reshape(len(images), -1).astype(np.float64)
         y = references.reshape(len(references), -1).astype(np.float64)
         mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
         x -= mean_x
         y -= mean_y
+        # C_xx and C_yx.
         return cls(mean_x, mean_y, x.T @ x / len(x), y.T @ x / len(x), noise)
 
     def predict(self, noisy: np.ndarray, level: float) -> np.ndarray:
         """Estimates for noisy images of one noise level λ, shape (n, d, d)."""
+        # N: the noise that the mean star would have; then the gain C_yx (C_xx + N)⁻¹, of which the
+        # transposed is solved for, as C_xx + N is symmetric.
         variance = self.noise.variance(self.mean_x, level)
         system = self.cov_xx + np.diag(variance)
         gain = np.linalg.solve(system, self.cov_yx.T).T
+        # ŷ = ȳ + gain (x − x̄), an image in each row.
         residual = noisy.reshape(len(noisy), -1) - self.mean_x
         return np.asarray((self.mean_y + residual @ gain.T).reshape(noisy.shape))

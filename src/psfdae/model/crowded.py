@@ -91,6 +91,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     ObservationError
         If there is no sky to measure.
     """
+    # PSFs of the field, and lengths that follow from the PSF in its middle.
     psfs, fwhm, side = PsfGrid.of(model), model.fwhm_px(), model.stamp_px
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
@@ -99,10 +100,11 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     # The image with its sky; saturated pixels are not fitted.
     sky = observation.sky()
     image = sky.flat + sky.level
-    limit = np.inf if observation.saturate is None else observation.saturate
-    saturated = image >= limit
+    limit = observation.saturate
+    saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
     bad = sky.bad | saturated
     sky = replace(sky, bad=bad)
+    # Stars start where the list or the detection has them.
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
     wings, wing_light = None, np.zeros_like(image)
@@ -141,7 +143,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if wings_used is not None:
         total, _ = wings_used.total(outer_shares(model.on_pixels, fit.place))
     stars = fit.table(total, 2.4 * fwhm)
-    # The error of the PSF is no noise, and is as large a part of each flux.
+    # The error of the PSF is no noise, and is as large a part of each flux, whatever its χ²:
+    # σ² = σ_noise² + (σ_model F)².
     model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1)) * stars["flux"]
     stars["flux_error"] = np.hypot(stars["flux_error"], model_error)
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
@@ -150,6 +153,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     sigma_px = np.hypot(stars["x_error"], stars["y_error"])
     is_far = distance_px > np.maximum(same_px, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
+    # Stars of a list keep its numbers and flags.
     if observation.detections is None:
         stars["id"] = observation.stars.id
         stars["flags"] |= observation.stars.flags

@@ -120,6 +120,7 @@ class Photometer:
                 x, side = np.tile(self.model.mean, (16, 1)), stamps.shape[-1]
                 flat = stamps[group].reshape(group.size, -1).astype(np.float64)
                 x[: group.size] = np.where(hidden[group], np.nan, flat - sky[group, None])
+                # Fluxes, and stamps with bad pixels and outliers repaired, of the whole group.
                 # Groups without a good pixel, the stars beyond an image, are all the same.
                 blind = group.size == 16 and hidden[group].all()
                 estimate = blind_estimate if blind else None
@@ -147,6 +148,7 @@ class Photometer:
         # if it has no image in single precision. A flux that is given is not faint.
         is_lost = ~fitted | ~(flux > self.least_flux * np.abs(repaired).max(axis=1))
         is_lost |= ~has_flux & ((fit_flags & StarFlag.NO_FLUX) > 0)
+        # NO_FLUX is judged with the fluxes that are given; all other flags are those of the fit.
         flags = fit_flags & ~np.uint16(StarFlag.NO_FLUX)
         flags[has_flux] &= ~np.uint16(StarFlag.FAINT)
         raise_flag(flags, StarFlag.NO_FLUX, is_lost)

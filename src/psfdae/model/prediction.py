@@ -162,6 +162,7 @@ class Prediction:
 
     def of(self, rows: slice) -> Self:
         """Return the predictions of some of the stars."""
+        # Images, columns and columns of the list have a row for each star.
         cubes: dict[str, Any] = {name: getattr(self, name)[rows] for name in CUBES}
         return replace(
             self,

@@ -93,7 +93,6 @@ class PsfModel(FieldPsfs):
     def __init__(self, bundle: Bundle, method: Method | None = None) -> None:
         self.bundle = bundle
         self.restorer = Restorer(bundle, estimator(bundle) if method is None else method)
-        # What every model of a field has, by `FieldPsfs`.
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     def __repr__(self) -> str:
@@ -298,7 +297,6 @@ class PsfModel(FieldPsfs):
         PredictionError
             If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
         """
-        # A PSF in pixels holds for pixels of one size.
         model_scale = self.info.pixel_scale_arcsec
         advice = "; psfdae from-stars trains one on an image of yours"
         if pixel_scale_arcsec is None:

@@ -237,9 +237,11 @@ class Restorer:
         # A star cannot be moved farther than the pixels around its stamp reach.
         is_too_far = np.abs(shift).max(axis=1) > margin
         shift[is_too_far] = 0
+        # Stamps of the model's side about the star; pixels that none shows are bad.
         stamps, bad, saturated = (
             cut(frames, side, shift) for frames in (data, stars.bad, stars.saturated)
         )
+        # Flags of the list, and those of pixels and centring.
         flags = stars.flags.copy()
         raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
@@ -264,6 +266,7 @@ class Restorer:
         noise for larger then: what it does not know of a bright star would pass for flux. Parts are
         restored together, in which some stars have about the same noise.
         """
+        # Photometry of all parts together, and stars that have none.
         info = self.bundle.info
         photometry = Photometry.joined([part.photometry for part in centred])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
@@ -275,6 +278,7 @@ class Restorer:
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
         if is_free.any() and self.method.finds_flux:
+            # √(noise² + misfit²): what the method does not know of a star counts as noise.
             images, noise = self._normalised(photometry, has_no_flux)
             level = np.hypot(noise, info.misfit) / info.kappa
             factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
@@ -300,13 +304,15 @@ class Restorer:
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred)])
         unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
-        whole = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
-        return [whole.part(slice(*rows)) for rows in pairwise(ends)]
+        restored = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [restored.part(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalised(
         self, photometry: Photometry, has_no_flux: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return images (n, d, d) of flux 1 and their noise (n,); a mean PSF where is no flux."""
+        # Stars without flux cost as much, and are NaN afterwards; their noise is the largest of the
+        # training.
         images = photometry.images
         if has_no_flux.any():
             mean_psf = self.bundle.flux_model.mean.reshape(images.shape[1:])
@@ -331,9 +337,11 @@ class Restorer:
         # PSFs, their errors and what is left of the stamps, in the unit of the stamps: errors of
         # PSFs of flux 1 times the flux, and r = x − b − F psf.
         flux = photometry.flux.astype(np.float32)[:, None, None]
+        # F psf ± F w, with the half-width w of the case of each star.
         half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
         psf *= flux
         residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
+        # Pixels that were repaired tell nothing.
         residual[~photometry.used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
         chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
@@ -422,6 +430,8 @@ def restored_by_measurement(
     flux = np.where(has_flux, stars.flux, photometry.flux)
     star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
     place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
+    # PSF, flux, sky and centre at once; what is stated is taken as it is. Centres count from the
+    # middle of the stamp, which was moved.
     estimate = method.measure(
         data,
         noise,
@@ -441,6 +451,7 @@ def restored_by_measurement(
     flux = np.where(has_flux, stars.flux, measured.flux)
     is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
     has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
+    # Flags on pixels are those of the photometry, on the flux those of the method.
     flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
     is_measured = ~has_flux & ~has_no_flux

@@ -105,6 +105,7 @@ class Wings:
 
         How the wings change with the PSF is known to half of the change.
         """
+        # 1 + s L, with the errors s σ_L and (s − 1) L / 2.
         scale = self.scale(outer_share)
         light, error = self.light()
         return 1.0 + scale * light, np.hypot(scale * error, 0.5 * (scale - 1.0) * light)
@@ -305,6 +306,7 @@ def wing_light(
     wings: Wings | None,
 ) -> np.ndarray:
     """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
+    # One map, to which each star adds the light in its window.
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
         for window, light in star_tents(rows, shape[1], stars, wings):
@@ -469,6 +471,7 @@ def around_stars(
     sigma : ndarray, shape (h, w)
         σ of every pixel without models and wings, with what these may be off by.
     """
+    # What is left beside the models has their errors, too.
     sigma = error_beside_models(error, star_light)
     without_stars = image - star_light
     wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier)

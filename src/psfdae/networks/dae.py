@@ -7,9 +7,8 @@ size of the input.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,19 +17,12 @@ from torch import nn
 from torch.nn.grad import conv2d_weight
 
 from psfdae.method import TrainingSet
-from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
+from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError
 from psfdae.networks.weights import channels_last
 from psfdae.rng import stream
 
 if TYPE_CHECKING:
     from psfdae.networks.settings import DaeSettings, Train
-
-
-LINEAR_PX = 24_000
-"""Number of random pixels to which the last layer of a network that begins linear is fitted."""
-
-BLOCK_PX = 4
-"""Side of the blocks of pixels that a layer with one output channel computes at once."""
 
 
 class SingleChannelConv(nn.Conv2d):
@@ -58,21 +50,24 @@ class _ToOneChannel(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.save_for_backward(x, weight)
         (height, width), side = x.shape[-2:], weight.shape[-1]
-        # All pixels of a block together see s + BLOCK_PX − 1 pixels along an axis. The kernel of
-        # one of them is the weight, shifted within a window of that side; elsewhere it is zero.
-        window_px = side + BLOCK_PX - 1
-        padded = nn.functional.pad(weight[0], (BLOCK_PX - 1,) * 4)
-        # Window i of the padded weight is that of pixel BLOCK_PX - 1 - i of a block.
+        # Blocks of 4 x 4 output pixels, so that there are 16 channels for vector instructions.
+        block = 4
+        # All pixels of a block together see s + block − 1 pixels along an axis. The kernel of one
+        # of them is the weight, shifted within a window of that side; elsewhere it is zero.
+        window_px = side + block - 1
+        padded = nn.functional.pad(weight[0], (block - 1,) * 4)
+        # Window i of the padded weight is that of pixel block − 1 − i of a block.
         windows = padded.unfold(1, window_px, 1).unfold(2, window_px, 1).flip(1, 2)
         kernels = windows.permute(1, 2, 0, 3, 4).flatten(0, 1)
         # Zeros fill up the last blocks of an image whose side is no multiple of theirs.
-        if width % BLOCK_PX or height % BLOCK_PX:
-            x = nn.functional.pad(x, (0, -width % BLOCK_PX, 0, -height % BLOCK_PX))
+        if width % block or height % block:
+            x = nn.functional.pad(x, (0, -width % block, 0, -height % block))
+        # The bias is that of every pixel.
         blocks = nn.functional.conv2d(
-            x, kernels, bias.expand(BLOCK_PX**2), stride=BLOCK_PX, padding=side // 2
+            x, kernels, bias.expand(block**2), stride=block, padding=side // 2
         )
-        # From BLOCK_PX² channels, one for each pixel of a block, to one channel.
-        return nn.functional.pixel_shuffle(blocks, BLOCK_PX)[..., :height, :width]
+        # From block² channels, one for each pixel of a block, to one channel; without the filling.
+        return nn.functional.pixel_shuffle(blocks, block)[..., :height, :width]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -102,6 +97,7 @@ class DaeNetwork(nn.Module):
         super().__init__()
         self.kernels, self.widths = tuple(kernels), tuple(widths)
         self.layers = nn.ModuleList()
+        # One channel enters, one leaves; the padding keeps the side of the images.
         channels = pairwise([1, *widths, 1])
         for (inputs, outputs), kernel in zip(channels, kernels, strict=True):
             layer_class = nn.Conv2d if outputs > 1 else SingleChannelConv
@@ -114,6 +110,7 @@ class DaeNetwork(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled star images (B, 1, d, d) to scaled PSFs of the same shape."""
+        # The last ReLU, too: a PSF is not negative.
         for layer in self.layers:
             x = torch.relu(layer(x))
         return x
@@ -148,10 +145,12 @@ def build_dae(
         for layer in model.layers:
             weight, bias = layer.parameters()
             if init == "default":
+                # fan_in: how many numbers of the layer's input make one of its output.
                 bound = float(weight[0].numel()) ** -0.5
                 weight.uniform_(-bound, bound, generator=generator)
                 bias.uniform_(-bound, bound, generator=generator)
             else:
+                # ReLU halves the mean square of its input, hence the 2 in 2/fan_in.
                 nn.init.kaiming_normal_(weight, nonlinearity="relu", generator=generator)
                 bias.zero_()
     return model
@@ -189,6 +188,7 @@ def begin_linear(
     TrainingError
         If an image or reference is not finite.
     """
+    # Before any product, as one NaN would spread to all weights.
     if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
         raise TrainingError("training stars that are not finite")
     first, *inner_layers, _ = model.convolutions
@@ -211,10 +211,11 @@ def begin_linear(
         middle = layer.kernel_size[0] // 2
         for channel in range(min(layer.in_channels, layer.out_channels)):
             layer.weight[channel, channel, middle, middle] += 1.0
-    _fit_last_layer(model, images, references.reshape(len(references), -1), weight, pixels)
+    # Given these layers, the last one follows from a linear system.
+    fit_last_layer(model, images, references.reshape(len(references), -1), weight, pixels)
 
 
-def _fit_last_layer(
+def fit_last_layer(
     model: DaeNetwork,
     images: torch.Tensor,
     references: np.ndarray,
@@ -264,6 +265,7 @@ def _fit_last_layer(
     ridge = 1e-6 * normal_matrix.diagonal().mean()
     normal_matrix += ridge * torch.eye(size, dtype=torch.float64)
     solution = torch.linalg.solve(normal_matrix, normal_vector).float()
+    # The last number of the solution belongs to the 1 of every row: it is the bias.
     last_weight.copy_(solution[:-1].view_as(last_weight))
     bias.copy_(solution[-1:])
 
@@ -298,6 +300,7 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
         middle = 0.5 + 0.5 * min(part, 1.0) ** 2
     else:
         middle = 0.75 if part < 2 / 3 else 1.0
+    # As many pixels less on either edge: the brightest pixel stays in the middle.
     return stamp_px - 2 * round(0.5 * (1.0 - middle) * stamp_px)
 
 
@@ -355,6 +358,8 @@ class DaeTraining(Training):
 
     model: DaeNetwork
     settings: Train
+    linear_px = 24_000
+    """Number of random pixels to which the last layer of a network that begins linear is fitted."""
 
     def __init__(
         self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
@@ -371,7 +376,7 @@ class DaeTraining(Training):
             start: Any = data.start  # a `psfdae.methods.dae.Dae`, of a layer above this one
             model.load_state_dict(start.network.state_dict())
         elif dae.init == "linear":
-            # 1500 noisy stars, and about LINEAR_PX random pixels of them, are enough for a start
+            # 1500 noisy stars, and about `linear_px` random pixels of them, are enough for a start
             # from which the training goes on.
             rng = stream(seed, "dae", "linear", attempt)
             stars = rng.permutation(data.fit)[:1500]
@@ -382,8 +387,9 @@ class DaeTraining(Training):
                 noisy * np.float32(self.factor),
                 data.references[stars] * np.float32(self.factor),
                 level**-settings.level_weight,
-                rng.permuted(pixels, axis=1)[:, : -(-LINEAR_PX // stars.size)],
+                rng.permuted(pixels, axis=1)[:, : -(-self.linear_px // stars.size)],
             )
+        # The last batch of an epoch may be smaller.
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
         # One noisy image of every star for all epochs, if the settings ask for that.
@@ -403,6 +409,7 @@ class DaeTraining(Training):
         matrices = [layer.weight for layer in self.model.convolutions[1:-1]]
         # By identity, as "in" would compare the values of tensors.
         by_adam = [p for p in self.model.parameters() if all(p is not w for w in matrices)]
+        # First and last layer, and all biases, are left to Adam.
         groups: list[dict[str, Any]] = [
             {"params": by_adam},
             {"params": matrices, "orthogonal": True},
@@ -435,6 +442,7 @@ class DaeTraining(Training):
             else:
                 noisy, level = (fixed[stars] for fixed in self.fixed)
             # Squared errors grow with λ: without weights, the faintest stars would decide alone.
+            # 1/λ^p over its mean, so that the loss is about as large for any power p.
             power = -self.settings.level_weight
             weight = level**power / np.mean(self.data.levels**power)
             weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
@@ -460,6 +468,7 @@ class DaeTraining(Training):
         # Not at every step, because the look at the values waits for the computation.
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
+        # (1/n) Σ w (f(z) − y)² over the pixels of all stars.
         return (weight * (output - target) ** 2).mean()
 
     def validate(self, epoch: int) -> float:
@@ -481,6 +490,7 @@ class DaeTraining(Training):
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = run_network(self.model, noisy, self.factor)
+        # Outputs of zero have no gradient: further epochs would not revive such a network.
         zero_part = 1.0 - estimate.any(axis=(1, 2)).mean()
         if zero_part > 0.5:
             raise DeadNetworkError(f"{zero_part:.0%} of the outputs are zero after epoch {epoch}")
@@ -494,6 +504,7 @@ class DaeTraining(Training):
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
         """Return a row of the history; the learning rate is that at the epoch's end."""
+        # The network sees images times a factor: errors are over its square.
         return {
             "epoch": epoch,
             "step": epoch * self.steps,
@@ -508,28 +519,6 @@ class DaeTraining(Training):
         """Return True if all epochs are done, or `patience` validations were not better."""
         scores = [row["validation_mse"] for row in self.history]
         scores = [score for score in scores if np.isfinite(score)]
-        # Number of validations since the one with the smallest error.
+        # Only the epochs that were validated. Of these, the number since the smallest error.
         stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
         return super().finished() or 0 < self.settings.patience <= stale
-
-
-def train_dae(
-    data: TrainingSet,
-    dae: DaeSettings,
-    settings: Train,
-    seed: int,
-    checkpoint: Path,
-    fingerprint: str,
-    report: Callable[[Row], None] = lambda row: None,
-) -> Training:
-    """Train a denoising autoencoder, and return the training with its `result` and `history`.
-
-    Parameters are those of `DaeTraining` and of `train`, which names the errors, too.
-    """
-    return train(
-        lambda attempt: DaeTraining(data, dae, settings, seed, attempt),
-        checkpoint,
-        fingerprint,
-        report,
-        settings.restarts,
-    )

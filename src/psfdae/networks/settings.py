@@ -29,7 +29,7 @@ class DaeSettings(Group):
     )
 
     @model_validator(mode="after")
-    def _shape(self) -> DaeSettings:
+    def check_shape(self) -> DaeSettings:
         """Refuse kernels without a middle pixel, and widths that do not fit between kernels."""
         if any(k % 2 == 0 for k in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")

@@ -31,12 +31,6 @@ from psfdae.progress import task
 Row = dict[str, float]
 """Values of one epoch in the history of a training, by the names of their columns."""
 
-STATE_DICTS = ("model", "optimiser", "scheduler")
-"""Attributes of a training of which a checkpoint holds torch's `state_dict`."""
-
-PLAIN_FIELDS = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
-"""Attributes of a training that a checkpoint holds as they are."""
-
 
 class TrainingError(FitError):
     """Failure of a training; the message says why and what to change."""
@@ -109,6 +103,7 @@ def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     for _ in range(5):
         factor = 3.4445 * identity - 4.7750 * gram + 2.0315 * gram @ gram
         product, gram = factor @ product, factor @ gram @ factor
+    # Without the padding, and tall matrices upright again.
     results = [p[: len(m), : len(m)] @ m for p, m in zip(product, scaled, strict=True)]
     return [r if r.shape == m.shape else r.T for r, m in zip(results, matrices, strict=True)]
 
@@ -159,6 +154,10 @@ class Training(ABC):
     """
 
     grad_clip = float("inf")
+    state_dicts = ("model", "optimiser", "scheduler")
+    """Attributes of which a checkpoint holds torch's `state_dict`."""
+    plain_fields = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
+    """Attributes that a checkpoint holds as they are."""
 
     def __init__(
         self,
@@ -172,6 +171,7 @@ class Training(ABC):
         self.model, self.settings, self.steps = model, settings, steps
         self.attempt, self.key = attempt, key
         self.optimiser = self.begin(settings.lr)
+        # One-cycle: the rate rises to its maximum and falls to nearly 0, step by step.
         self.scheduler: LRScheduler
         if settings.schedule == "onecycle":
             total = max(settings.epochs * steps, 2)  # torch divides by the number less 1
@@ -243,7 +243,8 @@ class Training(ABC):
         losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
-            losses.append(self._step(batch, epoch * self.steps + len(losses)))
+            losses.append(self.take_step(batch, epoch * self.steps + len(losses)))
+        # The state with the least validation error is the result.
         error = self.validate(epoch + 1)
         if error < self.best_mse:
             # A copy, because the next steps change the weights in place.
@@ -257,7 +258,7 @@ class Training(ABC):
         self.history.append(self.row(epoch + 1, rate, float(np.mean(losses)), error))
         return self.history[-1]
 
-    def _step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
+    def take_step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
         """Make a step of the optimiser with a batch, and return the loss before it."""
         loss = self.loss(batch, step)
         value = self._finite("loss", loss, step)
@@ -266,6 +267,7 @@ class Training(ABC):
         # Clipping returns the norm before it.
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
         self._finite("gradient's norm", norm, step)
+        # The learning rate changes after every step, not after every epoch.
         self.optimiser.step()
         self.scheduler.step()
         return value
@@ -282,14 +284,14 @@ class Training(ABC):
 
     def state(self) -> dict[str, Any]:
         """Return all that `restore` needs, as tensors and plain values."""
-        state = {name: getattr(self, name).state_dict() for name in STATE_DICTS}
-        return state | {name: getattr(self, name) for name in PLAIN_FIELDS}
+        state = {name: getattr(self, name).state_dict() for name in self.state_dicts}
+        return state | {name: getattr(self, name) for name in self.plain_fields}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a result of `state`."""
-        for name in STATE_DICTS:
+        for name in self.state_dicts:
             getattr(self, name).load_state_dict(state[name])
-        for name in PLAIN_FIELDS:
+        for name in self.plain_fields:
             setattr(self, name, state[name])
 
 
@@ -369,6 +371,7 @@ def listener(checkpoint: Path) -> Callable[[Row], None]:
 
 def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
     """Return the SHA-256 of the data of a training and of the settings that decide its result."""
+    # Settings by their JSON with sorted keys, arrays by their bytes.
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -52,6 +52,7 @@ def save_weights(path: Path, state: Mapping[str, Tensor], config: Mapping[str, A
     from safetensors.numpy import save
 
     arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in state.items()}
+    # The checksum is that of the arrays, which is the same whatever the file's header is.
     metadata = json.dumps({"config": config, "sha256": digest_of(arrays)})
     with atomic_path(path) as temporary:
         # safetensors' own function for files does not give them the usual permissions.
@@ -84,6 +85,7 @@ def with_weights(build: Callable[[], Network], path: Path) -> Network:
     except (RuntimeError, ValueError, TypeError, OverflowError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: its config.yaml describes no network ({line})") from None
+    # A tensor that is missing, one too many, or one of another shape.
     for name in sorted(needed.keys() | state.keys()):
         shape = tuple(state[name].shape) if name in state else "none"
         needed_shape = tuple(needed[name]) if name in needed else "none"
@@ -145,6 +147,7 @@ def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> N
     """
     import torch
 
+    # In memory first, as the checksum stands before the content.
     content = io.BytesIO()
     torch.save({"fingerprint": fingerprint, **state}, content)
     digest = hashlib.sha256(content.getbuffer()).hexdigest().encode()
@@ -162,6 +165,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
 
     if not path.is_file():
         return None
+    # A checkpoint is only a saving of time: whatever is wrong with it, the training begins anew.
     head, _, content = path.read_bytes().partition(b"\n")
     if head != CHECKPOINT_HEADER + hashlib.sha256(content).hexdigest().encode():
         print(f"{path}: damaged checkpoint ignored (wrong checksum)", flush=True)

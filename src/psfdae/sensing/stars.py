@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.bright_stars import LEAST_SKY, MOST_SKY
+from psfdae.bright_stars import BrightStars
 from psfdae.errors import Error
 from psfdae.image.stamps import Stamps, border_median, border_scatter
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
@@ -194,8 +194,8 @@ class Photons:
         noise = np.where(noise > 0, noise, np.nan)
         # A gain that is not given is so large that the star's own photon noise vanishes beside
         # the sky's. N electrons have the variance N, so the sky counts are (gain · noise)².
-        gain = np.where(np.isfinite(stamps.gain), stamps.gain, MOST_SKY**0.5 / noise)
-        sky = np.clip((gain * noise) ** 2, LEAST_SKY, MOST_SKY)
+        gain = np.where(np.isfinite(stamps.gain), stamps.gain, BrightStars.max_sky**0.5 / noise)
+        sky = np.clip((gain * noise) ** 2, BrightStars.min_sky, BrightStars.max_sky)
         # Counts of star and sky; pixels that are bad or saturated are not used.
         counts = gain[:, None, None] * (data - level[:, None, None]) + sky[:, None, None]
         counts = np.where(stamps.bad | stamps.saturated, np.nan, counts).reshape(len(data), -1)

@@ -126,7 +126,6 @@ class PcaSom(Method):
         },
         rule="baseline",
         run="baseline",
-        about="Product of the stage baseline.",
     )
     packing = None
     groups: ClassVar = {"baseline": Baseline}
@@ -162,6 +161,7 @@ class PcaSom(Method):
                 f"{data.train.size}, the number of training stars"
                 f"{' that are not used for validation' if validation else ''}"
             )
+        # One fit for each noise level, or a single one for noise of all levels, marked by level 0.
         settings = baseline.model_dump(exclude={"threads", "per_level"})
         seed = int(stream(data.seed, "baseline", "map").integers(2**31))
         level = np.sort(data.levels) if baseline.per_level else np.zeros(1)
@@ -199,6 +199,7 @@ class PcaSom(Method):
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Make the fits from the arrays that `save` has written."""
+        # `owner` tells which nodes belong to which fit.
         node_masks = [arrays["owner"] == i for i in range(len(arrays["level"]))]
         stored_fits = zip(arrays["mean"], arrays["components"], node_masks, strict=True)
         return cls(
@@ -286,6 +287,7 @@ def fit_pca_som(
             f"baseline.components = {components}: must be at most {min(flat.shape)} "
             f"(stars and pixels: {flat.shape})"
         )
+    # Coefficients of the stars along the principal axes, of which the map is made.
     mean, axes = principal_axes(flat, components)
     features = flat @ axes.T - mean @ axes.T
     nodes = self_organised(features, (rows, columns), epochs, sigma, learning_rate, seed)

@@ -27,12 +27,6 @@ if TYPE_CHECKING:
     from psfdae_paper.bounds.stamp_model import StampModel
     from psfdae_paper.configuration.schema import Config
 
-BANK_STARS = 32000
-"""Stars that a fit simulates for its bank; the target `wavefront` has that of the error bounds."""
-
-DRAWS_PER_STAR = 100
-"""Importance samples of each star."""
-
 
 @dataclass(frozen=True, eq=False)
 class Wavefront(Method):
@@ -48,6 +42,11 @@ class Wavefront(Method):
         Static PSFs of the F fields at all J centring errors.
     data : TrainingSet
         Training stars of the Gaussian mixture, for stars that no mode explains.
+    bank_stars : int
+        Stars that a fit simulates for its bank; the target `wavefront` has the bank of the error
+        bounds.
+    draws_per_star : int
+        Importance samples of each star.
     """
 
     look = Look("optics of the telescope", "#e69f00", "*", drawn=False)
@@ -55,6 +54,8 @@ class Wavefront(Method):
     storage = None
     packing = None
     fallback: ClassVar = GaussianMixture
+    bank_stars: ClassVar[int] = 32000
+    draws_per_star: ClassVar[int] = 100
 
     bank: Bank
     model: StampModel
@@ -74,11 +75,13 @@ class Wavefront(Method):
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
 
+        # The bank has the configuration of the training stars under another name, which gives
+        # other random streams.
         simulated = data.simulation
         if simulated.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, simulated)
-        columns = fresh_stars(config, "optics", BANK_STARS)
+        columns = fresh_stars(config, "optics", cls.bank_stars)
         bank = {name: column.values for name, column in columns.items()}
         return cls.with_bank(bank, config, data)
 
@@ -131,6 +134,8 @@ class Wavefront(Method):
         position : ndarray, shape (n, 2), optional
             Grid indices of the stars' fields.
         """
+        # Posterior mean Σ w x / Σ w over the samples, and the variance about it; of templates, the
+        # weights of fields and positions are those of static PSFs.
         mean, variance = sums.mean_image, sums.variance
         if self.data.reference == "template":
             mean, variance = sums.template(self.static)
@@ -193,6 +198,7 @@ class Wavefront(Method):
         from psfdae_paper.bounds.sampling import sample_posterior
         from psfdae_paper.bounds.stamp_model import StarPosteriors
 
+        # First by the stars of the bank, whose weights are their likelihoods.
         sums = self._sums_over_bank(noisy, level, self._fields(position))
         explained = np.ones(len(noisy), bool)
         # Stars whose effective number of similar bank stars is too small.
@@ -207,7 +213,7 @@ class Wavefront(Method):
             rngs = [stream(*names, int(star)) for star in block]
             posteriors = StarPosteriors(noisy[block], likelihood, self.model)
             no_field = np.full(len(block), -1)
-            samples, _ = sample_posterior(modes, posteriors, no_field, DRAWS_PER_STAR, rngs)
+            samples, _ = sample_posterior(modes, posteriors, no_field, self.draws_per_star, rngs)
             sums.put(block, samples.with_truth)
             explained[block[unexplained]] = False
         return sums, explained & (sums.weight_sum > 0)
@@ -248,6 +254,8 @@ class Wavefront(Method):
             bank = self.bank.take(bank_stars)
             return posterior_sums(bank, noisy[stars], likelihood, star_field=field)
 
+        # Stars whose field is given are compared with the bank's stars of this field
+        # and of its mirror images.
         for stars, bank_stars in groups_by_field(len(noisy), star_field, self.bank):
             eighth = len(bank_stars) // 8
             first_sums = weigh(stars, bank_stars[:eighth])

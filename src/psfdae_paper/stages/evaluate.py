@@ -49,7 +49,7 @@ else:
                 method_class.name,
                 Annotated[
                     (Folder if method_class.storage.files else File) | None,
-                    method_class.storage.about or f"Result of `psfdae fit {method_class.name}`.",
+                    f"Result of `psfdae fit {method_class.name}`.",
                 ],
                 None,
             )
