@@ -6,6 +6,8 @@ come the trained network and its errors of states, in units of their range.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -71,7 +73,7 @@ class StateNetworkTraining(Training):
             mae: dict[str, float] = {}
             for level in task.levels:
                 at_level = [row for row in rows if row["noise_level"] == level]
-                errors = [row["mean_abs_error"] for row in at_level if row["unit"] == "range"]
+                errors: Any = [row["mean_abs_error"] for row in at_level if row["unit"] == "range"]
                 mae[f"{role}_mae_{level:g}"] = float(np.mean(errors))
             metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
             write_csv(task.folder / task.tables[role], pd.DataFrame(rows))
