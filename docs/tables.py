@@ -33,7 +33,7 @@ import yaml
 from psfdae.cli import as_click, stage
 from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.image_input import ImageStatements
-from psfdae.methods import known, method
+from psfdae.methods import all_methods, method
 from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose
@@ -252,7 +252,7 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    return table.assign(label=ends.map({kind.name: kind.look.label for kind in known()}))
+    return table.assign(label=ends.map({kind.name: kind.look.label for kind in all_methods()}))
 
 
 def coverage():

@@ -27,14 +27,17 @@ def method(name: str) -> type[Method]:
     ProductError
         If there is none.
     """
+    # The package's own methods first: no other package replaces one.
     method_class = _of_module(f"{__name__}.{name}") or _joined().get(name)
     if method_class is None:
-        raise ProductError(f"no method {name!r}; there are {', '.join(k.name for k in known())}")
+        raise ProductError(
+            f"no method {name!r}; there are {', '.join(k.name for k in all_methods())}"
+        )
     return method_class
 
 
 @cache
-def known() -> tuple[type[Method], ...]:
+def all_methods() -> tuple[type[Method], ...]:
     """Return all methods, the package's own first."""
     classes = [_of_module(f"{__name__}.{name}") for name in _modules(__name__)]
     return (*filter(None, classes), *_joined().values())
@@ -57,6 +60,7 @@ def _of_module(module: str) -> type[Method] | None:
     """Return the method that a module defines; None if it defines none, or is absent."""
     if not (module.rpartition(".")[2].isidentifier() and find_spec(module)):
         return None
+    # Classes that it defines itself; those that it imports are of other modules.
     classes = [value for value in vars(import_module(module)).values() if isinstance(value, type)]
     methods = [c for c in classes if issubclass(c, Method) and c.__module__ == module]
     return methods[0] if methods else None
@@ -68,7 +72,7 @@ def groups_of(name: str, **options: object) -> tuple[str, ...]:
 
 
 def _is_known(name: str) -> str:
-    names = [kind.name for kind in known()]
+    names = [method_class.name for method_class in all_methods()]
     if name not in names:
         raise ValueError(f"no method {name!r}; there are {', '.join(names)}")
     return name

@@ -102,6 +102,7 @@ class ClusterInverses:
             covariance = cluster.residual_factor * (rows.T @ rows)
             covariance[np.diag_indices(width)] += cluster.common_factor * self.variance[:width]
             self._axes[k, width] = ClusterAxes.of(covariance)
+        # The eigenvectors are those of every noise; how many of them matter depends on it.
         return self._axes[k, width].inverse(least_variance)
 
     def of_one_noise(self, k: int, width: int, s: float) -> WoodburyInverse:

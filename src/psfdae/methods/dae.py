@@ -94,6 +94,7 @@ class Dae(Method):
         # All that decides the result: settings, seed, noise, and the stars themselves.
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        # Positions are not among them: a network sees the images alone.
         arrays = [data.images, data.references, data.fit, data.validation]
         # Warm start: the network begins with the weights of one of the same layers.
         if isinstance(data.start, Dae):
@@ -143,6 +144,7 @@ class Dae(Method):
         """Write weights, and the resolved configuration with the number of the start."""
         from psfdae.networks.weights import save_weights
 
+        # The configuration is part of the weights' file, too, as metadata.
         save_weights(place / WEIGHTS, self.network.state_dict(), described)
         write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
 

@@ -162,6 +162,7 @@ class GaussianMixture(MixtureLaw, Method):
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Return a fit from its arrays; the noise is that of the configuration."""
+        # A bundle may have the deviations in half precision.
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
         named: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
         return cls(**named, noise=noise)
@@ -192,6 +193,7 @@ class GaussianMixture(MixtureLaw, Method):
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
         """Return the arrays of a bundle with their shapes, None where any shape will do."""
+        # The other arrays depend on the number of clusters and of their main axes.
         pixels = info.stamp_px**2
         return dict.fromkeys(cls.stored()) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
@@ -208,6 +210,7 @@ class GaussianMixture(MixtureLaw, Method):
         The others hold noise, which is an estimate: their χ² would say that it is wrong.
         """
         law = self.outlier_law
+        # s of each image, as for the weights of the clusters (eq. 1).
         s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
         # ln of the density is less where noise is larger: relative to that of the common variances.
         common = np.log(2 * np.pi * (law.total_variance + s[:, None])).sum(axis=1)

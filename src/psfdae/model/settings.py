@@ -17,7 +17,7 @@ from pydantic import Field, create_model, model_validator
 
 from psfdae.errors import did_you_mean
 from psfdae.joined import joined
-from psfdae.methods import MethodNames, known
+from psfdae.methods import MethodNames, all_methods
 from psfdae.reading import read_yaml
 from psfdae.settings import (
     CalibrationStars,
@@ -95,7 +95,7 @@ def settings_model() -> type[Settings]:
     # A field of the class for each group of each method, by the name of the group.
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
-        for method_class in known()
+        for method_class in all_methods()
         for name, group in method_class.groups.items()
     }
     return create_model("Settings", __base__=Settings, **groups)

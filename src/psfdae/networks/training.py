@@ -284,6 +284,7 @@ class Training(ABC):
 
     def state(self) -> dict[str, Any]:
         """Return all that `restore` needs, as tensors and plain values."""
+        # The learning rate is part of the scheduler's state, moments are part of the optimiser's.
         state = {name: getattr(self, name).state_dict() for name in self.state_dicts}
         return state | {name: getattr(self, name) for name in self.plain_fields}
 
@@ -384,6 +385,7 @@ def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
 
     It shows a progress bar in a terminal, and prints a line otherwise.
     """
+    # In a terminal the bar is enough; a log gets a line after every epoch.
     headings = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
     is_terminal = sys.stderr.isatty()
 
@@ -396,6 +398,7 @@ def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
                 for key, heading in headings.items()
                 if np.isfinite(row.get(key, np.nan))
             ]
+            # As long for each of the other epochs as for those that are done.
             remaining_s = row["seconds"] * (epochs / row["epoch"] - 1)
             times = f"{row['seconds']:.0f} s, about {remaining_s:.0f} s left"
             print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, times, sep="  ", flush=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from psfdae.files import ProductError
 from psfdae.method import Method
-from psfdae.methods import known, method
+from psfdae.methods import all_methods, method
 from psfdae.reading import parse_yaml
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.base import config_dir
@@ -47,7 +47,7 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     # Registered methods that are not listed may still be asked for by name.
-    return (*listed, *(kind for kind in known() if kind not in listed))
+    return (*listed, *(kind for kind in all_methods() if kind not in listed))
 
 
 def all_groups() -> tuple[str, ...]:

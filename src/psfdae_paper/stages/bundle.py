@@ -18,7 +18,7 @@ from psfdae.files import Product
 from psfdae.method import CONFIG, Method
 from psfdae.methods import method
 from psfdae.model import packing
-from psfdae.model.bundle import SHIPPED, SUFFIX, Bundle, BundleError, read_bundle, write_bundle
+from psfdae.model.bundle import SUFFIX, Bundle, BundleError, read_bundle, shipped_path, write_bundle
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae.options import AboveZero, File, Folder
@@ -136,12 +136,14 @@ def ship(
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     # Its stars are simulated: it has the licence of the package.
-    info = packed.info.model_copy(update={"name": SHIPPED, "licence": "MIT"})
+    name = shipped_path().name
+    fields = {"name": name.removesuffix(SUFFIX), "licence": "MIT"}
+    info = packed.info.model_copy(update=fields)
     # The package must stay small: the bundle is in every installation.
     size, largest_size = source.stat().st_size, 5_000_000
     if size > largest_size:
         raise BundleError(f"{source}: {size} bytes, at most {largest_size}")
-    shipped = out / f"{SHIPPED}{SUFFIX}"
+    shipped = out / name
     write_bundle(replace(packed, info=info), shipped)
     print(shipped)
 
