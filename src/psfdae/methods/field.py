@@ -258,9 +258,7 @@ class FieldMixture(FieldLaw, Method):
             raise ValueError("stamps must be finite")
         unknown = np.full(count, np.nan)
         flux, sky = (unknown if a is None else a for a in (flux, sky))
-        if position is None:
-            position = np.full((count, 2), np.nan)
-        terms, position_known = self.terms(position)
+        terms, position_known = self.terms(unknown[:, None] if position is None else position)
         # Centres of the list in the coordinates of the field's centres; those that are exact.
         listed = (np.full((count, 2), np.nan) if centre is None else centre) + self.list_offset
         exact = np.where(np.broadcast_to(fixed, count)[:, None], listed, np.nan)
