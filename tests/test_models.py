@@ -12,7 +12,7 @@ import torch
 
 from psfdae.files import ProductError
 from psfdae.method import Method, TrainingSet
-from psfdae.methods import known
+from psfdae.methods import all_methods
 from psfdae.methods.dae import Dae as Fitted
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.metrics import mse
@@ -430,7 +430,7 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
 def test_methods_have_the_functions_of_their_capabilities_and_no_others():
     field = ("measure", "psf_at", "order", "is_out_of_range", "draw_stars", "fitted_flux_error")
     functions = {**dict.fromkeys(field, "knows_field"), "flux": "finds_flux"}
-    for kind in known():
+    for kind in all_methods():
         for function, capability in functions.items():
             is_own = getattr(kind, function) is not getattr(Method, function)
             assert is_own == getattr(kind, capability), (kind.name, function)

@@ -140,9 +140,9 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
         sharp = propagate(source.opd(part, pupil, propagate.real_dtype))
         # Seeing and sub-pixel position are factors of the Fourier transform: a shift by (x, y)
         # multiplies it by exp(−2πi f_y y) exp(−2πi f_x x).
-        moved = shift[part] * oversampling
-        rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * moved[:, 1, None])
-        columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * moved[:, 0, None])
+        subpixels = shift[part] * oversampling
+        rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * subpixels[:, 1, None])
+        columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * subpixels[:, 0, None])
         phase = rows[:, :, None] * columns[:, None, :]
         blurred = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
         # Sum of the sub-pixels of each pixel, without ripples below 0, of flux 1.
