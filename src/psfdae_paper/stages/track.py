@@ -318,8 +318,8 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
     # Files that are not part of the model: tables, figures and settings.
     with tempfile.TemporaryDirectory() as folder:
-        others = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
-        link(others, Path(folder))
+        side_files = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
+        link(side_files, Path(folder))
         client.log_artifacts(run_id, folder)
     client.log_text(run_id, as_yaml(run.config), CONFIG)
     client.set_terminated(run_id, run.status, run.end_ms)
