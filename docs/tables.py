@@ -38,7 +38,7 @@ from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.image_input import ImageStatements
 from psfdae.methods import all_methods, method
 from psfdae_paper.configuration import aligners
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 from psfdae_paper.stars.example import FieldRecipe
@@ -185,7 +185,7 @@ def field_recipe():
 
 def scene3():
     """Groups of the configuration of scene 3."""
-    return _names(compose(CHOICE))
+    return _names(compose(Alignment.choice))
 
 
 def keys():

@@ -23,7 +23,7 @@ from psfdae_paper.alignment.telescope import (
     fit_quadratic,
     grid_states,
 )
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import clear_caches, config_dir, load
 from workflow_runs import PATH, snakemake
 
@@ -97,7 +97,7 @@ def noise():
 @pytest.fixture(scope="session")
 def scene3():
     """Configuration of scene 3, as the workflow uses it."""
-    return load(CHOICE)
+    return load(Alignment.choice)
 
 
 @pytest.fixture(scope="session")

@@ -8,12 +8,12 @@ import pytest
 
 from command_line import psfdae
 from psfdae.files import ProductError, read_product
-from psfdae_paper.configuration.aligners import ALIGNERS, LEARNED
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.aligners import ALIGNERS, aligners_of, trained_networks
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
-from psfdae_paper.tracking import WEIGHTS, runs_of_alignment
+from psfdae_paper.tracking import runs_of_alignment
 
 pytestmark = pytest.mark.workflow
 
@@ -101,7 +101,7 @@ def test_key_figures(results):
 
 def test_same_configuration_gives_the_same_bytes(results, tmp_path):
     for name, override in (("again", "optics.threads=1"), ("other", "seed=1")):
-        words = (*CHOICE, "preset=smoke", override)
+        words = (*Alignment.choice, "preset=smoke", override)
         config = load_stage(states.stage.settings.reads, words)
         states(config, "uniform", tmp_path / f"{name}.h5")
     first, repeated, with_other_seed = (
@@ -146,7 +146,7 @@ def test_tables_hold_every_method(results):
     for (kind, level), rows in errors.groupby(["test_set", "noise_level"]):
         assert (rows.groupby("method").size() == 8).all()
         noisy = everyone if kind == "uniform" else everyone - with_free_flux
-        clean = {"constant", *(method.name for method in LEARNED)}
+        clean = {"constant", *(method.name for method in aligners_of("estimates"))}
         assert set(rows.method) == (noisy if level else clean)
     assert set(errors.noise_level) == {0, 0.002, 0.005}
 
@@ -170,7 +170,7 @@ def test_twin_is_closer_in_focus(results):
 
 def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
     runs = {run.kind: run for run in runs_of_alignment(results)}
-    assert set(runs) == set(WEIGHTS)
+    assert set(runs) == {"dae", *trained_networks()}
     for kind, run in runs.items():
         history = pd.read_csv(results / "alignment" / kind / "history.csv")
         curve = "train_mse" if kind == "dae" else "loss"

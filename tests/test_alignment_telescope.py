@@ -23,7 +23,7 @@ from psfdae_paper.alignment.telescope import (
     uniform_states,
     verify,
 )
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load
 
 ARCSEC = np.pi / 180 / 3600
@@ -118,7 +118,7 @@ def test_state_outside_the_range_is_refused(tracer, state, message):
 
 
 def test_vignetted_field_is_refused():
-    config = load([*CHOICE, "alignment.field_radius_deg=0.7"])
+    config = load([*Alignment.choice, "alignment.field_radius_deg=0.7"])
     message = r"state 0, field \(0\.7, 0\)°: \d+ of 132 rays are vignetted; 8 of 9 fields are"
     with pytest.raises(RayTracingError, match=message):
         StateTracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
@@ -136,7 +136,7 @@ def test_vignetted_field_is_refused():
 )
 def test_wrong_configuration_is_named(override, message):
     with pytest.raises(ConfigError, match=message):
-        load([*CHOICE, override])
+        load([*Alignment.choice, override])
 
 
 def test_nine_fields_are_the_centre_and_a_circle():

@@ -12,7 +12,7 @@ from command_line import psfdae, refused
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.cli import stage
 from psfdae.files import Column, ProductError, write_product
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.stages.alignment_results import products_of_one_test
 
@@ -161,7 +161,7 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
 
 def tree_of(name, *overrides):
     reads = stage(f"alignment {name}").stage.settings.reads
-    return load_stage(reads, (*CHOICE, "preset=smoke", *overrides)).model_dump()
+    return load_stage(reads, (*Alignment.choice, "preset=smoke", *overrides)).model_dump()
 
 
 def write(path, kind, config, **arrays):

@@ -15,12 +15,11 @@ from psfdae.networks.settings import DaeSettings, Train
 from psfdae.networks.training import fingerprint
 from psfdae.settings import ConfigError, as_overrides, deciding
 from psfdae_paper.configuration import compose
-from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION
 from workflow_runs import captured
 
-DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {SCENE3})
+DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {"alignment"})
 
 
 def settings_of(dataset):

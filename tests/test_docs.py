@@ -13,7 +13,7 @@ import yaml
 
 import psfdae
 from docs_pages import ROOT, pages, read
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose, dataset_names
 from workflow_runs import captured
 
@@ -80,7 +80,7 @@ def leaves(tree, name=""):
 
 def test_every_key_that_a_file_of_the_configuration_sets_is_documented():
     page = read("config/README.md")
-    trees = [compose(CHOICE), *(compose([f"dataset={name}"]) for name in dataset_names())]
+    trees = [compose(Alignment.choice), *(compose([f"dataset={name}"]) for name in dataset_names())]
     # A user names lenses.
     keys = {re.sub(r"\.lenses\.\w+", ".lenses", key) for tree in trees for key in leaves(tree)}
     assert len(keys) > 150

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from psfdae.files import ProductError
-from psfdae.method import TrainingSet
+from psfdae.method import Method, TrainingSet
+from psfdae.methods import all_methods
 from psfdae.methods.dae import Dae as Fitted
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.metrics import mse
@@ -424,3 +425,12 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
     path.unlink()
     with pytest.raises(ProductError, match="no such file"):
         load_weights(path)
+
+
+def test_methods_have_the_functions_of_their_capabilities_and_no_others():
+    field = ("measure", "psf_at", "order", "is_out_of_range", "draw_stars", "fitted_flux_error")
+    functions = {**dict.fromkeys(field, "knows_field"), "flux": "finds_flux"}
+    for kind in all_methods():
+        for function, capability in functions.items():
+            is_own = getattr(kind, function) is not getattr(Method, function)
+            assert is_own == getattr(kind, capability), (kind.name, function)

@@ -32,7 +32,7 @@ def results(tmp_path):
     for job, seconds, memory in (
         ("benchmarks/train/dataset3/random-template", 12.5, "812.5"),
         ("benchmarks/runtime/all", 0.4, "-"),
-        (f"{record.ON_REQUEST}/stability/stability", 100.0, "1"),
+        ("benchmarks_on_request/stability/stability", 100.0, "1"),
     ):
         written(folder / f"{job}.tsv", f"{header}{seconds}\t0:00:12\t{memory}\n")
         log = f"said\n0m0.002s 0m0.001s\n0m{seconds:.3f}s 1m0.250s\n"
@@ -53,8 +53,8 @@ def plan(results, **status):
 def history(tmp_path, monkeypatch):
     """Git in the folder of the test, as if the package lay there; commits what is in it."""
     monkeypatch.setattr(source, "SOURCES", tmp_path / "src")
-    # It walks through the whole environment.
-    monkeypatch.setattr(record, "_installation", dict)
+    # The size of the whole environment takes long to measure; there is none here.
+    monkeypatch.setattr(record.sys, "prefix", str(tmp_path))
     written(tmp_path / "src/psfdae/a.py", "")
     for name in ("AUTHOR_NAME", "AUTHOR_EMAIL", "COMMITTER_NAME", "COMMITTER_EMAIL"):
         monkeypatch.setenv(f"GIT_{name}", "nobody")

@@ -10,7 +10,7 @@ from scipy.special import j0
 
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.optics.seeing import NEGLIGIBLE_WING, BlurredPropagator, Profile
+from psfdae.optics.seeing import BlurredPropagator, Profile
 from psfdae.optics.wavefronts import zernike_images
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
@@ -45,7 +45,7 @@ def brightness(profile, r):
 def test_transfer_function_is_the_profile_s_transform(profile):
     assert brightness(profile, 2.0) == pytest.approx(0.5 * brightness(profile, 0.0))
     wing = brightness(profile, profile.reach) / brightness(profile, 0.0)
-    assert wing == pytest.approx(NEGLIGIBLE_WING, rel=1e-6)
+    assert wing == pytest.approx(Profile.negligible_wing, rel=1e-6)
 
     def transform(f):
         def ring(r):
@@ -120,7 +120,7 @@ def test_repeated_wings_do_not_reach_the_stamps():
     )
     fields, offsets = np.array([0, 4]), np.zeros((2, 2))
     stamps, expected = (p.stamps(16, offsets, fields) for p in (propagation, longer))
-    assert np.abs(stamps - expected).max() < 3 * NEGLIGIBLE_WING * stamps.max()
+    assert np.abs(stamps - expected).max() < 3 * Profile.negligible_wing * stamps.max()
 
 
 def test_framed_stars_are_wider_and_as_bright():

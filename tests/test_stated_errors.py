@@ -11,7 +11,7 @@ import psfdae
 from command_line import psfdae as command
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
-from psfdae.methods.field_search import excess_scatter
+from psfdae.methods.field_errors import excess_scatter
 from psfdae.model.calibration import with_model_errors
 from psfdae.model.crowded import star_flags
 from psfdae.model.fitting import described, fitted_to

@@ -15,7 +15,7 @@ from psfdae.files import Column, write_product
 from psfdae.methods import groups_of
 from psfdae.reading import read_json
 from psfdae.splits import random_split
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.sweep import point_groups
 from psfdae_paper.stages import sweep as stage
@@ -159,7 +159,7 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    settings = load_stage(point_groups("noise_trained"), (*CHOICE, *overrides))
+    settings = load_stage(point_groups("noise_trained"), (*Alignment.choice, *overrides))
     stage.point(settings, "noise_trained", {}, {}, task)
     metrics = read_json(folder / "result.json")["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):

@@ -18,7 +18,7 @@ from psfdae.settings import ConfigError
 from psfdae.telescope.field import static_zernikes
 from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae_paper.alignment.telescope import StateTracer
-from psfdae_paper.configuration.alignment import CHOICE as SCENE3
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars
@@ -98,7 +98,7 @@ def traced():
 
 
 def test_ray_trace_is_that_of_scene_3(traced):
-    alignment = load(SCENE3)
+    alignment = load(Alignment.choice)
     tracer = StateTracer(alignment.telescope, alignment.prescription, alignment.alignment)
     noll, zernikes = static_zernikes(traced.telescope, angles_of(traced.grid))
     traced_zernikes = -tracer(np.zeros((1, 4)))[0]
@@ -111,7 +111,7 @@ def test_ray_trace_is_that_of_scene_3(traced):
 
 def test_ray_traced_stamps_are_those_of_scene_3(traced):
     """In pixels, to which the sign of every term and both axes count."""
-    alignment = load(SCENE3)
+    alignment = load(Alignment.choice)
     source = template_wavefronts(traced)
     leaning = source.coefficients[[0, 4, 8]]
     leaning[:, 3:5] += [0.2, -0.1]  # the aligned telescope has too little coma to tell its sign

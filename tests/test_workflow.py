@@ -16,7 +16,7 @@ from docs_pages import read
 from psfdae.methods import method
 from psfdae.model.bundle import read_bundle
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
-from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.configuration.aligners import aligners_of
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.evaluation.comparison import seed_scatter
 from workflow_runs import captured, command, copy_of_sources, environment, planned, snakemake
@@ -101,7 +101,10 @@ def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path
     assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == 3
     words = " ".join(re.sub("<[^>]+>", "", first).split())
     config = load(["dataset=dataset7", "preset=smoke"])
-    for label in (*(method(name).look.label for name in config.methods), ESTIMATORS[0].look.label):
+    for label in (
+        *(method(name).look.label for name in config.methods),
+        aligners_of("estimates")[0].look.label,
+    ):
         assert label in words
 
 

@@ -421,7 +421,7 @@ class Method:
         """
         raise NotImplementedError(f"{self.name}: draws no stars")
 
-    def fitted_flux_error(self) -> tuple[float, tuple[float, ...]]:
+    def fitted_flux_error(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
         raise NotImplementedError(f"{self.name}: knows no field")
 
@@ -429,7 +429,8 @@ class Method:
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
-        columns = {n: Column(getattr(self, n), *facts) for n, facts in self.stored().items()}
+        arrays, facts = self.stored_arrays(), self.stored()
+        columns = {name: Column(array, *facts[name]) for name, array in arrays.items()}
         write_product(place, self.name, columns, described)
 
     @classmethod
@@ -459,6 +460,10 @@ class Method:
         """Return unit and meaning of each array of a fit; none if the method leaves no file."""
         return cls.storage.arrays if cls.storage else {}
 
+    def stored_arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of a fit by their names in files: those of its attributes."""
+        return {name: getattr(self, name) for name in self.stored()}
+
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:
         """Return the resolved configuration of a fit."""
@@ -476,7 +481,7 @@ class Method:
 
         `noise` is the least RMS per pixel, over the flux, that they are for.
         """
-        return {name: np.asarray(getattr(self, name)) for name in self.stored()}, {}
+        return {name: np.asarray(array) for name, array in self.stored_arrays().items()}, {}
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:

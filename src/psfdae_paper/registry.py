@@ -15,13 +15,10 @@ from psfdae.model.bundle import SUFFIX, Bundle, write_bundle
 from psfdae.model.packing import uncalibrated
 from psfdae.model.star_sets import read_stars
 from psfdae_paper.configuration.compose import part
-from psfdae_paper.tracking import MODEL, TrackedRun
+from psfdae_paper.tracking import TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-
-TEST_MSE = "test_mse"
-"""Tag of a version, and metric of its run: the mean over all noise levels."""
 
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRun) -> str | None:
@@ -44,9 +41,9 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     """
     from mlflow.entities import LoggedModelOutput
 
-    files = {name: path for name, path in run.files.items() if name.startswith(MODEL)}
-    if not files:
+    if not run.model_files:
         return None
+    # Pending until its files are there (READY, below).
     name = registered_name(run)
     logged = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
     model_id: str = logged.model_id
@@ -54,7 +51,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     # Its files, with a bundle for all that can be put into one.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        link(files, folder, MODEL)
+        link(run.model_files, folder)
         if run.fit is not None:
             write_bundle(bundle_of(run), folder / f"{name}{SUFFIX}")
         client.log_model_artifacts(model_id, temporary)
@@ -62,11 +59,14 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     # The model becomes a version of the models of its dataset and method.
     if run.fit is not None:
         if not client.search_registered_models(f"name = '{name}'"):
+            # MLflow lists it beside the name.
             description = f"PSFs of stamps of {run.dataset}, restored by {run.kind}."
             client.create_registered_model(name, description=description)
         tags = {"split": run.split, "reference": run.reference}
-        if TEST_MSE in run.metrics:
-            tags[TEST_MSE] = f"{run.metrics[TEST_MSE]:.6g}"
+        # The mean over all noise levels, by which `choose_best` compares versions.
+        if "test_mse" in run.metrics:
+            tags["test_mse"] = f"{run.metrics['test_mse']:.6g}"
+        # A version points to the files of the model; they are not copied.
         location = client.get_logged_model(model_id).artifact_location
         client.create_model_version(name, location, run_id, tags, model_id=model_id)
     return model_id
@@ -86,6 +86,7 @@ def bundle_of(run: TrackedRun) -> Bundle:
     # Groups of settings that tell which stars a fit was trained on, and with which noise.
     groups = ("seed", "noise", "parts")
     config = part(groups, {group: described[group] for group in groups})
+    # The bundle is named like the registered model.
     fitted, name = method_class.load(place, run.reference), registered_name(run)
     return uncalibrated(fitted, product, run.reference, config, described, name, "not stated")[0]
 
@@ -95,8 +96,8 @@ def registered_name(run: TrackedRun) -> str:
     return f"{run.dataset}-{run.kind}"
 
 
-def link(files: Mapping[str, Path], folder: Path, prefix: str = "") -> None:
-    """Make links to files in a folder, by their names without a prefix.
+def link(files: Mapping[str, Path], folder: Path) -> None:
+    """Make links to files in a folder, by their names.
 
     MLflow copies a folder; links save a copy of large files.
 
@@ -105,10 +106,9 @@ def link(files: Mapping[str, Path], folder: Path, prefix: str = "") -> None:
     files : mapping of str to Path
         Files by names, which may have folders.
     folder : Path
-    prefix : str
     """
     for name, path in files.items():
-        target = folder / name.removeprefix(prefix)
+        target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.symlink_to(path.resolve())
 
@@ -122,13 +122,13 @@ def choose_best(client: MlflowClient, name: str) -> None:
     candidates = [
         version
         for version in client.search_model_versions(f"name = '{name}'")
-        if TEST_MSE in version.tags
+        if "test_mse" in version.tags
         and client.get_run(str(version.run_id)).data.tags.get("superseded") != "true"
     ]
     # Truths first: any version that restores realisations is before those that restore templates.
     if candidates:
         winner = min(
-            candidates, key=lambda v: (v.tags["reference"] == "template", float(v.tags[TEST_MSE]))
+            candidates, key=lambda v: (v.tags["reference"] == "template", float(v.tags["test_mse"]))
         )
         if "best" not in winner.aliases:
             client.set_registered_model_alias(name, "best", winner.version)

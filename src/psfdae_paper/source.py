@@ -44,12 +44,13 @@ def source_hash(*names: str) -> str:
     ValueError
         If there is no such command, module or file.
     """
+    # A command stands for the module of its function.
     commands = command_modules()
     queue = [commands[name][0] if name in commands else name for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)
     for name in queue:
-        digests[name], imported = _module(name)
+        digests[name], imported = module_digest(name)
         queue += [module for module in imported if module not in digests]
         digests |= {module: digests.get(module) for module in imported}
     lines = "\n".join(f"{name} {digest}" for name, digest in sorted(digests.items()))
@@ -57,7 +58,7 @@ def source_hash(*names: str) -> str:
 
 
 @cache
-def _module(name: str) -> tuple[str, list[str]]:
+def module_digest(name: str) -> tuple[str, list[str]]:
     """Return the digest of a module, or of a program's file, and the modules that it imports.
 
     Raises
@@ -68,26 +69,35 @@ def _module(name: str) -> tuple[str, list[str]]:
     path = SOURCES.parent / name if name.endswith(".py") else _path(name)
     if path is None or not path.is_file():
         raise ValueError(f"{name}: no such command, module or file")
-    # The syntax tree has neither comments nor formatting.
+    # The syntax tree has neither comments nor formatting. Statements that are only a constant, such
+    # as docstrings, are taken out.
     tree = ast.parse(path.read_bytes())
-    parts = [ast.dump(_without_docstrings(tree))]
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            is_constant = [isinstance(getattr(s, "value", None), ast.Constant) for s in body]
+            node.body = [  # type: ignore[attr-defined]
+                s for s, c in zip(body, is_constant, strict=True) if not (c and type(s) is ast.Expr)
+            ]
+    parts = [ast.dump(tree)]
     # A package may have tables, which its functions read.
     if path.name == "__init__.py":
         data = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix != ".py")
         parts += [f"{p.name} {hashlib.sha256(p.read_bytes()).hexdigest()}" for p in data]
     program_folder = path.parent if name.endswith(".py") else None
+    # Code and tables together.
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    return digest, [*_imported(tree, program_folder)]
+    return digest, [*imported_modules(tree, program_folder)]
 
 
 def _path(module: str) -> Path | None:
     """Return the file of a module of the packages; None for modules of other packages."""
     path = SOURCES.joinpath(*module.split("."))
+    # A module, or a package.
     files = (path.with_suffix(".py"), path / "__init__.py")
     return next((file for file in files if file.is_file()), None)
 
 
-def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
+def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
     """Yield the modules of the packages that a module imports, and files beside a program."""
     # Nodes below annotations of arguments and variables, return types and decorators: names that
     # only these use decide no result.
@@ -113,18 +123,6 @@ def _imported(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
             file = program_folder and program_folder / f"{modules[-1]}.py"
             if file and file.is_file():
                 yield str(file.relative_to(SOURCES.parent))
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    """Remove all statements that are only a constant, such as docstrings, from a syntax tree."""
-    for node in ast.walk(tree):
-        if isinstance(body := getattr(node, "body", None), list):
-            node.body = [  # type: ignore[attr-defined]
-                s
-                for s in body
-                if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
-            ]
-    return tree
 
 
 def git_commit() -> str:

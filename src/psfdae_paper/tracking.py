@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
@@ -25,8 +25,7 @@ from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.settings import leaves
-from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT, TRAINED
-from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_networks, trained_networks
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered
@@ -34,15 +33,6 @@ from psfdae_paper.sweeps.points import hash_of
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
-
-WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
-"""Files of the networks of scene 3, in their folders."""
-
-AVERAGED = ("mse", "ssim")
-"""Metrics of which a run has the mean over the noise levels, too."""
-
-MODEL = "model/"
-"""Prefix of the names of files that are the model of a run."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +49,7 @@ class TrackedRun:
     name, experiment : str
         Name of the run, and of MLflow's experiment that holds it.
     files : mapping of str to Path
-        Files by their names within the run.
+        Files by their names within the run; those of its model begin with `model_prefix`.
     config : mapping
         Configuration of the training, with that of its stars.
     last_file : Path or None
@@ -80,12 +70,17 @@ class TrackedRun:
         Product with the training data.
     fit : tuple of a type of Method and a Path, or None
         Fit that a model bundle can hold, and its folder or file.
+    averaged : tuple of str
+        Metrics of which a run has the mean over the noise levels, too.
 
     Raises
     ------
     ProductError
         If a file is missing.
     """
+
+    model_prefix: ClassVar = "model/"
+    averaged: ClassVar = ("mse", "ssim")
 
     kind: str
     dataset: str
@@ -111,6 +106,15 @@ class TrackedRun:
         for path in (*self.files.values(), self.last_file):
             if path is not None and not path.is_file():
                 raise ProductError(f"{path}: no such file")
+
+    @property
+    def model_files(self) -> dict[str, Path]:
+        """Files of the model by their names without the prefix; none for a sweep as a whole."""
+        return {
+            name.removeprefix(self.model_prefix): path
+            for name, path in self.files.items()
+            if name.startswith(self.model_prefix)
+        }
 
     @cached_property
     def config_hash(self) -> str:
@@ -212,7 +216,7 @@ def _run_of_fit(
     for row in rows.to_dict("records"):
         metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
         metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
-    for metric in AVERAGED:
+    for metric in TrackedRun.averaged:
         if metric in {*rows.metric}:
             metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
     # Figures of the dataset, without those whose name has another split or reference.
@@ -247,7 +251,8 @@ def _run_of_fit(
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """List the files of a fit by their names within the run; `model/` is what the method loads."""
-    model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
+    model = {f"{TrackedRun.model_prefix}{path.name}": path for path in fits.own_files(kind, place)}
+    # Course of the training and the like, which `load` does not need.
     diagnostics = fits.storage_of(kind).diagnostics
     return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
 
@@ -269,7 +274,8 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
     figures = sorted((results / "figures/alignment").glob("*.png"))
     shared = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
     runs = []
-    for kind, weights in WEIGHTS.items():
+    for kind in ("dae", *trained_networks()):
+        weights = DAE_WEIGHTS if kind == "dae" else Aligner.weights_file
         folder = results / "alignment" / kind
         # As for datasets, the number of the start that succeeded is no setting.
         config = read_yaml(folder / CONFIG)
@@ -307,7 +313,7 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
 
 def _network_files(folder: Path, weights: str) -> dict[str, Path]:
     """List the files of a network of scene 3 by their names within the run."""
-    model = {f"{MODEL}{name}": folder / name for name in (weights, CONFIG)}
+    model = {f"{TrackedRun.model_prefix}{name}": folder / name for name in (weights, CONFIG)}
     return model | {HISTORY: folder / HISTORY}
 
 
@@ -354,13 +360,14 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
     from psfdae_paper.sweeps.measured import fit_in, read_cost
 
+    # A point has a folder with all its files.
     folder = results / "sweeps" / name / "points" / point
     result = read_json(folder / "result.json")
     model, config = result["model"], result["config"]
     # Files of the model, and the product with its training data if the workflow made it.
     data = None
-    if model in SWEPT:
-        model_files = _network_files(folder, NETWORK_WEIGHTS)
+    if model in swept_networks():
+        model_files = _network_files(folder, Aligner.weights_file)
         data = results / f"data/alignment/{ALIGNERS[model].states}.h5"
     else:
         model_files = _model_files(method(model), fit_in(method(model), folder))
@@ -402,6 +409,7 @@ def settings_of(run: TrackedRun, preset: str) -> dict[str, str]:
     defaults = {}
     # Stars that are none of the datasets, such as those of a user, have no defaults.
     if run.dataset in dataset_names() and (config_dir() / f"preset/{preset}.yaml").is_file():
+        # Settings of the dataset as the preset alone has them.
         defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
     differing = {
         key: value

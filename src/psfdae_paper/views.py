@@ -12,13 +12,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from psfdae_paper.tracking import AVERAGED, MODEL, TrackedRun
+from psfdae_paper.tracking import TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-
-VIEW = "mlflow.sharedViewState."
-"""Prefix of the names of tags that are views."""
 
 
 def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -> None:
@@ -32,12 +29,15 @@ def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -
     records : sequence of TrackedRun
         Runs that were imported now; views of other datasets stay.
     """
-    description = "mlflow.note.content"  # MLflow's tag
+    # MLflow's tags: the description of an experiment, and one for each view.
+    description, view = "mlflow.note.content", "mlflow.sharedViewState."
     tags = dict(client.get_experiment(experiment).tags)
-    new_tags = {f"{VIEW}{name}": view for name, view in views(records).items()}
+    names = {tag.removeprefix(view) for tag in tags if tag.startswith(view)}
+    new_views = views(records)
+    new_tags = {f"{view}{name}": state for name, state in new_views.items()}
     # A description that is another one than ours is a user's, and stays.
-    if tags.get(description) in (None, note(experiment, {*tags})):
-        new_tags[description] = note(experiment, {*tags, *new_tags})
+    if tags.get(description) in (None, note(experiment, names)):
+        new_tags[description] = note(experiment, {*names, *new_views})
     for key, value in new_tags.items():
         if tags.get(key) != value:
             client.set_experiment_tag(experiment, key, value)
@@ -46,7 +46,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -
 def views(records: Sequence[TrackedRun]) -> dict[str, str]:
     """Return the views of all runs with a model, and of those of each dataset by its name."""
     # A sweep itself has no model, and its points are in no view of a dataset.
-    with_model = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
+    with_model = [r for r in records if r.model_files]
     by_name = {"all": _view(with_model, "")} if with_model else {}
     for dataset in dict.fromkeys(r.dataset for r in with_model if r.fit and not r.parent):
         of_dataset = [record for record in with_model if record.dataset == dataset]
@@ -54,14 +54,11 @@ def views(records: Sequence[TrackedRun]) -> dict[str, str]:
     return by_name
 
 
-def note(experiment: str, tags: set[str]) -> str:
-    """Return the description of an experiment in Markdown, with a link to each view.
-
-    `tags` are the names of all tags of the experiment.
-    """
+def note(experiment: str, names: set[str]) -> str:
+    """Return the description of an experiment in Markdown, with a link to each of some views."""
     # Addresses of MLflow's pages begin with # and are relative to its server.
     links = []
-    for name in sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW)):
+    for name in sorted(names):
         # The workflow type hides pages that are for language models.
         query = urlencode({"viewStateShareKey": name, "workflowType": "machine_learning"})
         links.append(f"[{name}](#/experiments/{experiment}/runs?{query})")
@@ -74,7 +71,11 @@ def _view(records: Sequence[TrackedRun], condition: str) -> str:
     `condition` limits the runs further, in the language of MLflow's search.
     """
     # Metrics that have the same meaning for every run; without them, the first eight.
-    common = [*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse"]
+    common = [
+        *(f"test_{name}" for name in TrackedRun.averaged),
+        "best_validation_mse",
+        "validation_mse",
+    ]
     metrics = [name for name in common if any(name in r.metrics for r in records)]
     metrics = metrics or list(records[0].metrics)[:8]
     # Axes of a sweep come first: they are what its points differ in.

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.bright_stars import BrightStars
-from psfdae.methods.field_law import MARGIN_PX
+from psfdae.methods.field_residuals import MARGIN_PX
 from psfdae.methods.field_search import fit_field, refit_field
 from psfdae_paper.source import git_commit
 

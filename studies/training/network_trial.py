@@ -21,7 +21,7 @@ import pandas as pd
 from psfdae.cli import main as psfdae
 from psfdae.files import read_product
 from psfdae_paper.configuration.aligners import ALIGNERS
-from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 from psfdae_paper.stages.alignment_methods import denoise, network_predictor, noisy_test_states
@@ -32,7 +32,7 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
     root = Path(results)
     states, dae = root / "data/alignment", root / "alignment/dae"
     dae_option = [f"--dae={dae}"] * ALIGNERS[kind].denoised
-    config = load([*CHOICE, *overrides])
+    config = load([*Alignment.choice, *overrides])
     test = read_product(states / "uniform.h5", "alignment_states", ("states", "stamps"))
     with tempfile.TemporaryDirectory() as folder:
         words = ["alignment", "train-network", "--kind", kind, "--out", folder, *dae_option]

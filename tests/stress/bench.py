@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psfdae.model.flux_model import FluxModel
-from psfdae.model.packing import COMPONENTS, leading
+from psfdae.model.packing import leading
 from psfdae.model.photometry import Photometer
 from psfdae.networks.dae import TrainingSet, image_scale
 from psfdae.noise import NoiseModel
@@ -77,7 +77,7 @@ class Bench:
     @cached_property
     def photometer(self):
         """Photometry of scene 1 with what a bundle holds of the flux model."""
-        return Photometer(leading(self.flux_models["seidel"], COMPONENTS), COMPONENTS)
+        return Photometer(leading(self.flux_models["seidel"], 48), 48)
 
     def training_set(self, count):
         """The first stars of scene 1 against themselves; one in ten validates."""

@@ -2,7 +2,7 @@
 wildcard_constraints:
     states="grid|uniform|train",
     test_set="|".join(ALIGNMENT_SETS),
-    network="|".join(TRAINED),
+    network="|".join(trained_networks()),
     level=r"[0-9.e-]+",
 
 
@@ -152,7 +152,10 @@ rule alignment_bound:
 
 rule alignment_estimate:
     input:
-        **{network: f"{ALIGNMENT}/{network}/network.safetensors" for network in TRAINED},
+        **{
+            network: f"{ALIGNMENT}/{network}/network.safetensors"
+            for network in trained_networks()
+        },
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         dae=rules.alignment_dae.output.weights,
     output:

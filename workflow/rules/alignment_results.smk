@@ -65,7 +65,9 @@ rule alignment_time:
             *expand(rules.alignment_estimate.output.times, test_set=ALIGNMENT_SETS),
             *fits_of(*ALIGNMENT_SETS, what="times"),
         ],
-        histories=expand(f"{ALIGNMENT}/{{name}}/history.csv", name=["dae", *TRAINED]),
+        histories=expand(
+            f"{ALIGNMENT}/{{name}}/history.csv", name=["dae", *trained_networks()]
+        ),
     output:
         f"{RESULTS}/tables/alignment_time.csv",
     log:

@@ -13,8 +13,6 @@ from psfdae import fits
 from psfdae.cli import stage
 from psfdae.fits import suffix_of
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration.aligners import ESTIMATORS
-from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
@@ -79,6 +77,8 @@ def program_code(name, stages):
 
 # Stars of an image are not simulated: own_stars.smk.
 OWN_STARS = "from_stars"
+# Scene 3 has states of misalignment in the place of stars: alignment.smk.
+SCENE3 = "alignment"
 ALL_DATASETS = [name for name in dataset_names() if name not in (OWN_STARS, SCENE3)]
 # Data of telescopes that bring their own aberrations; they bear the dataset's name.
 OWN_TELESCOPES = f"{RESULTS}/data/telescope"

@@ -1,8 +1,8 @@
 from snakemake.exceptions import WorkflowError
 
-from psfdae_paper.configuration.aligners import SWEPT
+from psfdae_paper.configuration.aligners import swept_networks
 from psfdae_paper.configuration.sweep import sweep_names
-from psfdae_paper.stages.sweep import ADAPTIVE_MODULE, module_of
+from psfdae_paper.stages.sweep import training_class
 from psfdae_paper.sweeps.points import plan_sweep
 
 SWEEPS = f"{RESULTS}/sweeps"
@@ -52,9 +52,9 @@ def sweep_threads(w):
 def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
     sweep = sweep_plan(name).sweep
-    search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
-    own = [] if sweep.model in SWEPT else [method(sweep.model).__module__]
-    return source_hash("sweep point", module_of(sweep.model), *own, *search)
+    search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
+    own = [] if sweep.model in swept_networks() else [method(sweep.model).__module__]
+    return source_hash("sweep point", training_class(sweep.model).partition(":")[0], *own, *search)
 
 
 def sweep_results(w):

@@ -1,4 +1,4 @@
-from psfdae_paper.configuration.aligners import TRAINED, ALIGNERS
+from psfdae_paper.configuration.aligners import ALIGNERS, trained_networks
 from psfdae.model.bundle import SUFFIX
 
 with one_line():
@@ -149,4 +149,4 @@ def methods_shown():
 
 def aligners_shown():
     """Labels of the methods of scene 3."""
-    return [aligner.look.label for aligner in ESTIMATORS]
+    return [aligner.look.label for aligner in ALIGNERS.values() if aligner.network]

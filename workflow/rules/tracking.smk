@@ -29,7 +29,7 @@ use rule track as track_alignment with:
     input:
         rules.alignment_tables.output.errors,
         rules.alignment_dae.output,
-        expand(rules.alignment_network.output, network=TRAINED),
+        expand(rules.alignment_network.output, network=trained_networks()),
         rules.figure_alignment_predicted.output,
         rules.figure_alignment_errors.output,
         rules.figure_alignment_correlation.output,

@@ -23,15 +23,6 @@ def description(bundle: Bundle) -> str:
 
     Facts stand one in a line; the table of errors has a row for each noise level.
     """
-    facts = _facts(bundle)
-    # Names are padded to the longest one, so that all facts begin in the same column.
-    width = max(len(name) for name in facts)
-    lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
-    return "\n".join([*lines, "", "Errors of the test stars:", _error_table(bundle.info)])
-
-
-def _facts(bundle: Bundle) -> dict[str, str]:
-    """Return the facts about a model by their names, in the order in which they are printed."""
     info = bundle.info
     # Width of a pixel in arcsec, and in units of λ/D where the telescope is known.
     scale = f"{info.pixel_scale_arcsec:g} arcsec{', assumed' if info.scale_assumed else ''}"
@@ -49,7 +40,8 @@ def _facts(bundle: Bundle) -> dict[str, str]:
         method_facts = {"Method": f"{method(info.method).look.label}; {number_count} numbers"}
         method_facts |= estimator(bundle).facts()
     star_kind = {"simulated": "simulated stars", "stars": "stars of an image"}[info.source]
-    return {
+    # All facts by their names, in the order in which they are printed.
+    facts = {
         "Name": info.name,
         "Format": f"{FORMAT_VERSION}, written {info.created} by psfdae {info.psfdae_version}",
         "Licence": info.licence,
@@ -66,6 +58,10 @@ def _facts(bundle: Bundle) -> dict[str, str]:
         **({"Light beyond the stamp": str(bundle.wings)} if bundle.wings else {}),
         "Distance limit": f"{bundle.errors.distance_limit:.3g} in {info.components} components",
     }
+    # Names are padded to the longest one, so that all facts begin in the same column.
+    width = max(len(name) for name in facts)
+    lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
+    return "\n".join([*lines, "", "Errors of the test stars:", _error_table(info)])
 
 
 def _error_table(info: BundleInfo) -> str:

@@ -45,7 +45,7 @@ from psfdae.model.settings import (
     of_config,
     with_keywords,
 )
-from psfdae.model.stars import ALL, Stars
+from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder
 from psfdae.settings import ConfigError, as_overrides
@@ -254,7 +254,7 @@ def model_name(image: tuple[Path, ...], name: str | None) -> str:
     FolderError
         If no file can have such a name.
     """
-    name = name or (ALL if len(image) > 1 else ImageInput(image[0]).name)
+    name = name or ("all" if len(image) > 1 else ImageInput(image[0]).name)
     # Linux allows 255 bytes in the name of a file.
     longest = 255 - len(SUFFIX)
     if "/" in name or len(name.encode()) > longest:
@@ -386,7 +386,7 @@ def write_model(
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
-        write_columns(files.path / "found.csv", report.found.columns, digits=6)
+        write_columns(files.path / "found.csv", report.photometry.columns, digits=6)
         write_bytes(files.path / "report.png", report.strip_png)
         if page is not None:
             print(f"writing {page}")

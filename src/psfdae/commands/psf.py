@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.model import exchange
-from psfdae.model.exchange import PSFEX, STDPSF, load_field
+from psfdae.model.exchange import load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.options import File
 
@@ -37,17 +37,15 @@ def psf(
     """
     # The ending of the name decides the format: PSFEx's, STDPSF, or photutils' cube.
     check_targets((model,), out, overwrite=overwrite)
-    for_psfex, for_stdpsf = out.name.endswith(PSFEX), out.name.endswith(STDPSF)
+    for_psfex, for_stdpsf = out.name.endswith(".psf"), out.name.endswith(".stdpsf.fits")
     if for_psfex and (at or grid):
         raise PredictionError(f"{out}: has the whole field; neither --at nor --grid")
     if not for_psfex and bool(at) == (grid is not None):
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     # Readers of PSFEx's files interpolate with Lanczos' kernel, which errs less the finer they are.
-    oversampling = oversampling or (exchange.PSFEX_SAMPLES if for_psfex else exchange.GRID_SAMPLES)
-    if for_stdpsf and (at or oversampling != exchange.GRID_SAMPLES):
-        raise PredictionError(
-            f"{out}: STDPSF has a --grid, and {exchange.GRID_SAMPLES} values per pixel and axis"
-        )
+    oversampling = oversampling or (8 if for_psfex else 4)
+    if for_stdpsf and (at or oversampling != 4):
+        raise PredictionError(f"{out}: STDPSF has a --grid, and 4 values per pixel and axis")
     loaded = load_field(model)
     if for_psfex:
         # The polynomial of PSFEx's format does not hold the model exactly: print the error.

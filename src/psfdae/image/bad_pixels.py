@@ -69,36 +69,43 @@ def find_bad_pixels(
         If so many pixels have the least value that sky and noise are not measurable.
     """
     notes: list[str] = []
-    mask = masked.copy()
-    if mask.any():
-        notes.append(f"{np.count_nonzero(mask)} pixels that are masked or have no value")
+    mask = np.zeros(masked.shape, dtype=bool)
+
+    def leave_out(area: np.ndarray, words: str) -> None:
+        """Add pixels (h, w) to the mask, with a note of their number if there are any."""
+        np.logical_or(mask, area, out=mask)
+        if area.any():
+            notes.append(f"{np.count_nonzero(area)} {words}")
+
+    leave_out(masked, "pixels that are masked or have no value")
     # Areas of one value, then the columns and rows that the header calls overscan.
     for value, area in blank_areas(image, mask, saturate):
-        mask |= area
-        notes.append(f"{np.count_nonzero(area)} blank pixels (value {value:g})")
+        leave_out(area, f"blank pixels (value {value:g})")
     for key, area in overscan(headers, image, mask):
-        mask |= area
-        notes.append(f"{np.count_nonzero(area)} pixels outside the exposed area by {key}")
+        leave_out(area, f"pixels outside the exposed area by {key}")
     refuse_clipped_sky(image, mask)
     # Dead pixels first: beside these, others would look like cosmic rays.
     noise = pixel_noise(image, mask)
-    dead = dead_pixels(image, mask, noise)
-    if dead.any():
-        mask |= dead
-        notes.append(f"{np.count_nonzero(dead)} dead pixels")
+    leave_out(dead_pixels(image, mask, noise), "dead pixels")
     cosmic = cosmic_rays(image, mask, noise, saturate)
-    if cosmic.any():
-        notes.append(f"{np.count_nonzero(cosmic)} pixels of cosmic rays and hot pixels")
-    return BadPixels(mask | cosmic, cosmic, tuple(notes))
+    leave_out(cosmic, "pixels of cosmic rays and hot pixels")
+    return BadPixels(mask, cosmic, tuple(notes))
 
 
 def _in_bands(find: Callable[..., np.ndarray], *maps: np.ndarray) -> np.ndarray:
     """Return the mask (h, w) that a function finds in bands of 256 rows of maps (h, w).
 
     The function sees 16 rows more on each side. Bands bound the memory for a large image.
+
+    Parameters
+    ----------
+    find : callable
+        Takes some rows of each map, and returns a mask of these rows.
+    *maps : ndarray, shape (h, w)
     """
     mask = np.zeros(maps[0].shape, dtype=bool)
     for top in range(0, len(mask), 256):
+        # Rows beyond the edges of the band, so that filters of a few pixels see the image there.
         start, end = max(top - 16, 0), min(top + 256, len(mask))
         mask[top:end] = find(*(band[start : end + 16] for band in maps))[top - start : end - start]
     return mask
@@ -135,6 +142,7 @@ def blank_areas(
     solid = np.zeros(values.shape, dtype=bool)
     if min(values.shape) >= 8:
         solid = _in_bands(constant_squares, values) & np.isfinite(values)
+    # Whole columns and whole rows of one value; NaN is equal to nothing.
     solid |= (values == values[:1]).all(axis=0)
     solid |= (values == values[:, :1]).all(axis=1, keepdims=True)
     if not solid.any():
@@ -154,6 +162,7 @@ def blank_areas(
             continue
         # Above the sky, only what touches the edge of the image: a core of a star does not.
         if value > float(np.median(outside_values)):
+            # Parts of the area that touch one of the four edges are kept.
             label, _ = ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
@@ -173,6 +182,13 @@ def constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     """Return the pixels (h, w) of squares that have one value; noise fills none of 8 px with one.
 
     NaN differs from itself.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, w)
+        Pixels; NaN where they do not count.
+    side : int
+        Side of the squares in px.
     """
     from scipy import ndimage
 
@@ -255,6 +271,7 @@ def overscan(
         section = next((section_form.search(str(h[key])) for h in headers if key in h), None)
         if section is None:
             continue
+        # A section that is not within the image is that of another frame.
         x0, x1, y0, y1 = map(int, section.groups())
         if not (1 <= x0 <= x1 <= image.shape[1] and 1 <= y0 <= y1 <= image.shape[0]):
             continue
@@ -292,6 +309,11 @@ def dead_pixels(
         Pixels that do not count.
     least_sigma : float
         Least depth of a dead pixel, in σ.
+
+    Returns
+    -------
+    ndarray of bool, shape (h, w)
+        All False for an image of less than 32 px, in which a pixel has no surroundings.
     """
     from scipy import ndimage
 
@@ -341,6 +363,7 @@ def cosmic_rays(
     """
     if min(image.shape) < 32:
         return np.zeros(image.shape, dtype=bool)
+    # How sharp the stars of this image are decides how sharp a cosmic ray must be.
     sharpness = sharpness_of_sources(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
         return np.zeros(image.shape, dtype=bool)
@@ -360,6 +383,19 @@ def cosmic_rays_of_band(
     """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio.
 
     They are `least_sigma` times as high as the noise, or half of it beside a higher one.
+
+    Parameters
+    ----------
+    band, noise : ndarray, shape (r, w)
+        Rows of the image, and σ of their pixels.
+    bad : ndarray of bool, shape (r, w)
+        Pixels that do not count.
+    saturate : float or None
+        Counts from which a pixel is saturated.
+    ratio : float
+        Least L⁺ over fine structure F of a cosmic ray.
+    least_sigma : float
+        Least L⁺ of a cosmic ray, in σ.
     """
     from scipy import ndimage
 
@@ -375,6 +411,8 @@ def cosmic_rays_of_band(
     cosmic = np.zeros(band.shape, dtype=bool)
     # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
     for _ in range(8):
+        # L⁺ of all pixels; half of the limit on a cosmic ray picks out those that are worth a
+        # closer look.
         edge = edges(clean)
         row, column = np.nonzero((edge > 0.5 * least_sigma * noise) & ~forbidden & ~cosmic)
         if not row.size:
@@ -404,6 +442,15 @@ def sharpness_of_sources(
 
     It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, 3 to 5 for 1.2 px, and 7 to 15 for
     0.9 px. Sources above 20 are no stars.
+
+    Parameters
+    ----------
+    image, noise : ndarray, shape (h, w)
+        Image, and σ of its pixels.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    saturate : float, optional
+        Counts from which a pixel is saturated; such sources are left out.
     """
     from scipy import ndimage
 
@@ -411,6 +458,7 @@ def sharpness_of_sources(
     ratios = []
     # A band of rows at a time, which bounds the memory.
     for rows in (slice(top, top + 256) for top in range(0, len(image), 256)):
+        # Fill bad pixels first: the Laplacian would see their edges.
         hidden, sigma = bad[rows], noise[rows]
         clean = interpolated(image[rows], hidden)[0]
         edge = edges(clean)
@@ -421,6 +469,8 @@ def sharpness_of_sources(
         row, column = np.nonzero(top)
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         row, column = row[brightest], column[brightest]
+        # Ratio L⁺/F of each; F is at least the noise, so that a flat surrounding does not count as
+        # sharp.
         height, structure = _contrast(clean, edge, row, column)
         ratio = height / np.maximum(structure, sigma[row, column])
         ratios.append(ratio[ratio < 20.0])
@@ -451,6 +501,12 @@ def _contrast(
 
     L⁺ less its median over 5 × 5 pixels is free of smooth sources. F is the median over 3 × 3
     pixels less that over 7 × 7 of these medians.
+
+    Parameters
+    ----------
+    image, edge : ndarray, shape (h, w)
+        Image, and its positive Laplacian (`edges`).
+    row, column : ndarray of int, shape (n,)
     """
     # Windows of 5 × 5 px of L⁺ and of 9 × 9 px of the image, 4096 at a time to bound the memory.
     height, structure = np.empty((2, len(row)))
@@ -460,6 +516,8 @@ def _contrast(
     for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
         at = row[part], column[part]
         height[part] = edge[at] - np.median(fives[at].reshape(-1, 25), axis=1)
+        # Medians over 3 × 3 pixels at the 7 × 7 places about the pixel; the one in the middle is
+        # its own.
         threes = np.lib.stride_tricks.sliding_window_view(nines[at], (3, 3), axis=(1, 2))
         medians = np.median(threes.reshape(-1, 7, 7, 9), axis=3)
         structure[part] = medians[:, 3, 3] - np.median(medians.reshape(-1, 49), axis=1)

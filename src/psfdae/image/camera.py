@@ -18,9 +18,6 @@ from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.sky_level import noise_correlation
 
-BLOCK_PX = 32
-"""Side of the squares in which sky and noise are measured."""
-
 LARGEST_STAMP_PX = 256
 """Side of the largest stamps; planes of a cube that are larger are images."""
 
@@ -91,7 +88,18 @@ def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[
 
 
 def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
-    """Return the first finite number above 0 under one of the keys, in the order of the keys."""
+    """Return the first finite number above 0 under one of the keys, in the order of the keys.
+
+    Parameters
+    ----------
+    image : ImageFile
+    keys : sequence of str
+
+    Returns
+    -------
+    CameraValue
+        With the key as origin; the number is None if no header has one.
+    """
     # Its own header goes before that of the file; a truth value is no number.
     for key in keys:
         for header in image.headers:
@@ -106,7 +114,14 @@ def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
 
 
 def pixel_scale(image: ImageFile) -> CameraValue:
-    """Return arcseconds per pixel by the WCS, or by other cards of the header."""
+    """Return arcseconds per pixel by the WCS, or by other cards of the header.
+
+    Returns
+    -------
+    CameraValue
+        That of the WCS if there is one, else of a key for the scale, else from the width of a
+        pixel and the focal length.
+    """
     from astropy.wcs.utils import proj_plane_pixel_area
 
     if image.wcs is not None:
@@ -150,28 +165,34 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     return gain
 
 
-def sky_sample(image: ImageFile) -> SkySample | None:
+def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
 
     Squares of one value, such as an area without data, do not count.
+
+    Parameters
+    ----------
+    image : ImageFile
+    square_px : int
+        Side of the squares in which sky and noise are measured.
     """
     rows, columns = image.shape
-    # Bands of 32 rows, evenly spread over the image.
-    last_row = max(rows - BLOCK_PX, 0)
-    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // BLOCK_PX))).astype(int))
+    # Bands of rows, evenly spread over the image.
+    last_row = max(rows - square_px, 0)
+    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // square_px))).astype(int))
     levels, noises, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
     deviations: list[np.ndarray] = []
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
         for start in starts:
-            band = pixels[start : start + BLOCK_PX]
+            band = pixels[start : start + square_px]
             band = np.where(np.isfinite(band), band, np.nan)
-            deviation = np.full((BLOCK_PX + 4, columns), np.nan)
+            deviation = np.full((square_px + 4, columns), np.nan)
             deviations.append(deviation)
-            for column in range(0, columns, BLOCK_PX):
-                square = band[:, column : column + BLOCK_PX]
+            for column in range(0, columns, square_px):
+                square = band[:, column : column + square_px]
                 values = square[np.isfinite(square)]
-                if values.size < BLOCK_PX:
+                if values.size < square_px:
                     continue
                 # Stars in a square hardly change its median.
                 highest = max(highest, float(values.max()))
@@ -179,7 +200,7 @@ def sky_sample(image: ImageFile) -> SkySample | None:
                 # σ of a normal distribution is 1.4826 times its median deviation.
                 noise = 1.4826 * float(np.median(np.abs(values - level)))
                 if noise > 0:
-                    deviation[: len(band), column : column + BLOCK_PX] = (square - level) / noise
+                    deviation[: len(band), column : column + square_px] = (square - level) / noise
                     levels.append(level)
                     noises.append(noise)
     if not levels:
@@ -195,11 +216,23 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     Noise gives no five pixels far above the sky exactly the same value; those of saturated stars
     lie together, and those of a value for bad pixels do not. A value that over a hundredth of the
     image has is that of an area without data.
+
+    Parameters
+    ----------
+    image : ImageFile
+    sky : SkySample
+        Sky of the image: the largest value is at least 50 σ above it.
+
+    Returns
+    -------
+    tuple of float and int, or None
+        Value, and number of pixels that have it.
     """
     largest, count, pairs = -np.inf, 0, 0
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
-        for start in range(0, image.shape[0], 8 * BLOCK_PX):
-            band = pixels[start : start + 8 * BLOCK_PX]
+        # 256 rows at a time, which bounds the memory.
+        for start in range(0, image.shape[0], 256):
+            band = pixels[start : start + 256]
             # The largest value so far; a larger one starts the count anew.
             top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
             if top > largest:
@@ -268,6 +301,18 @@ def checked_saturation(
     """Return the saturation that fits the pixels, and sentences on another one.
 
     It is the largest value, if the image was cut off there, below the level of the header.
+
+    Parameters
+    ----------
+    image : ImageFile
+    sky : SkySample
+    saturation : CameraValue
+        Counts from which a pixel is saturated, by the header or as stated.
+
+    Raises
+    ------
+    ObservationError
+        If a saturation that is stated is below the sky.
     """
     unit, (level, origin) = image.unit or "counts", saturation
     remarks = []
@@ -295,9 +340,17 @@ def gain_contradiction(
     """Return how gain and read noise contradict the pixels; None if they do not.
 
     Photons of the sky alone scatter by √(sky / gain), and the electronics by read noise / gain.
+
+    Parameters
+    ----------
+    image : ImageFile
+    sky : SkySample
+    gain, read_noise : CameraValue
+        Electrons per count, and electrons.
     """
     if not gain.value:
         return None
+    # σ of Poisson noise: N = level · gain electrons scatter by √N, which are √N / gain counts.
     photons = np.sqrt(max(sky.level, 0.0) / gain.value)
     electronics = read_noise.value / gain.value if read_noise.value else 0.0
     # The larger of the two alone is a lower limit of the noise.
@@ -318,7 +371,10 @@ def gain_contradiction(
 
 
 def sky_coordinate_remarks(image: ImageFile) -> list[str]:
-    """Return sentences on a WCS that is damaged, or that says two things of its distortion."""
+    """Return sentences on a WCS that is damaged, or that says two things of its distortion.
+
+    A WCS is damaged if its keys announce coordinates of the sky, but astropy makes none of them.
+    """
     projection = str(image.card("CTYPE1") or "")
     if image.wcs is None and projection[:4].strip("-") in ("RA", "DEC", "GLON", "GLAT"):
         return [
@@ -348,6 +404,8 @@ def refuse_colours(image: ImageFile) -> None:
     shape = image.shape
     if len(shape) == 3:
         # A few large planes are no stamps of stars, whose side is at most 256 px.
+        # Colours are the first axis of most programs, and the last one of those that write
+        # pictures.
         first, last = shape[0] in (3, 4), shape[-1] in (3, 4)
         if last or (first and max(shape[1:]) > LARGEST_STAMP_PX):
             plane, size = ("[0]", shape[1:]) if first else ("[..., 0]", shape[:-1])
@@ -374,7 +432,14 @@ def refuse_colours(image: ImageFile) -> None:
 def other_instruments(
     training_instrument: Mapping[str, object], image_instrument: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
-    """Return keys of telescope, camera or filter that differ in two headers, with both values."""
+    """Return keys of telescope, camera or filter that differ in two headers, with both values.
+
+    Parameters
+    ----------
+    training_instrument, image_instrument : mapping
+        Values by key of the header (`Observation.instrument`); a key that one of them lacks is left
+        out, and so are differences of case.
+    """
     return [
         (key, str(value), image_instrument[key])
         for key, value in training_instrument.items()

@@ -100,7 +100,13 @@ class Catalogue:
         return numbers
 
     def coordinates(self, name: str) -> np.ndarray:
-        """Return a column of finite numbers, (n,), NaN elsewhere; an error if all are NaN."""
+        """Return a column of finite numbers, (n,), NaN elsewhere; an error if all are NaN.
+
+        Raises
+        ------
+        ObservationError
+            If there is no such column, or none of its values is a finite number.
+        """
         numbers = self.numbers(name, strict=False)
         # Infinite numbers are as good as none.
         finite = np.isfinite(numbers)
@@ -155,7 +161,15 @@ class Catalogue:
         return ra, np.where(on_sphere, dec, np.nan)
 
     def _angles(self, name: str, sexagesimal_unit: str) -> np.ndarray:
-        """Return a column of angles in degrees, shape (n,), NaN where there is none."""
+        """Return a column of angles in degrees, shape (n,), NaN where there is none.
+
+        Parameters
+        ----------
+        name : str
+            Column of numbers or texts.
+        sexagesimal_unit : str
+            Unit of texts such as 10:00:12, "hourangle" or "deg".
+        """
         from astropy import units
         from astropy.coordinates import Angle
 
@@ -200,7 +214,10 @@ class Catalogue:
         return flags
 
     def identifiers(self) -> np.ndarray:
-        """Return one identifier per star, int64 or str, shape (n,); row numbers from 0 without."""
+        """Return one identifier per star, int64 or str, shape (n,); row numbers from 0 without.
+
+        The first column that the list has of id, source_id, number and the like identifies them.
+        """
         # Without a column, the number of the row.
         name = self._identifier()
         if name is None:
@@ -280,7 +297,10 @@ class Catalogue:
 
 
 def _texts(column: Column) -> list[str]:
-    """Return the values of a column as text without blanks around it, "" where there is none."""
+    """Return the values of a column as text without blanks around it, "" where there is none.
+
+    Bytes are decoded as UTF-8; masked values are "".
+    """
     # FITS has text as bytes.
     values = np.where(np.ma.getmaskarray(column), "", np.ma.getdata(column).astype(object))
     return [
@@ -329,6 +349,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
             isinstance(row, Mapping) for row in star_list
         ):
             star_list = _pairs(path, star_list)
+        # pandas has no units; astropy reads its records.
         records = getattr(star_list, "to_records", None)  # of a DataFrame
         # Quantities become columns with units.
         table = Table(star_list if records is None else records(index=False))
@@ -336,7 +357,15 @@ def as_catalogue(star_list: StarList) -> Catalogue:
 
 
 def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
-    """Return the columns of positions (n, 2), x and y, NaN where they are masked."""
+    """Return the columns of positions (n, 2), x and y, NaN where they are masked.
+
+    The columns have the names that photutils gives, `x_fit` and `y_fit`, which count from 0.
+
+    Raises
+    ------
+    ObservationError
+        If the positions have another unit than pixels, or are not numbers of shape (n, 2).
+    """
     # Positions with another unit than pixels are on the sky, and have no WCS with them.
     values, mask, unit = parts_of_array(star_list)
     if unit not in ("", "pix", "pixel"):
@@ -354,7 +383,13 @@ def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
 
 
 def _catalogue(path: Path, table: Table) -> Catalogue:
-    """Return a catalogue of a table with stars; an only column of SkyCoord becomes RA and Dec."""
+    """Return a catalogue of a table with stars; an only column of SkyCoord becomes RA and Dec.
+
+    Raises
+    ------
+    ObservationError
+        If the table has no row.
+    """
     from astropy.coordinates import SkyCoord
 
     if len(table) == 0:

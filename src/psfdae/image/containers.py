@@ -27,7 +27,17 @@ if TYPE_CHECKING:
 
 
 def as_images(images: Any) -> list[Path | PlainFile | np.ndarray]:
-    """Return what is read for an image, or for each of several; see `as_image`."""
+    """Return what is read for an image, or for each of several; see `as_image`.
+
+    Parameters
+    ----------
+    images : one of what `as_image` takes, or several of them
+
+    Returns
+    -------
+    list of Path, PlainFile or ndarray
+        One for each image; an HDUList is the parts of one image.
+    """
     from astropy.io.fits import HDUList
 
     # An HDUList is a list of the parts of one image, and an array could be iterated over.
@@ -52,6 +62,7 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
 
     if isinstance(image, str | Path | PlainFile):
         return Path(image) if isinstance(image, str) else image
+    # Messages call an image without a file by its type.
     name = Path(type(image).__name__)
     if isinstance(image, np.ndarray):
         # An array without mask and unit needs no file.
@@ -59,24 +70,35 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
         if mask is None and not unit:
             return data
         header = fits.Header({"BUNIT": unit} if unit else {})
-        return _written(name, lambda: _hdus(data, header, mask, None))
+        return _temporary_fits(name, lambda: _hdus(data, header, mask, None))
     if isinstance(image, fits.HDUList):
-        return _written(Path(image.filename() or name), lambda: image)
+        return _temporary_fits(Path(image.filename() or name), lambda: image)
     if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
         # An extension stands behind a primary one.
         first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
-        return _written(name, lambda: fits.HDUList([*first, image.copy()]))
+        return _temporary_fits(name, lambda: fits.HDUList([*first, image.copy()]))
     if not isinstance(image, NDData):
         raise ObservationError(
             name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
         )
-    return _written(name, lambda: _of_nddata(image))
+    return _temporary_fits(name, lambda: _of_nddata(image))
 
 
 def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
     """Return numbers, mask (None without one) and unit ("" without one) of an array of any kind.
 
     Masked arrays of numpy, and quantities of astropy, also masked ones.
+
+    Parameters
+    ----------
+    values : array, masked array, Quantity or masked Quantity
+
+    Returns
+    -------
+    numbers : ndarray
+    mask : ndarray of bool or None, of the same shape
+    unit : str
+        As FITS writes it.
     """
     if isinstance(values, np.ma.MaskedArray):
         return np.asarray(values.data), np.ma.getmaskarray(values), ""
@@ -89,7 +111,10 @@ def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
 
 
 def sigma_of(data: NDData) -> np.ndarray | None:
-    """Return σ of the pixels, in the unit of the data; None without an uncertainty."""
+    """Return σ of the pixels, in the unit of the data; None without an uncertainty.
+
+    An uncertainty of another kind, such as a variance or its inverse, is converted into σ.
+    """
     from astropy.nddata import StdDevUncertainty
 
     if data.uncertainty is None:
@@ -136,10 +161,14 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
 
 
 def _of_nddata(data: NDData) -> fits.HDUList:
-    """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS."""
+    """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS.
+
+    What FITS cannot hold is left out: meta that are no numbers or texts, and a WCS of another kind.
+    """
     from astropy.io import fits
     from astropy.wcs import WCS
 
+    # The meta of CCDData is the header that it was read with.
     header = fits.Header()
     for key, value in data.meta.items():
         # Meta may hold anything; what is no card of FITS is left out.
@@ -173,7 +202,17 @@ def fits_unit(unit: Any) -> str:
 def _hdus(
     data: np.ndarray, header: fits.Header, mask: np.ndarray | None, sigma: np.ndarray | None
 ) -> fits.HDUList:
-    """Return an image with its mask as DQ and σ as ERR."""
+    """Return an image with its mask as DQ and σ as ERR.
+
+    Parameters
+    ----------
+    data : ndarray
+    header : Header
+    mask : ndarray or None
+        Truth values or bits, of the shape of the data or that of one stamp of a cube.
+    sigma : ndarray or None
+        σ of the pixels, likewise.
+    """
     from astropy.io import fits
 
     # FITS has no half precision and no truth values.
@@ -189,8 +228,16 @@ def _hdus(
     return hdus
 
 
-def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
-    """Return a temporary file with an image, which is called `name` in messages."""
+def _temporary_fits(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
+    """Return a temporary file with an image, which is called `name` in messages.
+
+    Parameters
+    ----------
+    name : Path
+        What messages call the image.
+    hdus : callable
+        Returns the HDUList, inside `reading`, as what it makes may not be written as FITS.
+    """
     content = io.BytesIO()
     with reading(name):
         hdus().writeto(content, output_verify="silentfix+ignore")

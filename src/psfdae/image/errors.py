@@ -16,6 +16,7 @@ from psfdae.errors import Error
 
 def one_line(text: object) -> str:
     """Return the text without line breaks and characters that do not print."""
+    # Line breaks and tabs become blanks.
     words = " ".join(str(text).split())
     return "".join(c if c.isprintable() else "?" for c in words)
 
@@ -26,7 +27,11 @@ def ascii_line(text: object) -> str:
 
 
 def no_formula(text: str) -> str:
-    """Return the text, with an apostrophe before it if a spreadsheet would execute it."""
+    """Return the text, with an apostrophe before it if a spreadsheet would execute it.
+
+    Spreadsheets execute cells that begin with = + - @, a tab or a carriage return. Numbers such as
+    -1.5 stay as they are.
+    """
     if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
         return text
     try:
@@ -37,7 +42,14 @@ def no_formula(text: str) -> str:
 
 
 def shorten(names: list[str], length_max: int = 20) -> str:
-    """Return a list of names for a message, cut after `length_max` of them."""
+    """Return a list of names for a message, cut after `length_max` of them.
+
+    Parameters
+    ----------
+    names : list of str
+        Each is cut after 40 characters.
+    length_max : int
+    """
     ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""
     return ", ".join(name[:40] for name in names[:length_max]) + ellipsis if names else "none"
 
@@ -55,7 +67,11 @@ _ONE_AT_A_TIME = threading.RLock()
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Silence warnings, log messages and floating-point errors of libraries."""
+    """Silence warnings, log messages and floating-point errors of libraries.
+
+    Filters of warnings belong to the process: one thread at a time is silent, and restores what it
+    found.
+    """
     from astropy import log
 
     with _ONE_AT_A_TIME, warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -73,7 +89,7 @@ def reading(path: str | Path) -> Iterator[None]:
     """Silence libraries while they read a file, and turn what they raise about it into one error.
 
     Libraries raise a dozen kinds of errors on damaged files (struct, index, key, assertion, zlib,
-    …) that no list would complete; errors of the program itself pass as they are (`_is_bug`).
+    …) that no list would complete; errors of the program itself pass as they are.
 
     Raises
     ------
@@ -95,24 +111,15 @@ def reading(path: str | Path) -> Iterator[None]:
         except MemoryError:
             raise ObservationError(path, "does not fit into memory") from None
         except Exception as error:
-            if _is_bug(error):
+            # A missing package and an undefined name are no property of a file. Neither is a wrong
+            # type, attribute, index or assertion in a line of psfdae's own; libraries raise these
+            # on damaged files, in their own lines.
+            *_, (frame, _) = walk_tb(error.__traceback__)
+            package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+            misuse = TypeError | AttributeError | LookupError | AssertionError
+            is_own_misuse = package == "psfdae" and isinstance(error, misuse)
+            if is_own_misuse or isinstance(error, ImportError | NameError):
                 raise
             # The start of the library's message, which may be long, or the kind of error.
             problem = one_line(error)[:160] or type(error).__name__
             raise ObservationError(path, f"damaged or of a wrong format ({problem})") from error
-
-
-def _is_bug(error: Exception) -> bool:
-    """Return True if an error is one of the program or its installation, not of a file.
-
-    A package that is missing and a name that is not defined are no property of a file. Neither is
-    a wrong type, attribute, index or assertion in a line of psfdae's own; libraries raise these
-    on damaged files, in their own lines.
-    """
-    if isinstance(error, ImportError | NameError):
-        return True
-    if not isinstance(error, TypeError | AttributeError | LookupError | AssertionError):
-        return False
-    # The module of the line that raised it.
-    *_, (frame, _) = walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__", "")).partition(".")[0] == "psfdae"

@@ -35,26 +35,8 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 2880
 """Bytes of a block, of which FITS files consist."""
 
-MAPS = {
-    "mask": re.compile("DQ|MASK|BPM|FLAGS?"),
-    "error": re.compile("(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?"),
-    "variance": re.compile("(VAR|VARIANCE)(_.*)?"),  # VAR_POISSON, a part of it
-    "weight": re.compile("IVAR|WEIGHT|WHT|WGT"),
-}
-"""Names of extensions that go with an image, by JWST, HST, LCO, LSST, Gemini and ccdproc."""
-
-NOT_SCIENCE = re.compile(
-    "|".join(kind.pattern for kind in MAPS.values())
-    + "|BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE"
-    + "|WCSDVARR|D2IMARR"
-)
-"""Names of extensions that hold no image of the sky."""
-
 SCIENCE = ("SCI", "IMAGE")
 """Names of the image of the sky; where one extension of a file has such a name, it is meant."""
-
-INSTRUMENT_KEYS = ("TELESCOP", "INSTRUME", "FILTER")
-"""Keys of telescope, camera and filter, with which PSFs change."""
 
 Card = tuple[str, str | float | None, str]
 """Key, value and comment of a header."""
@@ -64,7 +46,13 @@ Card = tuple[str, str | float | None, str]
 
 
 def only_member(file: IO[bytes]) -> IO[bytes]:
-    """Open the only file in a zip file."""
+    """Open the only file in a zip file.
+
+    Raises
+    ------
+    BadZipFile
+        If the zip file holds another number of files.
+    """
     packed = zipfile.ZipFile(file)
     names = packed.namelist()
     if len(names) != 1:
@@ -108,6 +96,11 @@ class PlainFile:
 def plain_file(path: Path) -> PlainFile:
     """Return a FITS file that astropy can read at random, unpacked if need be.
 
+    Returns
+    -------
+    PlainFile
+        The file itself, or a temporary copy of what is packed in it.
+
     Raises
     ------
     ObservationError
@@ -127,7 +120,15 @@ def plain_file(path: Path) -> PlainFile:
 
 
 def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
-    """Return a FITS file of this content, which exists as long as the object that is returned."""
+    """Return a FITS file of this content, which exists as long as the object that is returned.
+
+    Parameters
+    ----------
+    name : Path
+        What messages call the file.
+    content : file
+        Open for reading bytes, at the start of what is copied.
+    """
     with tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits", delete=False) as copy:
         shutil.copyfileobj(content, copy)
     plain, process = PlainFile(name, Path(copy.name), is_copy=True), os.getpid()
@@ -213,15 +214,26 @@ class ImageFile:
         return next((u.strip() for u in units if isinstance(u, str) and u.strip()), "")
 
     def card(self, key: str) -> Any:
-        """Return the value of a card of its own header; None if that has none."""
+        """Return the value of a card of its own header; None if that has none.
+
+        None as well if the card cannot be parsed.
+        """
         return card_value(self.headers[0], key) if self.headers else None
 
     def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return physical values of stored ones, in native byte order, same shape.
 
         They are of double precision where all are below 1e-15.
+
+        Parameters
+        ----------
+        stored : ndarray
+            Pixels as the file has them: neither scaled nor blank.
+        dtype : dtype
+            Type of the values.
         """
-        # value = bscale · stored + bzero
+        # value = bscale · stored + bzero, in double precision; without a scale, values are
+        # converted once.
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
         else:
@@ -239,7 +251,11 @@ class ImageFile:
         return replace(self, shape=self.shape[1:], leading=self.leading + 1)
 
     def provenance(self) -> list[Card]:
-        """Return the cards that say where the stars come from, those that can be parsed."""
+        """Return the cards that say where the stars come from, those that can be parsed.
+
+        These are object, telescope, instrument, observer, filter, dates, exposure time, air mass
+        and unit.
+        """
         # Of a key that stands in both headers, the value of the image's own.
         cards: list[Card] = []
         for key in (
@@ -263,7 +279,14 @@ def card_value(header: Header, key: str) -> Any:
 
 
 def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
-    """Return an array (h, w), or a cube of stamps (n, s, s), as an image without a header."""
+    """Return an array (h, w), or a cube of stamps (n, s, s), as an image without a header.
+
+    Raises
+    ------
+    ObservationError
+        If the array does not hold numbers, or has not two or three axes.
+    """
+    # A plane, or stamps along the first axis, of any type of numbers.
     values, path = np.asarray(values), Path(name)
     if values.dtype.kind not in "fiu" or values.ndim not in (2, 3) or not values.size:
         shape = "×".join(map(str, values.shape))
@@ -284,7 +307,7 @@ def find_image(
         An array is an image itself.
     extension : str or int, optional
         A name (case does not matter), "NAME,version" or a number (0 is the primary one). By default
-        the only image is taken that is not a mask, an error or the like (`NOT_SCIENCE`), or the
+        the only image is taken that is not a mask, an error or the like (`is_science`), or the
         only one called as in `SCIENCE`.
 
     Raises
@@ -334,6 +357,15 @@ def science_images(path: Path) -> dict[str, int]:
 
     A name, which files get, is the extension's own; or its number where it has none, or one that
     another extension has, too, or that looks like the number of another.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    ObservationError
+        If the file has none, or cannot be read.
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
         images = {k: hdu.name for k, hdu in enumerate(hdus) if has_pixels(hdu)}
@@ -349,13 +381,40 @@ def science_images(path: Path) -> dict[str, int]:
     }
 
 
+def map_kind_by_name(name: str) -> str | None:
+    """Return which map of an image an extension is: "mask", "error", "variance" or "weight".
+
+    By the names that JWST, HST, LCO, LSST, Gemini and ccdproc give them; None for another name.
+    """
+    names_by_kind = {
+        "mask": "DQ|MASK|BPM|FLAGS?",
+        "error": "(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?",
+        "variance": "(VAR|VARIANCE)(_.*)?",  # VAR_POISSON, a part of it
+        "weight": "IVAR|WEIGHT|WHT|WGT",
+    }
+    name = name.strip().upper()
+    return next((kind for kind, form in names_by_kind.items() if re.fullmatch(form, name)), None)
+
+
 def is_science(name: str) -> bool:
     """Return False for an extension that goes with an image, such as DQ, by its name."""
-    return NOT_SCIENCE.fullmatch(name.strip().upper()) is None
+    # Sky, context and exposure maps, samples up the ramp, and distortions of the WCS.
+    other_names = (
+        "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR"
+    )
+    is_other = re.fullmatch(other_names, name.strip().upper()) is not None
+    return map_kind_by_name(name) is None and not is_other
 
 
 def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
-    """Return the extension with the image; see `find_image`."""
+    """Return the extension with the image; see `find_image`.
+
+    Raises
+    ------
+    ObservationError
+        If the extension that is stated does not exist or holds no image, or if none is stated and
+        no image, or several, may be meant; it lists what the file has.
+    """
     # Number, name and size of each extension, for messages.
     labels = []
     for k, hdu in enumerate(hdus):
@@ -374,6 +433,7 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
         return hdu
     # Else the only image that is no mask, error or the like.
     images = [hdu for hdu in hdus if has_pixels(hdu)]
+    # Of a file that has nothing but such extensions, any may be meant.
     science = [hdu for hdu in images if is_science(hdu.name)] or images
     if not science:
         raise ObservationError(path, f"no image; the file has {listed}")
@@ -390,6 +450,7 @@ def _named(hdus: HDUList, text: str) -> Any:
     """Return the extension of a number, or of a name with perhaps a version; None without one."""
     if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
+    # A name alone means its first extension, whatever the version.
     name, _, version = text.rpartition(",") if "," in text else (text, "", "")
     for hdu in hdus:
         if hdu.name.upper() == name.strip().upper() and version.strip() in ("", str(hdu.ver)):
@@ -409,7 +470,15 @@ def has_pixels(hdu: Any) -> bool:
 
 
 def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
-    """Return the celestial WCS of an image; None without a stated scale, or if it is damaged."""
+    """Return the celestial WCS of an image; None without a stated scale, or if it is damaged.
+
+    Parameters
+    ----------
+    header : Header
+        Header of the image.
+    hdus : HDUList
+        Its file, in which look-up tables of distortions may be.
+    """
     from astropy.wcs import WCS
 
     # Without a scale, the pixels would be degrees.
@@ -427,7 +496,16 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Physical values of an image, which are read where they are indexed."""
+    """Physical values of an image, which are read where they are indexed.
+
+    Attributes
+    ----------
+    stored : array-like
+        Pixels as stored: an array, or a section of a file that reads what it is asked for.
+    image : ImageFile
+    dtype : dtype
+        Type of the values.
+    """
 
     stored: Any
     image: ImageFile

@@ -82,6 +82,7 @@ class ImageStatements:
         """Threshold of the search for stars in σ above the sky; None without a search."""
         if not self.detect:
             return None
+        # In Python, `detect` may be the threshold itself.
         return self.threshold if self.detect is True else float(self.detect)
 
 
@@ -129,6 +130,7 @@ class ImageInput(ImageStatements):
     @property
     def path(self) -> Path:
         """The image's file, or what an array is called in messages."""
+        # A temporary file has the name of what was given.
         if isinstance(self.image, PlainFile):
             return self.image.name
         return self.image if isinstance(self.image, Path) else Path("array")
@@ -136,6 +138,7 @@ class ImageInput(ImageStatements):
     @property
     def name(self) -> str:
         """Default name of a model of its stars: the file's name without its suffixes."""
+        # Suffixes of FITS and of compression, however many.
         suffixes = re.compile(r"(\.(fits|fit|fts|fz|gz|bz2|xz|zip))+$", re.IGNORECASE)
         return suffixes.sub("", self.path.name) or "model"
 
@@ -156,6 +159,7 @@ class ImageInput(ImageStatements):
         if self.catalogue is not None and len(images) > 1:
             require_sky(self.catalogue, "a training on several images")
             on_image = True
+        # Every image has the same statements.
         return [replace(self, image=image, on_image=on_image) for image in images]
 
     def camera(self, image_unit: str = "") -> dict[str, float | None]:
@@ -210,7 +214,7 @@ class ImageInput(ImageStatements):
         ObservationError
             If the image, its list or a statement cannot be used; one line that names the file.
         """
-        from psfdae.image.observation import open_observation
+        from psfdae.image.opening import open_observation
 
         # Ranges of whole numbers.
         if stamp_px < 1:

@@ -42,6 +42,7 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
         for across in steps:
             at = row + reach + down, column + reach + across
             weight = weights[down + reach, across + reach] * good[at]
+            # Sums over the pixels that are down and across by these steps.
             mean += weight * padded[at]
             weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
@@ -54,12 +55,14 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
         has_line = is_good[1] & is_good[2]
         has_cubic = has_line & is_good[0] & is_good[3]
         line = 0.5 * (values[1] + values[2])
+        # Cubic through −2, −1, 1, 2 at 0: (4 (v₋₁ + v₁) − v₋₂ − v₂) / 6; line: (v₋₁ + v₁) / 2.
         cubic = (4.0 * (values[1] + values[2]) - values[0] - values[3]) / 6.0
         # A cubic counts twice as much as a line, which cuts off peaks.
         part = np.where(has_cubic, 2.0, has_line * 1.0)
         total += part * np.where(has_cubic, cubic, line)
         count += part
     mean = mean / np.where(weight_sum > 0, weight_sum, 1.0)
+    # A pixel without a good pair on either axis gets the Gaussian mean.
     filled[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
     remaining[row, column] = weight_sum <= 0
     return filled, remaining

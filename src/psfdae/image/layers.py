@@ -21,7 +21,6 @@ from psfdae.image.camera import CameraValue
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, silent
 from psfdae.image.fits_file import (
-    MAPS,
     SCIENCE,
     ImageFile,
     Pixels,
@@ -30,6 +29,7 @@ from psfdae.image.fits_file import (
     find_image,
     has_pixels,
     is_science,
+    map_kind_by_name,
     open_hdus,
     open_pixels,
 )
@@ -66,10 +66,18 @@ class NoiseMap:
         """Return σ of the sky in pixels from their values in the map, NaN where it has none.
 
         The photons of stars, `light` above the sky, are taken out of a map that has them.
+
+        Parameters
+        ----------
+        values : ndarray
+            Pixels of the map.
+        light : ndarray or float
+            Light of stars in the same pixels, above the sky, in counts.
         """
         # σ² of the sky and of the light of stars.
         with np.errstate(all="ignore"):
             if self.kind == "weight":
+                # weight = 1/σ², error = σ, variance = σ².
                 variance = 1.0 / values
             else:
                 variance = values**2 if self.kind == "error" else values
@@ -126,7 +134,13 @@ class Layers:
             yield pixels, mask, noise
 
     def is_bad(self, values: np.ndarray) -> np.ndarray:
-        """Return True for the values of the mask that are bad; those that are no number are."""
+        """Return True for the values of the mask that are bad; those that are no number are.
+
+        Parameters
+        ----------
+        values : ndarray
+            Pixels of the mask, in double precision, which holds whole numbers up to 2⁵³.
+        """
         if self.bad_bits is None:
             return np.asarray(values != 0)
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
@@ -162,7 +176,13 @@ class Layers:
         return image, masked, sigma
 
     def find_bad(self, image: np.ndarray, masked: np.ndarray) -> BadPixels:
-        """Search for bad pixels in what `read` returns, once."""
+        """Search for bad pixels in what `read` returns, once.
+
+        Raises
+        ------
+        ObservationError
+            If the sky of the image was clipped at its least value.
+        """
         if not self._bad_pixels:
             try:
                 with silent():
@@ -245,6 +265,7 @@ def find_layers(
     notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
     for kind, place in stated.items():
         noise = _layer_of(image, place, NOISE_MAPS[kind])
+        # A pixel of σ or weight 0 has no data; the map is checked at the same time.
         if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
         layers = replace(layers, noise=NoiseMap(noise, kind))
@@ -272,7 +293,14 @@ def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
     """Return the map of noise of the image's own file, and words on its use.
 
     In it 0 is for bad pixels. None if it has values for fewer than half of the pixels.
+
+    Returns
+    -------
+    noise_map : NoiseMap or None
+    words : str
+        What the map is used as, or why it is not.
     """
+    # Part of the pixels that have a σ or σ² above 0.
     with open_pixels(noise, in_pieces=False) as pixels:
         good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
     if good < 0.5:
@@ -283,11 +311,26 @@ def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
 def mask_and_bits(
     source: ImageInput, image: ImageFile, mask: ImageFile | None
 ) -> tuple[ImageFile | None, int | None, list[str]]:
-    """Return the mask that is stated, else that of the image's file, its bad bits, and remarks."""
+    """Return the mask that is stated, else that of the image's file, its bad bits, and remarks.
+
+    Parameters
+    ----------
+    source : ImageInput
+        Statements on the image; its `mask` may be "none".
+    image : ImageFile
+    mask : ImageFile or None
+        Mask that the image's own file has beside it.
+
+    Raises
+    ------
+    ObservationError
+        If bits are stated, but there is no mask.
+    """
     if source.mask is not None:
         mask = None if _is_none(source.mask) else _layer_of(image, source.mask, "a mask")
     if mask is None and source.bad_bits is not None:
         raise ObservationError(source.path, "bits are given, but no mask that has them")
+    # Bits that are stated go before those by the header.
     bits_of_header = None if mask is None else bits_of_bad_pixels(mask)
     if mask is None or source.bad_bits is not None or bits_of_header is None:
         return mask, source.bad_bits, []
@@ -311,6 +354,11 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
         Extension of the image's file, another file, or an array.
     role : str
         Words for the layer, for messages.
+
+    Raises
+    ------
+    ObservationError
+        If the layer cannot be found, or is not as large as the image.
     """
     # An array, the path of a file, or else an extension; a text may be either of these two.
     is_array = isinstance(place, np.ndarray)
@@ -340,6 +388,7 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
     ObservationError
         If its name says another kind, or it has values that no map of its kind has.
     """
+    # A map under the name of another kind would give wrong errors without a word.
     kind_by_name = map_kind(noise)
     if kind_by_name in NOISE_MAPS and kind_by_name != kind:
         raise ObservationError(
@@ -401,6 +450,7 @@ def with_photons(
     if np.count_nonzero(bright) < 50 or not faint.any():
         return layers, camera, []
     # Slope of the variance with the light, and its scatter: 1.48 median deviations.
+    # (σ² − σ²_sky) / light = 1 / gain, at each bright pixel.
     growth = (variance[bright] - np.median(variance[faint])) / sky.flat[bright]
     slope = float(np.median(growth))
     spread = 1.48 * float(np.median(np.abs(growth - slope)))
@@ -417,7 +467,7 @@ def with_photons(
 
 
 def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
-    """Find the mask and the map of noise that a file has for an image, by the names in `MAPS`.
+    """Find the mask and the map of noise that a file has for an image, by their names.
 
     They have its size. If names repeat, their versions (EXTVER) belong together; of a file with
     several science images that do not, none is taken.
@@ -461,9 +511,11 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
 
 
 def map_kind(image: ImageFile) -> str | None:
-    """Return which of `MAPS` an extension is by its name or UTYPE, None if neither says it."""
-    name = str(image.card("EXTNAME") or "").strip().upper()
-    kind = next((kind for kind, names in MAPS.items() if names.fullmatch(name)), None)
+    """Return which map an extension is by its name and UTYPE, None if neither says it.
+
+    CCDData has its uncertainty in an extension UNCERT, and its kind in UTYPE.
+    """
+    kind = map_kind_by_name(str(image.card("EXTNAME") or ""))
     if kind != "error":
         return kind
     # CCDData writes the type of its uncertainty as UTYPE.

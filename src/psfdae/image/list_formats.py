@@ -24,6 +24,15 @@ if TYPE_CHECKING:
 def read_list_table(path: Path) -> Table:
     """Read the table of stars of a file.
 
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Table
+        A row for each star, in the order of the file.
+
     Raises
     ------
     ObservationError
@@ -33,7 +42,7 @@ def read_list_table(path: Path) -> Table:
         content = path.read_bytes()
     # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
     if content.startswith((b"SIMPLE  =", *UNPACK)):
-        return _fits_table(path)
+        return fits_table(path)
     # Text may begin with a mark of its encoding; a byte 0 is in no text.
     try:
         text = content.decode("utf-8-sig")
@@ -50,15 +59,20 @@ def read_list_table(path: Path) -> Table:
         return votable(path, content)
     if re.match(r"\s*NL\s+NX\s+NY\b", lines[0]):
         return stetson(path, lines)
-    return _text_table(path, lines)
+    return text_table(path, lines)
 
 
-def _fits_table(path: Path) -> Table:
+def fits_table(path: Path) -> Table:
     """Read the LDAC_OBJECTS or the only table of a FITS file; columns stay in the file till used.
 
     Parameters
     ----------
     path : Path
+
+    Raises
+    ------
+    ObservationError
+        If the file has not exactly one table that may be meant, or it is truncated.
     """
     from astropy.io import fits
     from astropy.table import Table
@@ -82,8 +96,20 @@ def _fits_table(path: Path) -> Table:
         return Table.read(objects[0], format="fits", mask_invalid=False, unit_parse_strict="silent")
 
 
-def _text_table(path: Path, lines: Sequence[str]) -> Table:
-    """Read a text table from the lines of a file that are not blank."""
+def text_table(path: Path, lines: Sequence[str]) -> Table:
+    """Read a text table from the lines of a file that are not blank.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    lines : sequence of str
+
+    Raises
+    ------
+    ObservationError
+        If there is no row of a star, or the text is no table.
+    """
     from astropy.io import ascii as text_tables
 
     # IRAF's DAOPHOT, ECSV and SExtractor describe their columns in comments.
@@ -111,6 +137,11 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
 
     A comment right before numbers without names is the names. VizieR writes two lines of units and
     of dashes below the names, which are left out.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Lines that are not blank.
     """
     # Rows that are no comments, and the comments above the first of them.
     rows = [line for line in lines if not line.lstrip().startswith("#")]
@@ -128,6 +159,18 @@ def votable(path: Path, content: bytes) -> Table:
     """Read the only table with rows of a VOTable.
 
     Data that lie elsewhere are refused: astropy would open any address that a file names.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    content : bytes
+        Its content.
+
+    Raises
+    ------
+    ObservationError
+        If its data lie elsewhere, or not exactly one table has rows.
     """
     from astropy.io.votable import parse
 
@@ -212,6 +255,11 @@ def stetson(path: Path, lines: Sequence[str]) -> Table:
     """Read number, x and y, the first columns of a list of DAOPHOT itself (three head lines).
 
     Its pixels count from 1, as SExtractor's do.
+
+    Raises
+    ------
+    ObservationError
+        If a row has fewer than three numbers.
     """
     from astropy.table import Table
 

@@ -57,6 +57,7 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     if len(star) < fewest:
         return None
     # Centroids less positions, of stars that did not run to the end of their reach.
+    # A Gaussian window of σ = 1.5 px, within 2 px of the middle.
     window_px = np.full(len(star), 1.5)
     centre = windowed_centres(stamps[star], np.zeros((len(star), 2)), window_px, 10, 2.0)[:, ::-1]
     offset = central_pixel(listed[star] - 0.5) + centre - listed[star]

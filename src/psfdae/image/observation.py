@@ -16,30 +16,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from psfdae.image.camera import (
-    LARGEST_STAMP_PX,
-    CameraValue,
-    camera_values,
-    checked_camera,
-    refuse_colours,
-    sky_coordinate_remarks,
-)
-from psfdae.image.catalogue import Catalogue, as_catalogue
+from psfdae.image.camera import CameraValue
+from psfdae.image.catalogue import Catalogue
 from psfdae.image.detection import Sky
 from psfdae.image.errors import ObservationError, reading, shorten, silent
-from psfdae.image.fits_file import INSTRUMENT_KEYS, Card, ImageFile, Pixels, find_image, open_pixels
-from psfdae.image.layers import Layers, find_layers, with_photons
-from psfdae.image.positions import (
-    SAME_STAR_PX,
-    on_image,
-    positions_in_image,
-    repeated_rows,
-    with_origin,
-)
+from psfdae.image.fits_file import Card, Pixels, open_pixels
+from psfdae.image.layers import Layers
+from psfdae.image.positions import repeated_rows
 from psfdae.image.stamps import (
     Stamps,
     StarFlag,
@@ -52,11 +39,6 @@ from psfdae.image.stamps import (
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-    from psfdae.image.image_input import ImageInput
-
-ASSUMED_SCALE_ARCSEC = 1.0
-"""Scale of the pixels where nothing says it."""
 
 
 class ListedStars(NamedTuple):
@@ -136,6 +118,8 @@ class Observation:
     neighbour_light: Callable[[slice, int, int], np.ndarray] | None = field(
         default=None, repr=False
     )
+    assumed_scale_arcsec: ClassVar[float] = 1.0
+    """Scale of the pixels where nothing says it."""
 
     @property
     def count(self) -> int:
@@ -160,7 +144,9 @@ class Observation:
     @property
     def instrument(self) -> dict[str, str]:
         """Telescope, camera and filter, by the key of the header that names them."""
-        return {key: str(value) for key, value, _ in self.header_cards if key in INSTRUMENT_KEYS}
+        # PSFs change with each of the three.
+        keys = ("TELESCOP", "INSTRUME", "FILTER")
+        return {key: str(value) for key, value, _ in self.header_cards if key in keys}
 
     @property
     def unit(self) -> str:
@@ -178,10 +164,11 @@ class Observation:
         return self.camera["pixel scale"].origin == "assumed"
 
     def assuming(self) -> Observation:
-        """Return the same with `ASSUMED_SCALE_ARCSEC` if nothing says the scale."""
+        """Return the same with `assumed_scale_arcsec` if nothing says the scale."""
         if self.pixel_scale_arcsec is not None:
             return self
-        scale = CameraValue(ASSUMED_SCALE_ARCSEC, "assumed")
+        # The origin tells that it was assumed.
+        scale = CameraValue(self.assumed_scale_arcsec, "assumed")
         return replace(self, camera=self.camera | {"pixel scale": scale})
 
     def sky(self) -> Sky:
@@ -192,6 +179,16 @@ class Observation:
         """Return ICRS coordinates in degrees of 0-based pixels (n,).
 
         None without a celestial WCS, and of a cube of stamps.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (n,)
+            Positions in the image, 0-based.
+
+        Returns
+        -------
+        tuple of ndarray, or None
+            Right ascension and declination, shape (n,) each.
         """
         from astropy.wcs.utils import pixel_to_skycoord
 
@@ -222,13 +219,19 @@ class Observation:
         return "\n".join(lines)
 
     def without_position(self) -> np.ndarray:
-        """Return True for stars without a position in a list that has others, shape (n,)."""
+        """Return True for stars without a position in a list that has others, shape (n,).
+
+        Detected stars all have one, and a cube need not have any.
+        """
         if self.positions is None or self.detections is not None:
             return np.zeros(self.count, dtype=bool)
         return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
     def listed_again(self) -> np.ndarray:
-        """Return True for stars of a list that are the same as an earlier one, shape (n,)."""
+        """Return True for stars of a list that are the same as an earlier one, shape (n,).
+
+        They are nearer to it than a tenth of a pixel (`repeated_rows`).
+        """
         if self.positions is None or self.detections is not None or self.shape is None:
             return np.zeros(self.count, dtype=bool)
         return repeated_rows(self.positions)
@@ -268,7 +271,10 @@ class Observation:
             )
 
     def sha256(self) -> str:
-        """Return SHA-256 of all pixels of the image or cube, as float32."""
+        """Return SHA-256 of all pixels of the image or cube, as float32.
+
+        It does not depend on how the file is compressed or scaled, nor on its header.
+        """
         # 256 rows of an image, or stamps of a cube, are in memory at a time.
         digest, rows = hashlib.sha256(), 256
         with open_pixels(self._layers.image, in_pieces=True) as pixels:
@@ -303,6 +309,14 @@ def _cut_from_cube(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cut stamps out of the middle of those of a cube.
 
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars that are cut.
+    pixels, mask : Pixels
+        Of the cube, and of its mask if it has one.
+
     Returns
     -------
     data, masked : ndarray, shape (n, s, s)
@@ -334,6 +348,14 @@ def _cut_from_image(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cut stamps out of an image, and measure the noise of the sky of each.
 
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars that are cut.
+    pixels, noise : Pixels
+        Of the image, and of its map of noise if it has one.
+
     Returns
     -------
     data, masked, truncated, noise
@@ -344,6 +366,7 @@ def _cut_from_image(
     x, y = observation.positions[part].T
     # The noise of the sky is that of a ring of at least 8 px around the stamp.
     margin = max(observation.margin, 8)
+    # All layers are cut at the same places.
     window = (shape, x, y, stamp_px, margin)
     data, inside, truncated = cut_image(pixels, *window)
     # Other stars of a crowded image are subtracted.
@@ -355,6 +378,7 @@ def _cut_from_image(
         data = np.where(data >= full, data, cleaned)
     # Pixels off the image, of the mask, and those that show no sky.
     masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
+    # The stamp with its own margin, within the wider window.
     stamp = slice(margin - observation.margin, margin + stamp_px + observation.margin)
     if noise is not None and layers.noise is not None:
         # σ of the sky by the map, without the photons of the star.
@@ -380,7 +404,22 @@ def _with_stars(
     truncated: np.ndarray,
     noise: np.ndarray,
 ) -> Stamps:
-    """Return stamps (n, s, s) of a part of the stars with all that is known of these."""
+    """Return stamps (n, s, s) of a part of the stars with all that is known of these.
+
+    Parameters
+    ----------
+    observation : Observation
+    part : slice
+        Stars of the stamps.
+    data : ndarray, shape (n, s, s)
+        Counts, changed here: pixels without a number become 0.
+    masked : ndarray of bool, shape (n, s, s)
+        Pixels that do not count, to which those without a number are added.
+    truncated : ndarray of bool, shape (n,)
+        Stars of which a part is off the image.
+    noise : ndarray, shape (n,)
+        σ of the sky, NaN where it is to be estimated.
+    """
     # A pixel of +inf is saturated, one of NaN is not.
     level = observation.saturate
     saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
@@ -415,177 +454,3 @@ def _with_stars(
         colour=stars.colour,
         listed=listed,
     )
-
-
-def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observation:
-    """Return the stars of an image, with all that its file, its list and the user say of them.
-
-    Parameters
-    ----------
-    source : ImageInput
-    stamp_px, margin : int
-        Side of the stamps, and pixels around each.
-
-    Raises
-    ------
-    ObservationError
-        If the image, its list or a statement cannot be used.
-    """
-    # The image, and whether it is a cube of stamps.
-    image = find_image(source.image, source.extension)
-    stated_camera = source.camera(image.unit)
-    table = None if source.catalogue is None else as_catalogue(source.catalogue)
-    image, is_cube = image_or_cube(source, image, table, stamp_px)
-    # The camera: values of a header are used as far as the pixels do not contradict them.
-    camera, remarks = camera_values(image, stated_camera), list[str]()
-    if not is_cube:
-        camera, remarks = checked_camera(image, camera)
-        remarks += sky_coordinate_remarks(image)
-    # Mask and map of noise. The map is scaled to the scatter of the sky, above which stars are
-    # searched.
-    layers, layer_remarks = find_layers(source, image, is_cube, camera)
-    remarks += layer_remarks
-    detections, threshold = None, source.detection_sigma
-    if threshold is not None or layers.noise is not None:
-        sky = layers.sky()
-        remarks += [f"{source.path}: {note}" for note in sky.notes]
-        if layers.noise is not None:
-            layers = replace(layers, noise=replace(layers.noise, scale=sky.noise_scale))
-            layers, camera, photon_remarks = with_photons(layers, camera, sky)
-            remarks += photon_remarks
-        if threshold is not None:
-            detections = detected_stars(source.path, sky, threshold)
-    stars, positions, list_remarks = locate_stars(
-        source, image, detections or table, layers, is_cube
-    )
-    return Observation(
-        source.path,
-        stamp_px,
-        margin=min(margin, (image.shape[-1] - stamp_px) // 2) if is_cube else margin,
-        shape=None if is_cube else image.shape,
-        camera=camera,
-        positions=positions,
-        stars=stars,
-        header_cards=image.provenance(),
-        catalogue=None if table is None else table.path,
-        detections=detections,
-        colour_column=source.colour_column,
-        remarks=(*remarks, *list_remarks),
-        _list=table,
-        _layers=layers,
-    )
-
-
-def image_or_cube(
-    source: ImageInput, image: ImageFile, table: Catalogue | None, stamp_px: int
-) -> tuple[ImageFile, bool]:
-    """Tell an image, out of which stars are cut, from a cube of stamps, or one stamp.
-
-    Returns
-    -------
-    image : ImageFile
-        An image is a plane, even if its file has it as a cube with one.
-    is_cube : bool
-
-    Raises
-    ------
-    ObservationError
-        If the image has several colours, an image has neither a list nor is to be searched, a cube
-        is to be searched, or stamps are too small.
-    """
-    is_searched = source.detection_sigma is not None
-    # A cube with one plane is an image, if it is no stamp of the only star of a list.
-    if len(image.shape) == 3 and image.shape[0] == 1:
-        has_stars = is_searched or (table is not None and len(table) != 1)
-        if has_stars or max(image.shape) > LARGEST_STAMP_PX:
-            image = image.one_plane()
-    refuse_colours(image)
-    shape, size = image.shape, "×".join(map(str, image.shape[-2:]))
-    # A plane is an image if it has stars, and else one stamp; stamps are squares of the right size.
-    is_image = len(shape) == 2 and (table is not None or is_searched)
-    is_square = shape[-2] == shape[-1] >= stamp_px
-    if not is_image and not (is_square and (len(shape) == 3 or shape[-1] == stamp_px)):
-        if len(shape) == 2:
-            raise ObservationError(
-                image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
-            )
-        raise ObservationError(
-            image.path,
-            f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger",
-        )
-    if is_searched and (not is_image or table is not None or source.origin is not None):
-        raise ObservationError(
-            source.path, "--detect takes an image, no cube; no list, and no origin of one"
-        )
-    return image, not is_image
-
-
-def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
-    """Return the stars of an image that are `threshold` σ above its sky.
-
-    Raises
-    ------
-    ObservationError
-        If there is none.
-    """
-    from astropy.table import Table
-
-    with silent():
-        table = Table(sky.stars(threshold))
-    if len(table) == 0:
-        raise ObservationError(path, f"no star {threshold:g} σ above the sky")
-    return Catalogue(path, table)
-
-
-def locate_stars(
-    source: ImageInput, image: ImageFile, table: Catalogue | None, layers: Layers, is_cube: bool
-) -> tuple[ListedStars, np.ndarray | None, list[str]]:
-    """Return the stars of a list, or of a cube without one, with their positions.
-
-    Returns
-    -------
-    stars : ListedStars
-    positions : ndarray or None, shape (n, 2)
-        None for a cube whose list has no pixels.
-    remarks : list of str
-        Sentences on the list's origin, and on rows of the same star.
-    """
-    # Without a list, stars are numbered and have no place.
-    remarks: list[str] = []
-    positions = None
-    count = len(table) if table is not None else image.shape[0] if len(image.shape) == 3 else 1
-    identifiers = np.arange(count, dtype=np.int64)
-    flags = np.zeros(count, dtype=np.uint16)
-    if table is not None:
-        # Position columns of the list, with the origin of pixels that is stated, or by custom.
-        columns = table.positions()
-        if source.origin is not None:
-            columns = replace(columns, origin=source.origin)
-        # Where neither the user nor the list says the origin of its pixels, the stars show it.
-        if columns.origin is None and not (columns.sky or is_cube):
-            columns, remarks = with_origin(table, columns, layers)
-        positions = positions_in_image(image, table, columns, is_cube)
-        identifiers, flags = table.identifiers(), table.flags(columns)
-        # Rows of a star that is listed already have no light of their own.
-        if positions is not None and not is_cube and source.detection_sigma is None:
-            is_repeated = repeated_rows(positions)
-            raise_flag(flags, StarFlag.BLENDED, is_repeated)
-            if rows := [str(row + 1) for row in np.flatnonzero(is_repeated)]:
-                subject = "row is" if len(rows) == 1 else "rows are"
-                remarks.append(
-                    f"{table.path}: {len(rows)} {subject} within {SAME_STAR_PX:g} px of an earlier "
-                    f"one ({shorten(rows)}): flagged BLENDED, and not learnt from"
-                )
-    # Columns that are stated; NaN where a list has no number, or none is stated.
-    numbers = [np.full(count, np.nan) for _ in range(3)]
-    for k, name in enumerate((source.flux_column, source.background_column, source.colour_column)):
-        if name is not None and table is None:
-            raise ObservationError(source.path, f"no catalogue is given to take {name!r} from")
-        if name is not None and table is not None:
-            numbers[k] = table.numbers(name)
-    stars = ListedStars(identifiers, np.arange(count), numbers[0], numbers[1], numbers[2], flags)
-    # A list may cover a larger part of the sky than the image.
-    if source.on_image and positions is not None and not is_cube:
-        selected = on_image(positions, image.shape)
-        stars, positions = stars.select(selected), positions[selected]
-    return stars, positions, remarks

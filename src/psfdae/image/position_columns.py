@@ -68,12 +68,17 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
     Positions.of_pairs("XCENTER,YCENTER", origin=1, exact=True),
     Positions.of_pairs("XCenter,YCenter"),
     # Names that anybody may have given: each pair is a convention of its own.
-    Positions.of_pairs("x,y"),
-    Positions.of_pairs("xpos,ypos"),
-    Positions.of_pairs("x_pos,y_pos"),
-    Positions.of_pairs("xpix,ypix"),
-    Positions.of_pairs("x_pix,y_pix"),
-    Positions.of_pairs("x_pixel,y_pixel"),
+    *(
+        Positions.of_pairs(pair)
+        for pair in (
+            "x,y",
+            "xpos,ypos",
+            "x_pos,y_pos",
+            "xpix,ypix",
+            "x_pix,y_pix",
+            "x_pixel,y_pixel",
+        )
+    ),
     # SExtractor on the sky, by its own and by photometry's names.
     Positions.of_pairs(
         "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
@@ -81,24 +86,26 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
         sky=True,
         flags="FLAGS",
     ),
-    # Gaia, VizieR, Pan-STARRS and others.
-    Positions.of_pairs("ra,dec", sky=True),
-    Positions.of_pairs("RAJ2000,DEJ2000", sky=True),
-    Positions.of_pairs("RAJ2000,DECJ2000", sky=True),
-    Positions.of_pairs("_RAJ2000,_DEJ2000", sky=True),
-    Positions.of_pairs("RA_ICRS,DE_ICRS", sky=True),
-    Positions.of_pairs("RA_ICRS,DEC_ICRS", sky=True),
-    Positions.of_pairs("RA_J2000,DEC_J2000", sky=True),
-    Positions.of_pairs("ra_deg,dec_deg", sky=True),
-    Positions.of_pairs("raMean,decMean", sky=True),
-    Positions.of_pairs("radeg,decdeg", sky=True),
-    Positions.of_pairs("radeg,dedeg", sky=True),
+    # Gaia, VizieR, Pan-STARRS and others; each pair is a convention of its own, too.
+    *(
+        Positions.of_pairs(pair, sky=True)
+        for pair in (
+            *("ra,dec", "RAJ2000,DEJ2000", "RAJ2000,DECJ2000", "_RAJ2000,_DEJ2000"),
+            *("RA_ICRS,DE_ICRS", "RA_ICRS,DEC_ICRS", "RA_J2000,DEC_J2000"),
+            *("ra_deg,dec_deg", "raMean,decMean", "radeg,decdeg", "radeg,dedeg"),
+        )
+    ),
 )
 """Position columns of each program, from the best to the worst."""
 
 
 def choose_positions(names: Sequence[str]) -> Positions:
     """Find the position columns among the names of a list's columns.
+
+    Parameters
+    ----------
+    names : sequence of str
+        In any order and case.
 
     Raises
     ------
@@ -115,6 +122,7 @@ def choose_positions(names: Sequence[str]) -> Positions:
     choices: list[Positions] = []
     for convention in CONVENTIONS:
         for columns in convention:
+            # The case of the names counts only where it tells the program.
             pair = (columns.first, columns.second)
             first, second = (name_in_any_case(names, name) for name in pair)
             if first is None or second is None or (columns.exact and (first, second) != pair):
@@ -140,6 +148,7 @@ def name_in_any_case(names: Sequence[str], name_wanted: str) -> str | None:
     ColumnError
         If several are.
     """
+    # Blanks around a name, as some text tables have, do not count.
     matches = [name for name in names if name.strip().lower() == name_wanted.lower()]
     if len(matches) > 1:
         raise ColumnError(f"columns {' and '.join(matches)} differ in their case only; keep one")

@@ -30,7 +30,15 @@ SAME_STAR_PX = 0.1
 
 
 def require_sky(stars: StarList, purpose: str) -> None:
-    """Refuse a star list of several images that has no sky coordinates."""
+    """Refuse a star list of several images that has no sky coordinates.
+
+    Parameters
+    ----------
+    stars : path-like, table or positions
+        The list (`as_catalogue`).
+    purpose : str
+        What needs sky coordinates, for the message.
+    """
     table = as_catalogue(stars)
     if not table.positions().sky:
         raise ObservationError(
@@ -129,6 +137,7 @@ def with_origin(
 
 def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return True for positions (n, 2), x and y, on an image (rows, columns)."""
+    # Row and column of the pixel that a star is in.
     pixel = central_pixel(positions[:, ::-1])
     return np.asarray(((pixel >= 0) & (pixel < shape)).all(axis=1))
 
@@ -136,7 +145,18 @@ def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def check_overlap(
     image: ImageFile, table: Catalogue, columns: Positions, positions: np.ndarray
 ) -> None:
-    """Refuse a list without a star on the image, or with more there than the image has pixels."""
+    """Refuse a list without a star on the image, or with more there than the image has pixels.
+
+    Parameters
+    ----------
+    image : ImageFile
+    table : Catalogue
+    columns : Positions
+        Columns of the list, named in messages.
+    positions : ndarray, shape (n, 2)
+        0-based x and y, NaN where unknown.
+    """
+    # A list with more stars than pixels is not one of this image.
     height, width = image.shape
     size = f"{image.path} of {width} columns and {height} rows"
     count = np.count_nonzero(on_image(positions, image.shape))
@@ -252,6 +272,7 @@ def sky_to_pixel(
 
     # First by the projection without its distortions.
     stars = SkyCoord(ra, dec, unit="deg")
+    # Mode "wcs" is the linear part and the projection, without SIP or look-up tables.
     x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
     # Stars at most one size of the image off its edge.
     rows, columns = shape

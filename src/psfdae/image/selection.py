@@ -92,7 +92,10 @@ class Candidates:
 
     @classmethod
     def joined(cls, several: Sequence[Candidates]) -> Candidates:
-        """Return those of several observations, one after the other."""
+        """Return those of several observations, one after the other.
+
+        Rows of bright stars are shifted to those of the joined list.
+        """
         # Rows of bright stars count in the joined list.
         starts = accumulate((len(candidates.verdict) for candidates in several), initial=0)
         bright = [
@@ -128,7 +131,13 @@ class Candidates:
         )
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
-        """Return columns of every star of the list, and which good ones are held out, (n,) each."""
+        """Return columns of every star of the list, and which good ones are held out, (n,) each.
+
+        Parameters
+        ----------
+        held_out : ndarray of bool, shape (k,)
+            True for bright stars that no fit learns from.
+        """
         # Stars that are not good are in no part.
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row[held_out]] = "held out"
@@ -388,6 +397,7 @@ def completed(
     if not np.isfinite(place).all():  # all stars are as near then
         place = np.arange(len(stars))[:, None] * np.ones(2)
     nearest = cKDTree(place).query(place[incomplete], k=min(companions + 1, len(stars)))[1]
+    # The stamp within its margins: only there the scale is measured.
     start = stars.stamps.shape[-1] // 2 - stamp_px // 2
     stamp = np.s_[start : start + stamp_px, start : start + stamp_px]
     # The second time, neighbours that have bad pixels are complete, too.

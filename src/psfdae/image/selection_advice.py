@@ -24,7 +24,11 @@ def advice(candidates: Candidates, observation: Observation, stamp_px: int) -> l
 
 
 def saturation_advice(candidates: Candidates) -> str:
-    """Return advice on saturation, from where brightest pixels pile up."""
+    """Return advice on saturation, from where brightest pixels pile up.
+
+    Stars that are cut off have the same brightest pixel, however bright they are.
+    """
+    # Counts from which brightest pixels agree; infinite if they do not.
     level = piled_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
     if not np.isfinite(level):
         return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
@@ -39,7 +43,10 @@ def saturation_advice(candidates: Candidates) -> str:
 
 
 def gain_advice(candidates: Candidates) -> str:
-    """Return advice on the gain by sky and noise, if photons make it: variance = level / gain."""
+    """Return advice on the gain by sky and noise, if photons make it: variance = level / gain.
+
+    Photons of a sky of L counts make the noise σ = √(L / gain) counts, hence gain = L / σ².
+    """
     sky, noise = float(np.median(candidates.sky)), float(np.median(candidates.noise))
     sky_text = f"gain: the sky is {sky:.4g} counts, its noise {noise:.3g}"
     # A sky of fewer than 3 σ was probably subtracted.
@@ -75,9 +82,11 @@ def stamp_advice(
     typical = np.median(candidates.bright.aligned(), axis=0)[None]
     sides = np.arange(8, typical.shape[-1] + 1, 2)
     light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
+    # The first side that holds enough light.
     needed = int(sides[np.argmax(light >= light_wanted)])
     if abs(needed - stamp_px) < step_px:
         return None
+    # How many stamps of either size have a second star.
     shared = ", ".join(
         f"{100 * overlapping(candidates.position, side):.0f} % of {side} px"
         for side in (stamp_px, needed)

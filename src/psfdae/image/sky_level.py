@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -104,6 +105,12 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the noise (h, w) of pixels from the differences of neighbours, in squares of 64.
 
     It is infinite where neighbours do not differ: there is no noise with which to compare.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
     """
     # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
     difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
@@ -157,11 +164,7 @@ def noise_correlation(deviation: np.ndarray) -> float:
     if nearest - shared < 0.15:
         return 1.0
     # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
-    lags = [
-        (0, 1),
-        (0, 2),
-        *((rows_apart, columns_apart) for rows_apart in (1, 2) for columns_apart in range(-2, 3)),
-    ]
+    lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
     excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 
@@ -190,7 +193,21 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
 
 
 def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
+    """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    mesh_px : int
+        Side of the meshes.
+
+    Raises
+    ------
+    ValueError
+        If every mesh has more bad pixels than that.
+    """
     from photutils.background import Background2D
 
     # Squares of the pixels of an image in a very small or large unit would be 0 or infinite.
@@ -217,7 +234,16 @@ def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarra
 
 
 def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
-    """Return values of meshes (m, n), continued beyond the edges with a part of their slope."""
+    """Return values of meshes (m, n), continued beyond the edges with a part of their slope.
+
+    Parameters
+    ----------
+    mesh : ndarray, shape (m, n)
+    width : int
+        Number of meshes that are added on each side.
+    slope : float
+        0 repeats the edge, 1 continues the straight line through it.
+    """
     # Along rows, then along columns: the edge repeated, and the same with its slope.
     for axis, count in enumerate(mesh.shape):
         pads = [(width, width) if axis == padded_axis else (0, 0) for padded_axis in (0, 1)]
@@ -255,6 +281,16 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     """Return values of meshes (m, n) at the pixels of an image (h, w), by cubic splines.
 
     Beyond the middles of the outer meshes they go on with a part of their slope.
+
+    Parameters
+    ----------
+    mesh : ndarray, shape (m, n)
+    shape : tuple of int
+        Rows and columns of the image.
+    mesh_px : int
+        Side of a mesh in pixels.
+    slope : float
+        Part of the slope beyond the outer meshes, as of `_continued`.
     """
     from scipy import ndimage
 
@@ -278,6 +314,15 @@ def _with_structure(
 
     They are those of the meshes, and the part is 0, unless over 5 % of the image has structure that
     is not that of the sources.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+    level, noise : ndarray, shape (h, w)
+        Level and σ in meshes; the level is changed in place.
+    mesh_px : int
+        Side of these meshes.
     """
     # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
     # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
@@ -322,6 +367,16 @@ def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: n
 
     A level (h, w) that takes more than a quarter of them is that of the sources themselves. Without
     five sources of 50 σ, such as where their models are subtracted, there are none to lose.
+
+    Parameters
+    ----------
+    light : ndarray, shape (h, w)
+        Image above the sky of its meshes.
+    level : ndarray, shape (h, w)
+        Finer level that would be subtracted as well.
+    bad : ndarray of bool, shape (h, w)
+    noise : ndarray, shape (h, w)
+        σ of the pixels.
     """
     from scipy import ndimage
 
@@ -392,6 +447,14 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
 
     It is the same in all eighths of the columns, up to 3 px from the row and from 3 to 12 and 12 to
     24 px, slopes subtracted; and above a tenth of the noise and eight times its error.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, n)
+    good : ndarray of bool, shape (h, n)
+        Pixels that count.
+    reach_px : int
+        Rows on either side of a step that must show it, 24.
     """
     height, count = values.shape
     if height < 4 * reach_px or count < 64:

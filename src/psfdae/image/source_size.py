@@ -41,6 +41,7 @@ class SourceSize:
     @property
     def fwhm_px(self) -> float:
         """Twice the radius of half of the light, which is the FWHM of a Gaussian."""
+        # No light is within radius 0.
         light, radius = (np.append(0.0, values) for values in (self.light, self.radius_px))
         return 2.0 * float(np.interp(0.5, light, radius))
 
@@ -144,8 +145,10 @@ def size_of_windows(
     for star, (window, good, (row, column)) in enumerate(
         zip(windows, measured, centre, strict=True)
     ):
+        # Distance of each pixel from the centre of the star.
         radius = np.hypot(axis[:, None] - row, axis - column)
         rings[star] = ring_light(window[good], radius[good], edges)
+        # A neighbour farther out may be brighter than the star.
         core = np.where(radius < max(4.0, reach_px / 6), window, -np.inf)
         peak = np.unravel_index(core.argmax(), core.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))
@@ -168,6 +171,7 @@ def size_of_windows(
     dark = (profile <= 3.0 * error) & (edges[1 : last + 1] > 4)
     end = int(np.argmax(dark)) if dark.any() else last
     profile, end_px = profile[:end], edges[end]
+    # Light within radius r: ∫ p(r) 2πr dr as a sum over rings.
     light = np.cumsum(profile * area[:end])
     if not len(light) or light[-1] <= 0:
         return None
@@ -185,6 +189,7 @@ def size_of_windows(
     stamp = np.median(
         windows[usable][:, middle_px, middle_px] / flux[usable][:, None, None], axis=0
     )
+    # σ of a Gaussian is √(Σp² / Σ|∇p|²), as Σ|∇p|² = Σp² / σ² in two dimensions.
     rows, columns = np.gradient(stamp)
     gradient = float(np.square(rows).sum() + np.square(columns).sum())
     sharpness = float(np.sqrt(np.square(stamp).sum() / gradient)) if gradient > 0 else 1.0
@@ -214,6 +219,7 @@ def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.
         if not len(pixels):
             continue
         if edges[k + 1] > 4:
+            # Median: the mean of the one or two middle values.
             middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
             pixels = np.partition(pixels, middle)[middle]
         light[k] = pixels.mean()

@@ -138,9 +138,9 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
 
     Pixel k covers k − ½ ≤ position < k + ½.
     """
-    far = LARGEST_POSITION_PX
-    rounded = np.floor(np.nan_to_num(position, nan=-far, posinf=far, neginf=-far) + 0.5)
-    return np.asarray(np.clip(rounded, -far, far), np.int64)
+    limit = LARGEST_POSITION_PX
+    rounded = np.floor(np.nan_to_num(position, nan=-limit, posinf=limit, neginf=-limit) + 0.5)
+    return np.asarray(np.clip(rounded, -limit, limit), np.int64)
 
 
 def cut_image(
@@ -167,6 +167,7 @@ def cut_image(
     inside : ndarray of bool, the same shape: the pixel is on the image
     truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
     """
+    # Rows and columns of every stamp in the image.
     side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
     rows = central_pixel(y)[:, None] + side
     columns = central_pixel(x)[:, None] + side
@@ -180,6 +181,7 @@ def cut_image(
     if not inside.all():
         stamps = np.where(inside, stamps, 0)
     stamp = slice(margin, margin + stamp_px)
+    # A star is whole if all rows and columns of its stamp, margin aside, are on the image.
     is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
     return stamps, inside, np.asarray(~is_whole)
 
@@ -238,6 +240,7 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     ring = stamps.reshape(size)[:, border]
     if bad is None:
         return np.asarray(mad_std(ring, axis=1), np.float64)
+    # Bad pixels of the ring are left out, but for stamps of which all of the ring is bad.
     hidden = bad.reshape(size)[:, border]
     hidden &= ~hidden.all(axis=1, keepdims=True)
     ring = np.where(hidden, np.nan, ring)
@@ -291,12 +294,10 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).
 
-SMOOTHED_NOISE = 0.53
-"""σ of the difference of two pixels of a smoothed stamp, √2 · (6/16), in σ of a pixel."""
-
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
     """Return stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
+    # [1, 2, 1] along columns, then along rows; 16 is the sum of the weights.
     padded = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
@@ -338,6 +339,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
         (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie within
         `jitter_px`, or of which that cannot be said.
     """
+    # Pixels in the middle that the jitter of the training reaches.
     middle = stamps.shape[-1] // 2
     centre = slice(middle - jitter_px, middle + jitter_px + 1)
     # Brightest pixels of the stamps, and of the stamps smoothed once more.
@@ -350,9 +352,10 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
     offset = np.zeros((len(stamps), 2), dtype=np.int16)
     if not star.size:
         return offset
-    # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels.
+    # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels, which is
+    # √2 · 6/16 = 0.53 of the σ of a pixel.
     excess = smooth[star].max(axis=(1, 2)) - smooth[star, centre, centre].max(axis=(1, 2))
-    significant = excess > 5.0 * SMOOTHED_NOISE * border_scatter(stamps[star])
+    significant = excess > 5.0 * 0.53 * border_scatter(stamps[star])
     offset[star[significant]] = brightest[star[significant]]
     return offset
 
@@ -379,6 +382,7 @@ def cut(window: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> 
     ndarray, shape (n, d, d)
     """
     side = window.shape[-1]
+    # Stamps without an offset are the middle of the window.
     pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
     middle = window[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
     if offset is None or not offset.any():

@@ -57,12 +57,10 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "x_error": ("pix", ".3g", "standard error of x_fit, or of x"),
     "y_error": ("pix", ".3g", "standard error of y_fit, or of y"),
     "background_error": (OF_IMAGE, ".3g", "standard error of background"),
-    "corr_flux_background": ("", ".3f", "correlation of errors"),
-    "corr_flux_y": ("", ".3f", "correlation of errors"),
-    "corr_flux_x": ("", ".3f", "correlation of errors"),
-    "corr_background_y": ("", ".3f", "correlation of errors"),
-    "corr_background_x": ("", ".3f", "correlation of errors"),
-    "corr_y_x": ("", ".3f", "correlation of errors"),
+    **{
+        f"corr_{pair}": ("", ".3f", "correlation of errors")
+        for pair in ("flux_background", "flux_y", "flux_x", "background_y", "background_x", "y_x")
+    },
     "shift_x": ("pix", "", "stamp moved along columns"),
     "shift_y": ("pix", "", "stamp moved along rows"),
     "group": ("", "", "number of the stars that were fitted together"),
@@ -118,8 +116,20 @@ def star_table(
     return table
 
 
-def shown_with_digits(table: Table, form: str = ".4g") -> Table:
-    """Return the table, whose columns of real numbers are shown in a format from now on."""
+def table_of_rows(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Table:
+    """Return a table of rows that have the same keys; real numbers are shown in a format.
+
+    Parameters
+    ----------
+    rows : sequence of mappings
+        At least one.
+    form : str
+        Format in which real numbers are shown; all digits are kept.
+    """
+    from astropy.table import Table
+
+    # Columns stand in the order of the keys of the first row.
+    table = Table({name: [row[name] for row in rows] for name in rows[0]})
     for column in table.itercols():
         if column.dtype.kind == "f":
             column.info.format = form
@@ -131,6 +141,11 @@ def fits_values(column: Column) -> np.ndarray:
 
     Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
     that are missing are NaN, whole ones the least of their type.
+
+    Parameters
+    ----------
+    column : Column, MaskedColumn or Quantity
+        Numbers or text, perhaps masked, perhaps with a unit, which is left out.
     """
     # Values without mask and unit, and which of them are missing.
     unmasked = getattr(column, "unmasked", column)
@@ -147,20 +162,34 @@ def fits_values(column: Column) -> np.ndarray:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
     elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
         values = values.astype(np.float64)
+    # FITS has no masks: a value stands for a missing one.
     if is_missing.any():
         values = np.where(is_missing, _missing(values.dtype), values).astype(values.dtype)
     return values
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return what stands for a missing value in FITS."""
+    """Return what stands for a missing value in FITS.
+
+    Parameters
+    ----------
+    dtype : dtype
+        Type of the column: NaN for real numbers, the least whole number, False for truth values.
+    """
     if dtype.kind == "f":
         return np.nan
     return np.iinfo(dtype).min if dtype.kind == "i" else False
 
 
 def as_fits(table: QTable, name: str) -> BinTableHDU:
-    """Return a table as an extension of a FITS file, with units, meanings and missing values."""
+    """Return a table as an extension of a FITS file, with units, meanings and missing values.
+
+    Parameters
+    ----------
+    table : QTable
+    name : str
+        Name of the extension.
+    """
     from astropy.io import fits
     from astropy.table import Table
 
@@ -206,11 +235,13 @@ def write_table(path: Path, table: QTable) -> None:
     plain = Table(table)  # columns with units in place of quantities
     with atomic_path(path) as temporary, silent():
         if path.suffix.lower() == ".fits":
+            # A table is an extension behind an empty primary one.
             hdus = fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")])
             hdus.writeto(temporary, overwrite=True)
         elif path.suffix.lower() == ".ecsv":
             plain.write(temporary, format="ascii.ecsv", overwrite=True)
         else:
+            # Texts of a list may begin like a formula.
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
             # Formats are those of the columns; numbers that are missing are written as such.
@@ -222,7 +253,14 @@ def write_table(path: Path, table: QTable) -> None:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML; cells of the rows are HTML, those of the head are text."""
+    """Return a table of HTML; cells of the rows are HTML, those of the head are text.
+
+    Parameters
+    ----------
+    head : sequence of str, length k
+    rows : sequence of sequences of str, length k each
+    """
+    # Head, then a line for each row.
     cells = "".join(f"<th>{escape(name)}</th>" for name in head)
     lines = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
     return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

@@ -37,6 +37,12 @@ def with_trails(image: np.ndarray, bad_pixels: BadPixels) -> BadPixels:
     Without a trail, they are returned with the sky of the image, which was measured to find one,
     unless the image is so large that its means over squares were searched. They are returned as
     they are if no sky can be measured, or if the image is smaller than a trail.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad_pixels : BadPixels
+        Bad pixels of other kinds, which are left out of the search.
     """
     if min(image.shape) < 100:
         return bad_pixels
@@ -45,6 +51,7 @@ def with_trails(image: np.ndarray, bad_pixels: BadPixels) -> BadPixels:
     values, hidden = image, bad_pixels.mask
     if size > 1:
         rows, columns = (n // size for n in image.shape)
+        # Mean of the good pixels of each square; a square without any is bad.
         squares = rows, size, columns, size
         good = np.where(hidden, 0.0, image)[: rows * size, : columns * size]
         count = (~hidden[: rows * size, : columns * size]).reshape(squares).sum(axis=(1, 3))
@@ -98,6 +105,7 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
     for number, box in enumerate(ndimage.find_objects(label), 1):
         if np.hypot(*(part.stop - part.start for part in box)) < shortest_px:
             continue
+        # Pixels of this source, counted from the corner of the image.
         row, column = np.nonzero(label[box] == number)
         row, column = row + box[0].start, column + box[1].start
         for _ in range(4):
@@ -115,7 +123,18 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
 
 
 def line_through(x: np.ndarray, y: np.ndarray) -> Line:
-    """Return the line on which most of some pixels (n,) lie (Hough 1962, US patent 3069654)."""
+    """Return the line on which most of some pixels (n,) lie (Hough 1962, US patent 3069654).
+
+    Parameters
+    ----------
+    x, y : ndarray of int, shape (n,)
+        Columns and rows of the pixels.
+
+    Returns
+    -------
+    Line
+        Least squares on the pixels within 3 px of the line that has most of them.
+    """
     # Number of pixels in strips of 2 px, for lines of all directions.
     line, most_pixels = Line(0.0, 0.0), 0
     thinned = np.s_[:: max(1, len(x) // 5000)]
@@ -131,6 +150,7 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
         is_near = np.abs(across) < reach_px
         if np.count_nonzero(is_near) < 10:
             break
+        # A line that is turned by −arctan(slope) follows the pixels; its distance is their mean.
         slope, _ = np.polyfit(along[is_near], across[is_near], 1)
         turned = Line(line.angle_rad - float(np.arctan(slope)), 0.0)
         line = turned._replace(distance_px=float(np.mean(turned.across(x[is_near], y[is_near]))))
@@ -158,6 +178,7 @@ def trail_on_line(
     across, along = line.across(column, row), line.along(column, row)
     part = ((along - float(along.min())) / part_px).astype(int)
     middle = np.abs(across) < 1.0
+    # Pixels of each part within 1 px of the line, and those of them that are bright.
     pixels = np.bincount(part[middle], minlength=part.max() + 1)
     is_bright = np.bincount(part[middle], bright[middle], minlength=len(pixels)) > 0.75 * pixels
     is_bright &= pixels > 0
@@ -181,6 +202,7 @@ def trail_on_line(
     inside = (part >= start) & (part < end)
     ring = np.abs(across)
     for half_px in range(2, 20):
+        # A strip of 1 px on either side at this distance.
         edge = inside & (ring >= half_px) & (ring < half_px + 1)
         if edge.any() and np.median(flat[edge]) < 1.5 * np.median(noise[edge]):
             is_narrow = (end - start) * part_px > 20 * half_px

@@ -54,6 +54,7 @@ def star_grid(position: np.ndarray) -> np.ndarray:
         members = by_x[start : start + rows]
         if is_located:
             members = members[np.argsort(position[members, 1], kind="stable")]
+        # Column of the lattice, and place in it.
         grid[members] = np.stack([np.full(members.size, column), np.arange(members.size)], axis=1)
     return grid
 
@@ -123,9 +124,8 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
 
 def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
     """Return the stack of all training stars, (s, s), centre at index (s//2, s//2)."""
-    training = stars.of(~held_out)
-    everyone = np.zeros(len(training), dtype=int)
-    return np.asarray(stacks(training.aligned(), training.snr, everyone, 1)[0])
+    # The field as a whole is the only part: all templates are the same.
+    return np.asarray(templates_of(stars, held_out, bins=1)[0])
 
 
 def make_images(

@@ -5,12 +5,14 @@ the centre of every star (Gauss-Newton). Light is the same at all phases of the 
 that condition, splines and fluxes could change with the phase against each other. Changes over the
 field are as small a part of the wings as of the core, unless the stars say otherwise. Stars that
 are unlike the others do not count, and pixels that are brighter or fainter than the model count
-less: they may show a neighbour. `psfdae.methods.field_search` chooses the options.
+less: they may show a neighbour. `psfdae.methods.field_search` chooses the options, by stars
+that were left out (`psfdae.methods.field_errors`). Equations are numbered as on the page
+docs/field_model.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,11 +25,10 @@ from psfdae.methods.field_spline import (
     deform_splines,
     draw_splines,
     field_terms,
-    image_design,
     solve_splines,
     spacing_of,
 )
-from psfdae.moments import cubic_splines, windowed_centres
+from psfdae.moments import cubic_splines, robust_scatter, windowed_centres
 from psfdae.progress import Advance
 
 
@@ -49,8 +50,7 @@ class FitOptions:
     change : float
         Standard deviation of a coefficient about that of another exposure, over its value.
     tolerance : float
-        Residual at which the conjugate gradients stop. Errors of stars left out hardly change up to
-        3e-3, which fits have that are only compared.
+        Residual at which the conjugate gradients stop (`FitSettings.compared_tolerance`).
     """
 
     knots: int
@@ -71,9 +71,9 @@ class FitSettings:
         Rounds of splines, centres and fluxes; with more, centres follow what splines cannot.
     centre_steps, left_out_steps : int
         Gauss-Newton steps of a star in a round, and of a star that was left out.
-    window_px, window_reach_px, max_offset_px : float
-        Width of the window of the first centroids, how far these may move, and how far a centre may
-        be from the brightest pixel, in pixels.
+    window_px, window_reach_px, wide_reach_px : float
+        Width of the window of the first centroids, how far these may move, and how far if stars are
+        rings, in pixels.
     model_error, min_error : float
         Error of the model over a pixel's light, which no polynomial follows; error of a pixel over
         the flux, at least.
@@ -93,6 +93,9 @@ class FitSettings:
         predicted, the further groups are not.
     few_stars : int
         With fewer stars, their number limits the order of the polynomial.
+    compared_tolerance : float
+        `FitOptions.tolerance` of fits that are only compared: up to it, errors of stars left out
+        hardly change.
     """
 
     rounds: int = 3
@@ -100,7 +103,7 @@ class FitSettings:
     left_out_steps: int = 5
     window_px: float = 1.2
     window_reach_px: float = 1.0
-    max_offset_px: float = 1.5
+    wide_reach_px: float = 1.5
     model_error: float = 0.02
     min_error: float = 1e-5
     outlier_sigma: float = 3.0
@@ -113,6 +116,25 @@ class FitSettings:
     folds: int = 5
     enough_stars: int = 300
     few_stars: int = 16
+    compared_tolerance: float = 3e-3
+
+
+class FieldUncertainty(NamedTuple):
+    """Scatter of fields that are as likely as the fitted one; nothing of a fit that was stored.
+
+    Attributes
+    ----------
+    redrawn : sequence of FieldModel
+        Fields that the same stars give with other noise.
+    parted : sequence of FieldModel
+        Fields as uncertain as without some stars after the others.
+    unknown_light : float
+        Scatter of the light in stamps that the field takes for sky, over the flux.
+    """
+
+    redrawn: Sequence[FieldModel] = ()
+    parted: Sequence[FieldModel] = ()
+    unknown_light: float = 0.0
 
 
 class FieldFit(NamedTuple):
@@ -131,12 +153,8 @@ class FieldFit(NamedTuple):
         Stars that count.
     residual : ndarray, shape (n, s, s)
         Image less model of a star of flux 1; 0 where a pixel was not measured.
-    redrawn : sequence of FieldModel
-        What the same stars give with other noise.
-    parted : sequence of FieldModel
-        Fields as uncertain as without some stars after the others.
-    unknown_light : float
-        Scatter of the light in stamps that is taken for sky, over the flux.
+    uncertainty : FieldUncertainty
+        Errors of the model, if they were measured.
     """
 
     model: FieldModel
@@ -145,38 +163,19 @@ class FieldFit(NamedTuple):
     centre: np.ndarray
     good: np.ndarray
     residual: np.ndarray
-    redrawn: Sequence[FieldModel] = ()
-    parted: Sequence[FieldModel] = ()
-    unknown_light: float = 0.0
+    uncertainty: FieldUncertainty = FieldUncertainty()
 
+    def list_error(self, stars: BrightStars) -> np.ndarray:
+        """Return median and robust RMS of fitted less listed centres (row, column), shape (2, 2).
 
-class LeftOut(NamedTuple):
-    """Stars that were left out of a fit, with flux, sky and centre fitted to them.
-
-    Attributes
-    ----------
-    coefficients : ndarray, shape (K, N, N)
-        Splines of the fit to the other stars.
-    light : ndarray, shape (2, n)
-        What looks like sky in their stamps, over the flux, and its σ.
-    residual, weight : ndarray, shape (n, d, d)
-        Residuals of stars of flux 1; expected light of pixels that were measured, else 0.
-    """
-
-    coefficients: np.ndarray
-    light: np.ndarray
-    residual: np.ndarray
-    weight: np.ndarray
-
-    def squared_errors(self) -> np.ndarray:
-        """Return the mean squared residual of each star, weighted by the light m in its pixels.
-
-        By Cauchy and Schwarz, the error Σ m δ / Σ m² of a flux by residuals δ is at most that of
-        Σ m δ².
+        NaN if fewer than five stars have a listed centre. The RMS is at least 0.05 px.
         """
-        return np.asarray(
-            (self.residual**2 * self.weight).sum(axis=(1, 2)) / self.weight.sum(axis=(1, 2))
-        )
+        offset_px = (self.centre + stars.peak - stars.listed)[self.good]
+        offset_px = offset_px[np.isfinite(offset_px).all(axis=1)]
+        if len(offset_px) < 5:
+            return np.full((2, 2), np.nan)
+        scatter = np.maximum(robust_scatter(offset_px), 0.05)
+        return np.stack([np.median(offset_px, axis=0), scatter])
 
 
 @dataclass(frozen=True)
@@ -227,15 +226,16 @@ class FieldFitter:
     @classmethod
     def of(cls, stars: BrightStars, background: float, frame_px: int, stamp_px: int) -> FieldFitter:
         """Return the fitter of bright stars; for the parameters see `fit_field`."""
-        images, measured = stars.framed(frame_px)
-        # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
-        # of all light does, 1.4 σ.
-        sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
+        # Range of each coordinate over the stars; (0, 0) for one that no star has.
         finite_columns = [column[np.isfinite(column)] for column in stars.place.T]
         ends = [
             (column.min(), column.max()) if column.size else (0.0, 0.0) for column in finite_columns
         ]
         low, high = np.transpose(ends)
+        images, measured = stars.framed(frame_px)
+        # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
+        # of all light does, 1.4 σ.
+        sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
         return cls(
             images=images,
             measured=measured,
@@ -256,7 +256,7 @@ class FieldFitter:
         return np.asarray(np.abs(self.axis + 0.5) < self.stamp_px / 2)
 
     def fit(self, options: FitOptions) -> FieldFit:
-        """Fit field, fluxes and centres to all stars by turns."""
+        """Fit field, fluxes and centres to all stars by turns (eq. 2 to 4)."""
         settings, spacing = self.settings, spacing_of(len(self.axis), options.knots)
         # Coordinates that do not count have a range of no width; those at the end are left out.
         count = max((1, *options.star_terms)) + 1
@@ -265,36 +265,32 @@ class FieldFitter:
             if coordinate not in options.star_terms:
                 high[coordinate] = low[coordinate]
         terms = field_terms(self.place, low, high, options.order)
+        # First fluxes are the light in the frames, first centres centroids in a Gaussian window.
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
         is_usual = self.window_px == settings.window_px
-        reach = settings.window_reach_px if is_usual else settings.max_offset_px
+        reach = settings.window_reach_px if is_usual else settings.wide_reach_px
         centre = windowed_centres(self.images, start, window, 4, reach)
         # Weights are those of a star's expected light, first that of the median star. Those of its
         # own pixels would be larger where noise makes them fainter, and light in the wings too
         # little (Humphrey, Liu & Buote 2009, ApJ 693, 822).
         light = np.median(self.images / flux[:, None, None], axis=0)
-        robust_weight, noise = np.ones(self.images.shape), self._weight(flux, light)
+        robust_weight, noise = np.ones(self.images.shape), self.pixel_weight(flux, light)
         coefficients: np.ndarray | None = None
         for turn in range(settings.rounds):
-            # Splines at given centres and fluxes, then centres and fluxes at given splines.
+            # Splines at given centres and fluxes (eq. 2), then centres and fluxes at given splines
+            # (eq. 4).
             data = self.images / flux[:, None, None]
             weight = noise * robust_weight
-            coefficients = self._splines(
+            coefficients = self.fit_splines(
                 options, terms, data, weight * good[:, None, None], centre, coefficients
             )
             splines = np.tensordot(terms, coefficients, 1)
             factor, centre, _ = adjust_stars(
-                splines,
-                data,
-                weight,
-                centre,
-                self.axis,
-                spacing,
-                settings.centre_steps,
-                max_offset_px=settings.max_offset_px,
+                splines, data, weight, centre, self.axis, spacing, settings.centre_steps
             )
-            # The mean star in the middle of its stamp has the sum 1.
+            # The mean star in the middle of its stamp has the sum 1: a factor of all splines is one
+            # of all fluxes.
             middle = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(draw_splines(middle, sides, np.zeros((1, 2)), spacing).sum())
@@ -306,8 +302,9 @@ class FieldFitter:
             inside = star_images[:, self.in_stamp][:, :, self.in_stamp].sum(axis=(1, 2))
             flux, star_images = flux * inside, star_images / inside[:, None, None]
             residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)
-            # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all.
-            noise = self._weight(flux, star_images)
+            # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all. In the
+            # first round, the field is not known well enough to tell stars.
+            noise = self.pixel_weight(flux, star_images)
             square = residual**2 * noise
             chi2 = square.sum(axis=(1, 2)) / np.maximum(self.measured.sum(axis=(1, 2)), 1)
             robust_weight = 1.0 / (1.0 + square / settings.outlier_sigma**2)
@@ -318,77 +315,24 @@ class FieldFitter:
         model = FieldModel(coefficients, low, high, spacing)
         return FieldFit(model, options, flux, centre, good, residual)
 
-    def left_out(self, fit: FieldFit) -> Iterator[LeftOut]:
-        """Yield the stars of one fold after the other, as the others predict them.
-
-        Of many stars, some folds are enough. Splines are fitted without these stars, to the fluxes
-        and centres of the fit.
-        """
-        settings, spacing = self.settings, fit.model.spacing
-        terms = fit.model.terms(self.place)
-        data = self.images / fit.flux[:, None, None]
-        star_images = fit.model.images(terms, fit.centre, len(self.axis))
-        weight, noise = self._weight(fit.flux, star_images), self._variance(fit.flux, star_images)
-        weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
-        fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
-        axis = self.axis[self.in_stamp]
-        box = np.ix_(np.arange(len(terms)), self.in_stamp, self.in_stamp)
-        for left_out in range(settings.folds):
-            used = weight * ((fold != left_out) & fit.good)[:, None, None]
-            coefficients = self._splines(
-                fit.options, terms, data, used, fit.centre, fit.model.coefficients
-            )
-            judged = np.flatnonzero((fold == left_out) & fit.good)
-            if not len(judged):
-                continue
-            images, is_measured = data[box][judged], self.measured[box][judged].astype(float)
-            splines = np.tensordot(terms[judged], coefficients, 1)
-            flux, centre, residual = adjust_stars(
-                splines,
-                images,
-                is_measured,
-                fit.centre[judged],
-                axis,
-                spacing,
-                settings.left_out_steps,
-                sky=True,
-                max_offset_px=settings.max_offset_px,
-            )
-            # The sky b of weighted least squares with the design D of flux, row, column and sky is
-            # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
-            # median around the star which was subtracted from them.
-            design = image_design(splines, centre, axis, spacing, sky=True)
-            turned = design * weight[box][judged].reshape(len(judged), 1, -1)
-            influence = np.linalg.solve(turned @ design.transpose(0, 2, 1), turned)[:, 3]
-            level = (influence * images.reshape(len(judged), -1)).sum(axis=1)
-            variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
-            variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
-            yield LeftOut(
-                coefficients=coefficients,
-                light=len(axis) ** 2 / flux * [level, np.sqrt(variance)],
-                residual=residual,
-                weight=is_measured * np.maximum(star_images[box][judged], 0.0),
-            )
-            judged_stars += len(judged)
-            if judged_stars >= settings.enough_stars:
-                break
-
-    def _weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Return 1/variance of pixels of flux 1, with errors of the model; 0 where not measured.
+    def pixel_weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """Return 1/variance w of pixels of flux 1 (eq. 3); 0 where not measured.
 
         `light` is that expected of stars of flux 1, of each (n, s, s) or of all (s, s).
         """
-        of_model = self.settings.model_error * np.maximum(light, 0.0)
-        variance = self._variance(flux, light) + of_model**2 + self.settings.min_error**2
+        # Noise, and the error (0.02 f)² + (10⁻⁵)² of the model.
+        model_error = self.settings.model_error * np.maximum(light, 0.0)
+        variance = self.pixel_variance(flux, light) + model_error**2 + self.settings.min_error**2
         return np.where(self.measured, 1.0 / variance, 0.0)
 
-    def _variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
+    def pixel_variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the variance of pixels of stars of flux 1 by the sky and the star's photons."""
+        # (σ/F)² + f / (g F), the first two terms of eq. 3.
         factor = 1.0 / flux[:, None, None]
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
         return np.asarray((noise * factor) ** 2 + np.maximum(light, 0.0) * factor / photons)
 
-    def _splines(
+    def fit_splines(
         self,
         options: FitOptions,
         terms: np.ndarray,
@@ -397,7 +341,7 @@ class FieldFitter:
         centre: np.ndarray,
         start: np.ndarray | None,
     ) -> np.ndarray:
-        """Return coefficients (K, N, N) of weighted least squares at given centres (eq. 2).
+        """Return coefficients (K, N, N) of weighted least squares at given centres (eq. 2, 5).
 
         Parameters
         ----------
@@ -409,14 +353,18 @@ class FieldFitter:
         start : ndarray, shape (K, N, N), or None
             Coefficients of the round before.
         """
+        # Stars without a pixel that counts add nothing.
         used = weight.any(axis=(1, 2))
         terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
         shape = (terms.shape[1], options.knots, options.knots)
         spacing, settings = spacing_of(len(self.axis), options.knots), self.settings
+        # B-splines of the rows and columns of each star's frame, at its centre.
         rows, columns = (
             cubic_splines(self.axis[None] - centre[:, i, None], options.knots, spacing)
             for i in (0, 1)
         )
+        # Smoothness η_k, ten times as large beyond the constant term, and the ridge ρ of the first
+        # round.
         penalty = np.full((shape[0], 1, 1), settings.varying_smoothness * options.smoothness)
         penalty[0] = options.smoothness
         ridge, prior_coefficients = np.full(shape, settings.ridge), np.zeros(shape)
@@ -424,14 +372,16 @@ class FieldFitter:
             # Only the difference to the other exposure is fitted, after its stretch and blur.
             prior_coefficients = deform_splines(self.prior, terms, data, weight, (rows, columns))
             change = options.change * np.abs(prior_coefficients[0]) + settings.min_coefficient
+            # ρ: a change by `options.change` of the coefficient is one σ.
             ridge[:] = 1.0 / change**2
             ridge[1:] /= settings.varying_change**2
             image = rows @ np.tensordot(terms, prior_coefficients, 1) @ columns.transpose(0, 2, 1)
             data = data - image
         elif start is not None:
-            # Changes over the field are a part of the mean star.
+            # Changes over the field are a part of the mean star of the round before.
             change = settings.field_change * np.abs(start[0]) + settings.min_coefficient
             ridge[1:] = 1.0 / change**2
+        # Iterations begin at the coefficients of the round before.
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(

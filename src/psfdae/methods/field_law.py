@@ -1,9 +1,10 @@
 """Law of the stars of a field: the PSF at their place, residuals about it, and their centres.
 
 Bright stars give the PSF at every place of the field (`psfdae.methods.field_spline`). What this
-model leaves of them gives the covariance by which real stars differ from it. The centre of a star
-in its stamp is a node of a square lattice that is finer than a pixel. In each node, a stamp x of a
-star of flux F is
+model leaves of them gives the covariance by which real stars differ from it
+(`psfdae.methods.field_residuals`). The centre of a star in its stamp is a node of a square lattice
+that is finer than a pixel (`psfdae.methods.field_nodes`). In each node, a stamp x of a star of flux
+F is (eq. 6)
 
     x = F (a m + Lᵀ t + e) + noise,   e ~ N(0, C),   t ~ N(0, diag(σ²)),
 
@@ -20,21 +21,21 @@ is known is one node at exactly that place. The posterior of stars by this law i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import ceil, isqrt
-from typing import Annotated, NamedTuple
+from math import isqrt
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
-from psfdae.methods.field_spline import SLOPE_PX, STAR_TERMS, FieldModel, spacing_of
-from psfdae.methods.gaussians import NodeAxes
+from psfdae.methods.field_nodes import Node, NodeAxes, Residuals, lattice_nodes
+from psfdae.methods.field_residuals import MARGIN_PX, phase_of, phases_of
+from psfdae.methods.field_spline import STAR_TERMS, FieldModel, spacing_of
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
-
-MARGIN_PX = 2
-"""Width in pixels of the margin around a stamp in which field and residuals are known as well."""
 
 
 @dataclass(frozen=True)
@@ -94,41 +95,6 @@ class FieldSettings(Group):
     threads: Count = Field(1, description="Threads of the linear algebra")
 
 
-class Node(NamedTuple):
-    """Node of the lattice of centres: a centre, and what stars look like that stand there.
-
-    Attributes
-    ----------
-    images : ndarray, shape (K + 1, P)
-        Image of each of the field's K terms; the mean residual of the training stars.
-    image_sums : ndarray, shape (K,)
-        Sum of each term's image.
-    residual_modes : ndarray, shape (r, P)
-        Rows R of the residual covariance C = RᵀR + diag(`diagonal`).
-    field_modes : ndarray, shape (K, P)
-        Rows that the variation over the field adds to R where a star's position is unknown.
-    derivatives : ndarray, shape (3, P)
-        Rows of L: change of a star of flux 1 with the sky, and with row and column of its centre.
-    diagonal : ndarray, shape (P,)
-        Variance of the residuals beyond their modes.
-    """
-
-    images: np.ndarray
-    image_sums: np.ndarray
-    residual_modes: np.ndarray
-    field_modes: np.ndarray
-    derivatives: np.ndarray
-    diagonal: np.ndarray
-
-    def image_weights(self, terms: np.ndarray) -> np.ndarray:
-        """Return weights (n, K + 1) of the images that add up to PSFs m of sum 1.
-
-        `terms` are those of the field at the positions of n stars, (n, K).
-        """
-        sums = (terms @ self.image_sums)[:, None]
-        return np.hstack([terms / sums, np.ones((len(terms), 1))])
-
-
 @dataclass(frozen=True, eq=False)
 class FieldLaw:
     """Distribution of the stars of an image: the PSF over the field, and residuals about it.
@@ -137,7 +103,7 @@ class FieldLaw:
     ----------
     coefficients, low, high : ndarray
         Those of the `FieldModel`.
-    usual, spread : ndarray, shape (K,) and (K, K)
+    mean_terms, terms_covariance : ndarray, shape (K,) and (K, K)
         Mean and covariance of the terms of the field over the training stars.
     offset : ndarray, shape (f², w²)
         Mean residual at the f phases of a pixel along rows and columns, in frames of
@@ -151,23 +117,20 @@ class FieldLaw:
         was no list.
     noise : NoiseModel
     settings : FieldSettings
-    measures_flux : bool
-        `estimate` measures flux and sky; otherwise the flux is 1 and the sky 0.
     limits : PosteriorLimits
     """
 
     coefficients: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    usual: np.ndarray
-    spread: np.ndarray
+    mean_terms: np.ndarray
+    terms_covariance: np.ndarray
     offset: np.ndarray
     modes: np.ndarray
     diagonal: np.ndarray
     listed: np.ndarray
     noise: NoiseModel
     settings: FieldSettings
-    measures_flux: bool = False
     limits: PosteriorLimits = PosteriorLimits()
     _axes_cache: dict[tuple[int, bool], NodeAxes] = field(
         default_factory=dict, init=False, repr=False
@@ -178,6 +141,7 @@ class FieldLaw:
     @cached_property
     def model(self) -> FieldModel:
         """The PSF at every place of the field (eq. 1)."""
+        # Knots cover the frame, a stamp with its margin.
         coefficients = self.coefficients.astype(np.float64)
         spacing = spacing_of(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
         return FieldModel(coefficients, self.low, self.high, spacing)
@@ -192,7 +156,7 @@ class FieldLaw:
         """Side of a stamp in pixels."""
         return isqrt(self.offset.shape[-1]) - 2 * MARGIN_PX
 
-    def terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    def terms(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the terms of the field for each star, and whether its position is known.
 
         Terms of an unknown position, magnitude or colour are their mean over the training stars. A
@@ -200,117 +164,139 @@ class FieldLaw:
 
         Parameters
         ----------
-        position : ndarray, shape (n, 2) to (n, 4), or None
-            x, y, magnitude and colour; NaN where unknown. None if nothing is known.
-        count : int
-            Number of stars n if there are no positions.
+        position : ndarray, shape (n, 2) to (n, 4)
+            x, y, magnitude and colour; NaN where unknown.
 
         Returns
         -------
         terms : ndarray, shape (n, K)
         position_known : ndarray of bool, shape (n,)
         """
-        coordinates = np.full((count if position is None else len(position), 4), np.nan)
-        if position is not None:
-            coordinates[:, : position.shape[1]] = position
+        # What is left out of the position is not known.
+        coordinates = np.full((len(position), 4), np.nan)
+        coordinates[:, : position.shape[1]] = position
         # Terms of x and y first, then two of each star property that changes the PSF.
-        is_known, properties = np.isfinite(coordinates), self.model.of_star
+        is_known, properties = np.isfinite(coordinates), self.model.star_coordinates
         place_known = is_known[:, :2].all(axis=1) | (self.order == 0)
-        place_terms = len(self.usual) - STAR_TERMS * len(properties)
-        term_known = np.hstack(
-            [
-                np.repeat(place_known[:, None], place_terms, axis=1),
-                np.repeat(is_known[:, properties], STAR_TERMS, axis=1),
-            ]
+        property_known = is_known[:, properties]
+        place_terms = len(self.mean_terms) - STAR_TERMS * len(properties)
+        term_known = np.repeat(
+            np.column_stack([place_known, property_known]),
+            [place_terms, *[STAR_TERMS] * len(properties)],
+            axis=1,
         )
-        position_known = place_known & is_known[:, properties].all(axis=1)
+        position_known = place_known & property_known.all(axis=1)
         terms = self.model.terms(np.nan_to_num(coordinates))
-        return np.where(term_known, terms, self.usual), position_known
+        return np.where(term_known, terms, self.mean_terms), position_known
+
+    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
+        """Return the field's PSFs at positions, as `FieldModel.images` draws them.
+
+        The star lies at its sub-pixel phase in the middle pixel. Its flux is that for which a star
+        in the middle of its pixel has the sum 1 in its stamp: a PSF keeps its flux where it moves
+        with its star, as it does in photometry, though some light then crosses the stamp's edge.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n, 2) to (n, 4)
+            x, y, magnitude and colour, as in the star list of the training; the PSF is the mean
+            one with respect to what is NaN.
+        oversampling : int
+
+        Returns
+        -------
+        ndarray, shape (n, m, m)
+        """
+        terms = self.terms(position)[0]
+        # The phase of (row, column) in a pixel, in the coordinates of the field's centres.
+        phase = (position - np.floor(position + 0.5))[:, 1::-1]
+        images = self.model.images(terms, phase + self.list_offset, self.side, oversampling)
+        centred = np.broadcast_to(self.list_offset, phase.shape)
+        total = self.model.images(terms, centred, self.side).sum(axis=(1, 2), keepdims=True)
+        return np.asarray(images / total)
+
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
+        """Yield the conditions that any law fulfils: a mean star of sum 1, and smaller residuals.
+
+        Each is the name of an array in files, what it must have, and whether it has it.
+        """
+        terms, mean_terms, spread = len(self.coefficients), self.mean_terms, self.terms_covariance
+        mean_star = self.model.images(mean_terms[None], np.zeros((1, 2)), self.side)
+        yield "coefficients", "a mean star of the sum 1", abs(mean_star.sum() - 1) < 0.1
+        has_shape = self.low.shape == self.high.shape and 2 <= len(self.low) <= 4
+        yield "high", "at least low", has_shape and self.low <= self.high
+        yield "usual", "terms from -1 to 1", mean_terms.shape == (terms,) and abs(mean_terms) <= 1
+        eigenvalue = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
+        yield "spread", "a covariance", (spread == spread.T) & (eigenvalue > -1e-6)
+        yield "modes", "squares below 1", np.square(self.modes, dtype=float).sum(axis=1) < 1
+        yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
+        yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
+        yield "listed", "an error above 0, if any", self.listed[1:] > 0
+
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
+        return self.model.is_out_of_range(position)
+
+    def facts(self) -> dict[str, str]:
+        """Return titles and sentences about the field: how the PSF changes, and with what."""
+        return self.model.facts()
 
     # The nodes.
 
     @cached_property
     def step_px(self) -> float:
         """Distance of two nodes in pixels, for which there are residuals."""
+        # The setting, or 1/n of a pixel where stars are undersampled (`node_step`): residuals have
+        # as many phases.
         step, phases = self.settings.step_px, isqrt(len(self.offset))
         return step if len(phases_of(step)) == phases else 1.0 / phases
 
-    @cached_property
-    def _lattice(self) -> np.ndarray:
-        """Coordinates of the nodes along an axis, in units of a step."""
+    @property
+    def axis_px(self) -> np.ndarray:
+        """Coordinates of the nodes along rows and columns, from the stamp's middle pixel, (a,)."""
         outermost = round(self.settings.reach_px / self.step_px)
-        return np.arange(-outermost, outermost + 1)
+        return self.step_px * np.arange(-outermost, outermost + 1)
 
     @cached_property
     def places(self) -> np.ndarray:
         """Centres (row, column) of the nodes from the stamp's middle pixel, shape (nodes, 2)."""
-        row, column = np.meshgrid(self._lattice, self._lattice, indexing="ij")
-        return self.step_px * np.stack([row.ravel(), column.ravel()], axis=1)
+        rows_and_columns = np.meshgrid(self.axis_px, self.axis_px, indexing="ij")
+        return np.stack([np.ravel(a) for a in rows_and_columns], axis=1)
+
+    def residuals_at(self, centre: np.ndarray) -> Residuals:
+        """Return the training stars' residuals in a stamp whose star has this centre, (2,)."""
+        phase, window = phase_of(centre, phases_of(self.step_px), self.side)
+        return (
+            self.offset[phase, window],
+            self.modes[phase][:, window],
+            self.diagonal[phase, window],
+        )
 
     @cached_property
     def nodes(self) -> list[Node]:
         """All nodes, in the order of `places`."""
-        count, axis = len(self.usual), self.step_px * self._lattice
-        phases, steps = phases_of(self.step_px), ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
-
-        def drawn(terms: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:
-            images = self.model.on_lattice(terms, axis + row, axis + column, self.side)
-            return images.reshape(len(terms), len(self.places), -1)
-
-        # Images of each term in all nodes, and central differences of the mean star's image.
-        term_images, usual = drawn(np.eye(count)), self.usual[None]
-        slopes = [
-            (drawn(usual, *e) - drawn(usual, -e[0], -e[1]))[0] / (2 * SLOPE_PX) for e in steps
-        ]
-        field_modes = _covariance_rows(self.spread.reshape(count, count))
-        nodes = []
-        for k, place in enumerate(self.places):
-            images = term_images[:, k]
-            image_sums = images.sum(axis=1)
-            flux = float(self.usual @ image_sums)
-            mean = self.usual @ images / flux
-
-            # A change of a star whose light in the stamp is kept at 1: (δ − Σδ m) / F.
-            def at_constant_flux(
-                rows: np.ndarray, mean: np.ndarray = mean, flux: float = flux
-            ) -> np.ndarray:
-                return np.asarray((rows - rows.sum(axis=-1, keepdims=True) * mean) / flux)
-
-            # Residuals are stored by the phase of a centre in its pixel, in frames that are larger
-            # than a stamp: whole pixels of a node's place choose the window.
-            phase, window = phase_of(place, phases, self.side)
-            residuals = np.vstack([self.offset[phase, window], self.modes[phase][:, window]])
-            residuals = at_constant_flux(residuals.astype(np.float64))
-            shifts = at_constant_flux(np.stack([s[k] for s in slopes]))
-            nodes.append(
-                Node(
-                    images=np.vstack([images, residuals[:1]]),
-                    image_sums=image_sums,
-                    residual_modes=residuals[1:],
-                    field_modes=at_constant_flux(field_modes @ images),
-                    derivatives=np.vstack([np.ones_like(mean), shifts]),
-                    diagonal=self.diagonal[phase, window].astype(np.float64),
-                )
-            )
-        return nodes
+        count, residuals = len(self.mean_terms), map(self.residuals_at, self.places)
+        terms = self.mean_terms, self.terms_covariance.reshape(count, count)
+        return lattice_nodes(self.model, self.side, self.axis_px, *terms, residuals)
 
     @cached_property
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
-        """Matched filters of all nodes, (nodes, P), and the sum of squares of each, (nodes,).
+        """Matched filters m̄ of all nodes, (nodes, P), and the sum of squares of each, (nodes,).
 
         A filter is the mean star of sum 1 less its average over the stamp, so that a flat sky
-        gives nothing.
+        gives nothing (eq. 18).
         """
-        parts = np.append(self.usual, 0.0)
+        # m of the mean terms (eq. 7): the field's PSF, then the mean residual.
+        parts = np.append(self.mean_terms, 0.0)
         means = np.stack(
-            [parts @ node.images / (self.usual @ node.image_sums) for node in self.nodes]
+            [parts @ node.images / (self.mean_terms @ node.image_sums) for node in self.nodes]
         )
         means += np.stack([node.images[-1] for node in self.nodes])
         means -= means.mean(axis=1, keepdims=True)
         return means, np.square(means).sum(axis=1)
 
     def node_psfs(self, k: int, terms: np.ndarray, centre: np.ndarray | None) -> np.ndarray:
-        """Return the field's PSFs m, (n, P), of sum 1, for n stars in node k (eq. 5).
+        """Return the field's PSFs m, (n, P), of sum 1, for n stars in node k (eq. 7).
 
         Parameters
         ----------
@@ -321,24 +307,23 @@ class FieldLaw:
             Centres of the stars if they are known; otherwise that of the node is theirs.
         """
         node = self.nodes[k]
+        # At a known centre, the field is drawn there; residuals are those of the node.
         if centre is None:
             return np.asarray(node.image_weights(terms) @ node.images)
         images = self.model.images(terms, centre, self.side).reshape(len(terms), -1)
         return np.asarray(images / images.sum(axis=1, keepdims=True) + node.images[-1])
 
     def node_axes(self, k: int, position_known: bool) -> NodeAxes:
-        """Return the principal axes of node k (eq. 6), which are computed once.
+        """Return the principal axes of node k (eq. 8), which are computed once.
 
         Where no position is known, C has the variation over the field as well.
         """
+        # Eigenvectors take far longer than all else that a star needs of a node.
         if (k, position_known) not in self._axes_cache:
             node = self.nodes[k]
-            rows = (
-                [node.residual_modes] if position_known else [node.residual_modes, node.field_modes]
-            )
-            self._axes_cache[k, position_known] = NodeAxes.of(
-                np.vstack(rows), node.diagonal, node.derivatives, node.images, self.limits.min_axes
-            )
+            rows = [node.residual_modes, *[node.field_modes] * (not position_known)]
+            axes = NodeAxes.of(node, np.vstack(rows), self.limits.min_axes)
+            self._axes_cache[k, position_known] = axes
         return self._axes_cache[k, position_known]
 
     @property
@@ -348,83 +333,12 @@ class FieldLaw:
 
     # The stars.
 
+    @property
+    def has_list_error(self) -> bool:
+        """True if the training stars had a list, of which offset and error are known."""
+        return bool(len(self.listed) and np.isfinite(self.listed).all())
+
     @cached_property
     def list_offset(self) -> np.ndarray:
         """Offset of the field's centres from those of the training stars' list, shape (2,)."""
-        known = len(self.listed) and np.isfinite(self.listed).all()
-        return np.asarray(self.listed[0] if known else np.zeros(2))
-
-    def log_prior(self, listed: np.ndarray) -> np.ndarray:
-        """Return ln of each node's prior probability, shape (n, nodes) (eq. 17).
-
-        Parameters
-        ----------
-        listed : ndarray, shape (n, 2)
-            Centres of a list, NaN where there is none.
-        """
-        # Without a list: the part of a node's cell that is within ±`centring_px`.
-        step, half = self.step_px, self.settings.centring_px
-        box = np.clip((half + step / 2 - np.abs(self.places)) / step, 0.0, 1.0).prod(axis=1)
-        prior = np.tile(box / box.sum(), (len(listed), 1))
-        is_listed = np.isfinite(listed).all(axis=1)
-        if is_listed.any() and len(self.listed) and np.isfinite(self.listed).all():
-            # A normal distribution about the listed place, as wide as the error of the list.
-            sigma = np.hypot(self.listed[1], self.cell_sigma_px)
-            offset_sigma = (self.places - listed[is_listed, None]) / sigma
-            density = np.exp(-0.5 * np.square(offset_sigma).sum(axis=-1))
-            total = density.sum(axis=1, keepdims=True)
-            density /= np.where(total > 0, total, 1.0)
-            # 5 %: the list, or this entry of it, is worse than it was for the training stars.
-            prior[is_listed] = 0.05 * prior[is_listed] + 0.95 * density
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(prior / prior.sum(axis=1, keepdims=True)))
-
-
-def node_step(fwhm_px: float, max_step_px: float, max_step_fwhm: float = 0.125) -> float:
-    """Return the distance of two nodes in pixels for stars of this FWHM.
-
-    It is the largest one allowed, or else 1/n of a pixel with a whole n, so that nodes have few
-    phases. Up to `max_step_fwhm` of the FWHM, stars change linearly between two nodes.
-    """
-    step = max_step_fwhm * fwhm_px
-    return max_step_px if step >= max_step_px else 1.0 / ceil(1.0 / step)
-
-
-def phases_of(step_px: float) -> np.ndarray:
-    """Return the offsets from the centre of a pixel at which nodes lie, in pixels."""
-    steps = round(MARGIN_PX / step_px)
-    place = step_px * np.arange(-steps, steps + 1)
-    return np.unique(np.round(place - np.floor(place + 0.5), 9))
-
-
-def phase_of(place: np.ndarray, phases: np.ndarray, side: int) -> tuple[int, np.ndarray]:
-    """Return where the residuals of stars with a given centre are stored.
-
-    Parameters
-    ----------
-    place : ndarray, shape (2,)
-        Centre (row, column) from the middle pixel of a stamp.
-    phases : ndarray
-        Offsets of `phases_of`.
-    side : int
-        Side of the stamp in pixels.
-
-    Returns
-    -------
-    phase : int
-        Number of the phase nearest to the centre.
-    window : ndarray of int, shape (side²,)
-        Pixels of the frame, which has a star in its middle pixel, that are the stamp.
-    """
-    whole = np.floor(np.round(place, 9) + 0.5)
-    row, column = np.abs((place - whole)[:, None] - phases).argmin(axis=1)
-    rows, columns = (np.arange(side) + MARGIN_PX - w for w in whole.astype(int))
-    window = (rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel()
-    return int(row * len(phases) + column), np.asarray(window)
-
-
-def _covariance_rows(covariance: np.ndarray) -> np.ndarray:
-    """Return rows R with RᵀR = covariance, without those of directions that do not vary."""
-    variance, axes = np.linalg.eigh(covariance)
-    varies = variance > 1e-12 * max(float(variance[-1]), 1e-300)
-    return np.asarray((axes * np.sqrt(np.where(varies, variance, 0.0)))[:, varies].T)
+        return np.asarray(self.listed[0] if self.has_list_error else np.zeros(2))

@@ -20,12 +20,10 @@ from functools import partial
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
+from psfdae.methods.field_errors import field_uncertainty, left_out_error
 from psfdae.methods.field_fit import FieldFit, FieldFitter, FitOptions, FitSettings
 from psfdae.methods.field_spline import FieldModel, knots_of, spacing_of
 from psfdae.progress import task
-
-COMPARED_TOLERANCE = 3e-3
-"""`FitOptions.tolerance` of fits that are only compared."""
 
 
 def fit_field(
@@ -58,10 +56,11 @@ def fit_field(
     smoothness : float
         Least weight of the squared second differences of the coefficients, 1/flux².
     rng : Generator, optional
-        Source of the noise with which the fit is repeated for `FieldFit.redrawn`; without it the
-        errors of the field are not measured.
+        Source of the noise with which the fit is repeated for `FieldFit.uncertainty`; without it
+        the errors of the field are not measured.
     """
     fitter, few_stars = FieldFitter.of(stars, background, frame_px, stamp_px), FitSettings.few_stars
+    # Orders that the stars support: without positions, the field is one mean PSF.
     supported = sorted(orders)
     if not np.isfinite(stars.position).all():
         supported = [0]
@@ -77,7 +76,11 @@ def fit_field(
         fitter = replace(fitter, advance=advance)
         if len(orders) > 1 and len(stars) >= 3:
             options = _best_options(fitter, options, supported)
-        return with_errors(fitter, fitter.fit(options), rng)
+        fit = fitter.fit(options)
+        # Of two stars, none can be left out.
+        if rng is None or len(stars) < 3:
+            return fit
+        return fit._replace(uncertainty=field_uncertainty(fitter, fit, rng))
 
 
 def _best_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int]) -> FitOptions:
@@ -101,7 +104,7 @@ def _best_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int
     # slope.
     curved = 2
     start = max((o for o in orders if o <= curved), default=orders[0])
-    options = replace(options, order=start, tolerance=COMPARED_TOLERANCE)
+    options = replace(options, order=start, tolerance=fitter.settings.compared_tolerance)
     least_error = error_of(options)
     # Knots √2 farther apart, at most six times, and then splines ten times as smooth, at most three
     # times.
@@ -117,6 +120,7 @@ def _best_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int
             if (error := error_of(step)) >= least_error:
                 break
             options, least_error = step, error
+    # Orders from the lowest on, until the next one does not pay.
     best_order, least_error = 0, np.inf
     for order in orders:
         error = error_of(replace(options, order=order))
@@ -162,65 +166,8 @@ def refit_field(
         low=prior.low,
         high=prior.high,
     )
-    knots, star_terms = knots_of(frame_px, prior.spacing), tuple(prior.of_star.tolist())
+    # The same terms and knots; three limits of the change are compared (eq. 5).
+    knots, star_terms = knots_of(frame_px, prior.spacing), tuple(prior.star_coordinates.tolist())
     options = FitOptions(knots, smoothness, prior.order, star_terms)
     fits = [fitter.fit(replace(options, change=change)) for change in (0.005, 0.02, 0.1)]
     return min(fits, key=partial(left_out_error, fitter))
-
-
-def left_out_error(fitter: FieldFitter, fit: FieldFit) -> float:
-    """Return the geometric mean of the squared errors of stars that were left out of a fit.
-
-    Flux, sky and centre of these are fitted to them.
-    """
-    errors = [np.log(part.squared_errors()) for part in fitter.left_out(fit)]
-    return float(np.exp(np.concatenate(errors).mean()))
-
-
-def with_errors(fitter: FieldFitter, fit: FieldFit, rng: np.random.Generator | None) -> FieldFit:
-    """Return the fit with what its stars say of the errors of its model.
-
-    Four other fits, to noise-free stars of the model with new noise, scatter as much as the
-    field is uncertain (parametric bootstrap: Efron & Tibshirani 1993, An Introduction to the
-    Bootstrap, ch. 6.5). Light that the model does not know is the sky that stars which were
-    left out seem to have.
-    """
-    if rng is None or len(fitter.noise) < 3:  # of two stars, none can be left out
-        return fit
-    parts = list(fitter.left_out(fit))
-    light = np.concatenate([part.light for part in parts], axis=1)
-    # Delete-group jackknife (Kott 2001, J. Off. Stat. 17, 521): without one of K folds after
-    # the other, fields scatter by 1/√(K − 1) of their error, and by more the more a fit of p
-    # terms follows its own n stars.
-    fields = np.array([part.coefficients for part in parts])
-    followed = min(fields.shape[1] / len(fitter.noise), 1.0)
-    fields = (fields - fields.mean(axis=0)) * np.sqrt((len(fields) - 1) * (1.0 - followed))
-    parted = [replace(fit.model, coefficients=fit.model.coefficients + f) for f in fields]
-    # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
-    stars = fit.model.images(fit.model.terms(fitter.place), fit.centre, len(fitter.axis))
-    stars = stars * fit.flux[:, None, None]
-    variance = np.maximum(stars, 0.0) / fitter.photons[:, None, None]
-    sigma = np.sqrt(variance + fitter.noise[:, None, None] ** 2)
-    options, models = replace(fit.options, tolerance=COMPARED_TOLERANCE), []
-    for _ in range(4):
-        images = np.where(fitter.measured, stars + sigma * rng.normal(size=stars.shape), 0.0)
-        models.append(replace(fitter, images=images).fit(options).model)
-    unknown = excess_scatter(*light)
-    return fit._replace(redrawn=tuple(models), parted=tuple(parted), unknown_light=unknown)
-
-
-def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
-    """Return the likeliest scatter τ of values (n,) about 0 beyond their errors σ (n,).
-
-    Σ (e²/(σ² + τ²) − 1) / (σ² + τ²) = 0 with e² ≤ 9 (σ² + τ²), for outliers; 0 of fewer than five.
-    """
-    from scipy.optimize import brentq
-
-    def slope(scatter: float) -> float:
-        total = sigma**2 + scatter**2
-        return float(((np.minimum(values**2 / total, 9.0) - 1.0) / total).sum())
-
-    if len(values) < 5 or slope(0.0) <= 0:
-        return 0.0
-    upper_end = 3.0 * float(np.abs(values).max())
-    return float(brentq(slope, 0.0, upper_end))

@@ -1,14 +1,15 @@
 """The PSF as splines whose coefficients are polynomials in the position in the field.
 
-What a detector shows of a star whose centre lies at u from a pixel is f(u; x, y), pixel included
-(Anderson & King 2000, PASP 112, 1360; eq. 1 of docs/field_model.md),
+What a detector shows of a star whose centre lies at u from a pixel is f(u; q), pixel included
+(Anderson & King 2000, PASP 112, 1360),
 
     f(u; q) = Σ_k p_k(q) Σ_ij c_kij B(u_row/h − i) B(u_col/h − j),
 
 a sum of cubic B-splines B with the distance h of their knots. The terms p_k are monomials of the
 position q in the field, and of magnitude and colour of the star. Here are the model itself
-(`FieldModel`), and least squares for its coefficients c and for flux and centre of stars, which
-`psfdae.methods.field_fit` puts together.
+(`FieldModel`), least squares for its coefficients c and for flux and centre of stars, which
+`psfdae.methods.field_fit` puts together, and the deformations by which exposures differ.
+Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -20,26 +21,23 @@ import numpy as np
 
 from psfdae.moments import cubic_splines
 
-SLOPE_PX = 0.02
-"""Half of the distance in pixels of two images whose difference is a slope."""
-
 STAR_TERMS = 2
 """Number of terms, powers from the first on, of the magnitude and of the colour."""
 
 
 @dataclass(frozen=True)
 class FieldModel:
-    """A PSF at every place of a field.
+    """A PSF at every place of a field (eq. 1).
 
     Attributes
     ----------
     coefficients : ndarray, shape (K, N, N)
-        Of the splines, for each of the K terms of the polynomial.
+        Coefficients c of the N × N splines, for each of the K terms of the polynomial.
     low, high : ndarray, shape (2,) to (4,)
         Range of x and y, and then of magnitude and colour: the PSF does not change with one that
         has the same ends, or is not there. Beyond a range the PSF is that of its end.
     spacing : float
-        Of the knots, in pixels.
+        Distance h of the knots, in pixels.
     """
 
     coefficients: np.ndarray
@@ -50,18 +48,19 @@ class FieldModel:
     @property
     def order(self) -> int:
         """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
-        of_place = len(self.coefficients) - STAR_TERMS * len(self.of_star)
-        return (isqrt(8 * of_place + 1) - 3) // 2
+        # K = (o + 1)(o + 2)/2, solved for the order o.
+        place_terms = len(self.coefficients) - STAR_TERMS * len(self.star_coordinates)
+        return (isqrt(8 * place_terms + 1) - 3) // 2
 
     @property
-    def of_star(self) -> np.ndarray:
-        """Numbers of the coordinates beyond x and y with which the PSF changes."""
+    def star_coordinates(self) -> np.ndarray:
+        """Coordinates beyond x and y with which the PSF changes: 2 magnitude, 3 colour."""
         return np.asarray(2 + np.flatnonzero(self.high[2:] > self.low[2:]))
 
     def terms(self, position: np.ndarray) -> np.ndarray:
-        """Terms of the polynomial, shape (n, K).
+        """Return the terms p_k of the polynomial at positions, shape (n, K).
 
-        At positions (n, 4) of x, y, magnitude and colour, of which the last ones may be left out of
+        Positions (n, 4) are x, y, magnitude and colour, of which the last ones may be left out of
         a model that does not change with them.
         """
         return field_terms(position, self.low, self.high, self.order)
@@ -69,12 +68,13 @@ class FieldModel:
     def images(
         self, terms: np.ndarray, centre: np.ndarray, side: int, oversampling: int = 1
     ) -> np.ndarray:
-        """The field with the star `centre` (n, 2) (row, column) px off the middle, (n, m, m).
+        """Return the field with stars `centre` (n, 2) (row, column) px off the middle, (n, m, m).
 
         Pixels are every 1/oversampling, that at m//2 = oversampling · (side//2) is the middle;
         m is side, and one more if oversampled, so that both edges are there. Values are
         those of whole pixels.
         """
+        # Coordinates of the pixels, and coefficients Σ_k p_k c_k at each position (eq. 1).
         count = side if oversampling == 1 else oversampling * side + 1
         axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
         splines = np.tensordot(terms, self.coefficients, 1)
@@ -84,6 +84,7 @@ class FieldModel:
         self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
     ) -> np.ndarray:
         """Return images (n, r c, m, m) of stars at all pairs of rows (r,) and columns (c,)."""
+        # B-splines of all rows and of all columns: their products are the images on the lattice.
         splines = np.tensordot(terms, self.coefficients, 1)
         axis = np.arange(side) - side // 2
         down, across = (
@@ -95,6 +96,38 @@ class FieldModel:
         images = images.transpose(2, 0, 3, 1, 4)
         return np.asarray(images.reshape(len(terms), -1, side, side))
 
+    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
+        """Return which stars are brighter, fainter, bluer or redder than all training stars, (n,).
+
+        `position` has x, y, magnitude and colour (n, 4). Those count with which the PSF changes,
+        and 2 % of the range beyond its ends are allowed: a training star may be measured there.
+        """
+        # Beyond the ends by more than the slack, in any coordinate with which the PSF changes.
+        columns = self.star_coordinates
+        value, low, high = (a[..., columns] for a in (position, self.low, self.high))
+        slack = 0.02 * (high - low)
+        return np.asarray(((value < low - slack) | (value > high + slack)).any(axis=1))
+
+    def facts(self) -> dict[str, str]:
+        """Return titles and sentences about the field: how the PSF changes, and with what."""
+        order = self.order
+        changes = f"changes over the image by a polynomial of order {order}"
+        constant = "is the same everywhere (order 0: more is not supported by stars left out)"
+        facts = {"Field": f"the PSF {changes if order else constant}"}
+        names = {
+            2: ("Brightness", "magnitude −2.5 log₁₀ (flux / counts)"),
+            3: ("Colour", "colour of the star list"),
+        }
+        # A sentence for each property of a star with which the PSF changes, with its range.
+        for coordinate in self.star_coordinates.tolist():
+            name, quantity = names[coordinate]
+            low, high = self.low[coordinate], self.high[coordinate]
+            facts[name] = (
+                f"the PSF changes with the {quantity}, {low:.2f} to {high:.2f}; stars beyond this "
+                "range have the PSF of its end"
+            )
+        return facts
+
 
 def knots_of(frame_px: int, spacing: float) -> int:
     """Return the number of knots along a side of a frame, the outermost ½ pixel beyond its edge."""
@@ -102,7 +135,7 @@ def knots_of(frame_px: int, spacing: float) -> int:
 
 
 def spacing_of(frame_px: int, knots: int) -> float:
-    """Return the distance of so many knots in pixels."""
+    """Return the distance of the knots in pixels if a side of a frame has so many."""
     return (frame_px + 1) / (knots - 1)
 
 
@@ -112,9 +145,11 @@ def field_terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: 
     Powers of other coordinates whose range has two ends are the last terms. What is not known is
     taken for the middle of its range.
     """
+    # Coordinates −1 … 1 over the range; beyond it, those of its ends. The middle is 0.
     width = np.where(high > low, high - low, 1.0)
     scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
     scaled = np.nan_to_num(scaled)
+    # Monomials by their total power, then the powers of magnitude and of colour.
     x, y, *star_columns = scaled.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
     terms = [x**a * y**b for a, b in powers]
@@ -127,6 +162,7 @@ def draw_splines(
     splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
 ) -> np.ndarray:
     """Return images (n, m, m) on an axis (m,) of coefficients (n, N, N) with centres (n, 2)."""
+    # The image is R c Cᵀ, with the B-splines R of its rows and C of its columns (eq. 1).
     rows, columns = (
         cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
@@ -142,10 +178,8 @@ def adjust_stars(
     spacing: float,
     steps: int,
     sky: bool = False,
-    max_offset_px: float = 1.5,
-    max_step_px: float = 0.3,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps.
+    """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps (eq. 4).
 
     Parameters
     ----------
@@ -163,8 +197,6 @@ def adjust_stars(
         Number of steps.
     sky : bool
         A constant is fitted as well.
-    max_offset_px, max_step_px : float
-        Largest coordinate of a centre, and largest change in one step, in pixels.
 
     Returns
     -------
@@ -175,12 +207,16 @@ def adjust_stars(
     """
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
+        # Weighted least squares (A w Aᵀ) θ = A w d for θ = (F, F δ_row, F δ_col, sky), with the
+        # rows A of the design; the centre moves by δ, at most by 0.3 px in a step, in which an
+        # image is nearly linear, and no farther than 1.5 px from the brightest pixel.
         design = image_design(splines, centre, axis, spacing, sky)
         weighted = design * weight.reshape(count, 1, -1)
         parameters = np.linalg.solve(weighted @ design.transpose(0, 2, 1), weighted @ flat)[..., 0]
         flux = parameters[:, 0]
-        move = np.clip(parameters[:, 1:3] / flux[:, None], -max_step_px, max_step_px)
-        centre = np.clip(centre + move, -max_offset_px, max_offset_px)
+        move = np.clip(parameters[:, 1:3] / flux[:, None], -0.3, 0.3)
+        centre = np.clip(centre + move, -1.5, 1.5)
+    # Residuals of stars of flux 1 at their last centres.
     level = parameters[:, 3, None, None] if sky else 0.0
     star_images = draw_splines(splines, axis, centre, spacing)
     return flux, centre, (data - level) / flux[:, None, None] - star_images
@@ -189,9 +225,9 @@ def adjust_stars(
 def image_design(
     splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
 ) -> np.ndarray:
-    """Return the change of images (n, 3 or 4, P) with flux, row, column and, if asked, sky."""
+    """Return the change A of images, (n, 3 or 4, P), with flux, row, column and, if asked, sky."""
     # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
-    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
+    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves (eq. 4).
     place, knots = axis - centre[..., None], splines.shape[-1]
     rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
     down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
@@ -214,7 +250,8 @@ def solve_splines(
 ) -> np.ndarray:
     """Return coefficients (K, N, N) of weighted least squares with penalties (eq. 2).
 
-    They minimise Σ w (d − f)² + Σ_k η_k |D c_k|² + Σ ρ c², with the second differences D.
+    They minimise Σ w (d − f)² + Σ_k η_k |D c_k|² + Σ ρ c², with the second differences D along
+    rows and columns.
 
     Parameters
     ----------
@@ -235,16 +272,19 @@ def solve_splines(
     """
     from scipy.sparse.linalg import LinearOperator, cg
 
+    # |D c|² = tr(cᵀ B c) + tr(c B cᵀ) with B = DᵀD; its slope by c is 2 (B c + c B).
     shape, knots = ridge.shape, ridge.shape[-1]
     difference = np.diff(np.eye(knots), 2, axis=0)
     bend = difference.T @ difference
-    # Normal equations (Σ tᵀ w t + penalty) c = Σ tᵀ w d, solved by conjugate gradients. The
-    # gradients stop at a part of 1e-4: single precision is enough for their products.
+    # Normal equations (Σ Tᵀ w T + penalty) c = Σ Tᵀ w d, solved by conjugate gradients, with the
+    # linear map T from coefficients to images: T c = R (Σ_k p_k c_k) Cᵀ. The gradients stop at a
+    # part of 1e-4: single precision is enough for their products.
     single = (terms, data, weight, *splines)
     terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
     rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
 
     def normal(flat: np.ndarray) -> np.ndarray:
+        # T c, then Tᵀ w T c, then the slope of the penalties, all over 2.
         c = flat.reshape(shape)
         fields = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
         image = rows @ fields @ columns_t
@@ -254,6 +294,7 @@ def solve_splines(
 
     projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
     # Preconditioner: the terms of a knot are solved for together, as they are far from orthogonal.
+    # Knots count as independent of each other: the diagonals of RᵀwC and of B, which is 6 inside.
     curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
     pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
     blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
@@ -261,6 +302,7 @@ def solve_splines(
     inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
 
     def nearly(flat: np.ndarray) -> np.ndarray:
+        # The terms of each knot by the inverse of its block.
         return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
 
     coefficients, _ = cg(
@@ -282,7 +324,7 @@ def deform_splines(
     splines: tuple[np.ndarray, np.ndarray],
     deformation_sigma: float = 0.3,
 ) -> np.ndarray:
-    """Return splines of another exposure, stretched and blurred as its stars show it.
+    """Return splines of another exposure, stretched and blurred as its stars show it (eq. 5).
 
     Their fluxes may be wrong: what is proportional to a star says nothing of its shape.
 
@@ -302,12 +344,13 @@ def deform_splines(
     rows, columns_t = splines[0], splines[1].transpose(0, 2, 1)
 
     def in_sigma(coefficients: np.ndarray) -> np.ndarray:
+        # Pixels √w T c of all stars, in standard deviations.
         image = rows @ np.tensordot(terms, coefficients, 1) @ columns_t
         return np.asarray((image * np.sqrt(weight)).reshape(len(terms), -1))
 
     scaled_data = (np.sqrt(weight) * data).reshape(len(terms), -1)
     coefficients = prior.coefficients
-    # Three Gauss-Newton steps.
+    # Three Gauss-Newton steps c ← c + Σ_l α_l Δ_l c.
     for _ in range(3):
         # Images of the deformations and the data, all without their part along the star itself.
         changes, star = deformations(coefficients, prior.spacing), in_sigma(coefficients)
@@ -315,7 +358,7 @@ def deform_splines(
         shapes = np.stack([*map(in_sigma, changes), scaled_data])
         shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
         shapes = shapes.reshape(len(shapes), -1)
-        # Normal equations with a prior of the deformations about 0.
+        # Normal equations for α with the prior N(0, σ²); the last column is the data.
         products = shapes @ shapes.T
         normal = products[:-1, :-1] + np.eye(len(changes)) / deformation_sigma**2
         coefficients = coefficients + np.tensordot(
@@ -325,10 +368,12 @@ def deform_splines(
 
 
 def deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
-    """Return changes of splines (K, N, N) by stretching and blurring them, along three axes each.
+    """Return changes of splines (K, N, N) by stretching and blurring them, (6, K, N, N) (eq. 5).
 
-    Shape (6, K, N, N): a change of one is that of r → r (1 − a), or of a² added to the variance.
+    They are x ∂/∂x, y ∂/∂y and x ∂/∂y + y ∂/∂x, which stretch an image, and ∂²/∂x², ∂²/∂y² and
+    ∂²/∂x∂y, which blur it.
     """
+    # Coordinates of the knots in pixels: the middle of the frame is 0.
     place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
 
     def slope(values: np.ndarray, axis: int) -> np.ndarray:

@@ -7,9 +7,9 @@ that a damaged file is refused. The date is not part of it: a model has the same
 it was made.
 
 Only the leading eigenvectors of the flux model's covariance are stored. The variance of the others
-is spread evenly over the directions that they span. For stamps of up to `MAX_FULL_BASIS_PX` pixels,
-reading completes the basis; any basis of these directions gives the same results. For larger
-stamps, whose full basis would take gigabytes, the variance stays one number.
+is spread evenly over the directions that they span. For stamps of up to 32 × 32 pixels, reading
+completes the basis (`flux_model_of`); any basis of these directions gives the same results. For
+larger stamps, whose full basis would take gigabytes, the variance stays one number.
 """
 
 from __future__ import annotations
@@ -42,12 +42,6 @@ from psfdae.version import __version__
 
 SUFFIX = ".psf.safetensors"
 """End of the name of a bundle."""
-
-SHIPPED = "wfsat"
-"""Name of the bundle that comes with the package."""
-
-MAX_FULL_BASIS_PX = 32**2
-"""Pixels of the largest stamps whose covariance gets a full basis when it is read."""
 
 
 class BundleError(Error, ValueError):
@@ -104,6 +98,7 @@ def estimator(bundle: Bundle) -> Method:
     info = bundle.info
     method_class = method(info.method)
     if info.dae:
+        # A network is checked by torch when its weights are loaded.
         with needed_by(f"the model {info.name!r}"):
             return method_class.unpack(bundle.weights, info)
     # The method knows which arrays it can work with: it states conditions, and restores a stamp.
@@ -124,7 +119,13 @@ def estimator(bundle: Bundle) -> Method:
 
 
 def creation_date() -> str:
-    """Return today's date in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible."""
+    """Return today's date in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible.
+
+    Raises
+    ------
+    BundleError
+        If SOURCE_DATE_EPOCH is no number of seconds.
+    """
     # https://reproducible-builds.org/specs/source-date-epoch
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -135,20 +136,40 @@ def creation_date() -> str:
 
 
 def write_bundle(bundle: Bundle, path: Path) -> None:
-    """Write a bundle atomically, if its parts fit together; the same one gives the same bytes."""
+    """Write a bundle atomically, if its parts fit together; the same one gives the same bytes.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    path : Path
+
+    Raises
+    ------
+    BundleError
+        If an array is missing or has a wrong shape or value.
+    """
     # Checked as it will be when it is read: no file is written that cannot be read.
     arrays = bundle_arrays(bundle)
     _check(bundle.info, arrays, path)
     content = bundle_bytes(bundle.info, arrays)
+    # The file is whole or absent.
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 def bundle_bytes(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return the bytes of a bundle file with its checksum, without checks of its contents."""
+    """Return the bytes of a bundle file with its checksum, without checks of its contents.
+
+    Parameters
+    ----------
+    info : BundleInfo
+    arrays : mapping of str to ndarray
+        As `bundle_arrays` returns them.
+    """
     from safetensors.numpy import save
 
     tree = info.model_dump(mode="json")
+    # Kind and version, by which a reader knows the file; the checksum; the description.
     text = {
         "kind": "psfdae bundle",
         "format_version": FORMAT_VERSION,
@@ -161,31 +182,23 @@ def bundle_bytes(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> bytes:
 
 def _digest(tree: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 of a description without its date, and of arrays."""
+    # The same model has the same checksum whenever it was made.
     dateless = {key: value for key, value in tree.items() if key != "created"}
+    # Keys in one order: the same description has the same text.
     text = json.dumps(dateless, sort_keys=True) + digest_of(arrays)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
-    """Return the arrays of the file, the covariance cut to its leading eigenvectors."""
-    model, leading = bundle.flux_model, bundle.info.components
-    # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
-    # of a model from a file are equal; their mean could differ from them in the last digit.
-    trailing = np.array([model.other_variance])
-    if model.is_complete:
-        trailing = model.variance[: model.variance.size - leading]
-    is_even = trailing.size and (trailing == trailing[0]).all()
-    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
-    # Variances in double precision, maps of pixels in single; the method's arrays as they are.
-    groups: dict[str, Mapping[str, np.ndarray]] = {
-        "flux": {
-            "variance": np.asarray(model.variance[-leading:], np.float64),
-            "rest": np.asarray(trailing_variance, np.float64),
-            "mean": np.asarray(model.mean, np.float32),
-            "low": np.asarray(model.low, np.float32),
-            "high": np.asarray(model.high, np.float32),
-            "basis": np.asarray(model.basis[:, -leading:], np.float32),
-        },
+    """Return the arrays of the file, the covariance cut to its leading eigenvectors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        By group and name: `flux/…` (`flux_arrays`), `errors/…`, and those of the method.
+    """
+    groups = {
+        "flux": flux_arrays(bundle.flux_model, bundle.info.components),
         "errors": bundle.errors.arrays(),
         bundle.info.method: bundle.weights,
     }
@@ -201,11 +214,23 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
 
 def shipped_path() -> Path:
     """Return the file of the bundle that comes with the package."""
-    return Path(str(files("psfdae") / "bundles" / f"{SHIPPED}{SUFFIX}"))
+    return Path(str(files("psfdae") / "bundles" / f"wfsat{SUFFIX}"))
 
 
 def read_bundle(path: Path | None = None) -> Bundle:
-    """Read a bundle, by default the shipped one, and check it, or raise BundleError."""
+    """Read a bundle, by default the shipped one, and check it, or raise BundleError.
+
+    Parameters
+    ----------
+    path : Path, optional
+        A safetensors file of at most 256 MB.
+
+    Raises
+    ------
+    BundleError
+        If the file is missing, damaged, of another format, or holds unusable numbers. Nothing in it
+        is executed, and its arrays are used only if their checksum is right.
+    """
     from safetensors import SafetensorError, safe_open
 
     path = shipped_path() if path is None else path
@@ -247,7 +272,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)
     )
-    return Bundle(info, weights, _read_flux_model(flux), ErrorModel.of_arrays(errors))
+    return Bundle(info, weights, flux_model_of(flux), ErrorModel.of_arrays(errors))
 
 
 def _require(condition: ArrayLike, path: Path, problem: str) -> None:
@@ -258,6 +283,14 @@ def _require(condition: ArrayLike, path: Path, problem: str) -> None:
 
 def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> None:
     """Check that arrays have the shapes that the description asks for, and usable numbers.
+
+    Parameters
+    ----------
+    info : BundleInfo
+    arrays : mapping of str to ndarray
+        By group and name, as in the file.
+    path : Path
+        The file, for messages.
 
     Raises
     ------
@@ -305,16 +338,56 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     _require(abs(total - 1.0) <= 1e-3, path, "array 'flux/mean' must have a sum of 1")
 
 
-def _read_flux_model(arrays: Mapping[str, np.ndarray]) -> FluxModel:
-    """Return the flux model of a file, eigenvalues ascending.
+def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
+    """Return the arrays of a flux model with so many leading eigenvectors, for `flux_model_of`.
 
-    It has a full basis unless the stamps are large: the directions that are not stored come first,
-    with the same variance.
+    Parameters
+    ----------
+    model : FluxModel
+        With a full basis, or of a file of large stamps.
+    components : int
+        Number k of leading eigenvectors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Variances (k,) and `rest`, that along each other direction, in double precision; maps of
+        the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
     """
+    # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
+    # of a model from a file are equal; their mean could differ from them in the last digit.
+    trailing = np.array([model.other_variance])
+    if model.is_complete:
+        trailing = model.variance[: model.variance.size - components]
+    is_even = trailing.size and (trailing == trailing[0]).all()
+    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
+    # Eigenvalues ascend: the leading ones are the last.
+    return {
+        "variance": np.asarray(model.variance[-components:], np.float64),
+        "rest": np.asarray(trailing_variance, np.float64),
+        "mean": np.asarray(model.mean, np.float32),
+        "low": np.asarray(model.low, np.float32),
+        "high": np.asarray(model.high, np.float32),
+        "basis": np.asarray(model.basis[:, -components:], np.float32),
+    }
+
+
+def flux_model_of(arrays: Mapping[str, np.ndarray], full_basis_max_px: int = 32**2) -> FluxModel:
+    """Return the flux model of the arrays of a file, eigenvalues ascending.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        As `flux_arrays` returns them.
+    full_basis_max_px : int
+        Pixels of the largest stamps that get a full basis: the directions that are not stored come
+        first, with the same variance.
+    """
+    # Leading eigenvectors, with their variances; the others share one variance.
     basis, variance = arrays["basis"].astype(np.float64), arrays["variance"]
     trailing_variance = float(arrays["rest"])
     pixels, components = basis.shape
-    if pixels <= MAX_FULL_BASIS_PX:
+    if pixels <= full_basis_max_px:
         # Left singular vectors beyond the rank span the orthogonal complement.
         complement = np.linalg.svd(basis)[0][:, components:]
         basis = np.concatenate([complement, basis], axis=1)

@@ -425,7 +425,7 @@ def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
         return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
     # The errors of the flux, of the sky, and of the centre, both axes together.
-    fitted_flux, growth = fitted.fitted_flux_error()
+    fitted_flux, *growth = fitted.fitted_flux_error()
     flux = lacking((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
     sky = lacking(prediction.background[usable], prediction.background_error[usable])
@@ -435,9 +435,7 @@ def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
     usable_centres = np.concatenate([usable, usable])
     centre_error = lacking(off[usable_centres], stated[usable_centres])
     # Few fields are drawn: the error of the flux is not below that of a fit on a known sky.
-    measured = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux)
-    if growth:
-        measured = measured._replace(growth=growth)
+    measured = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
     return replace(bundle, errors=replace(bundle.errors, measured=measured))
 
 

@@ -49,17 +49,20 @@ class ModelErrors(NamedTuple):
     fitted_flux : float
         Error of the flux over the flux, RMS over the field, where the PSF is fitted on a sky that
         is known from the whole image.
-    growth : tuple of 6 floats
-        (x₀, y₀, a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² + c w² +
-        d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By default
-        it is the same at all places.
+    middle : ndarray, shape (2,)
+        Place (x₀, y₀) in the image from which the variance of a flux grows.
+    growth : ndarray, shape (4,)
+        Coefficients (a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² +
+        c w² + d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By
+        default it is the same at all places.
     """
 
     flux: float = 0.0
     sky: float = 0.0
     centre: float = 0.0
     fitted_flux: float = 0.0
-    growth: tuple[float, ...] = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    middle: np.ndarray = np.zeros(2)
+    growth: np.ndarray = np.eye(4)[0]
 
     def flux_factor(self, place: np.ndarray) -> np.ndarray:
         """Return √v: errors of fluxes at places (n, 2), x and y, over those of the field, (n,).
@@ -67,9 +70,9 @@ class ModelErrors(NamedTuple):
         1 where the place is not known (NaN).
         """
         # v = (a, b, c, d) · (1, u², w², u² w²).
-        u2, w2 = np.square(place - np.array(self.growth[:2])).T
+        u2, w2 = np.square(place - self.middle).T
         terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
-        return np.where(np.isfinite(u2 + w2), np.sqrt(np.array(self.growth[2:]) @ terms), 1.0)
+        return np.where(np.isfinite(u2 + w2), np.sqrt(self.growth @ terms), 1.0)
 
     def added_to(self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Return covariances of measured stars with the errors of the model too.
@@ -163,16 +166,17 @@ class ErrorModel:
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
         values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
-        # Ten numbers of the model's own errors: four of them, and the six of their growth.
-        flux, sky, centre, fitted_flux, *growth = arrays["measured"].tolist()
-        measured = ModelErrors(flux, sky, centre, fitted_flux, tuple(growth))
+        # Ten numbers of the model's own errors; the last six are middle and growth of the flux's.
+        table = arrays["measured"]
+        flux, sky, centre, fitted_flux = table[:4].tolist()
+        measured = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
         return cls(**values | {"measured": measured})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
         # The reverse of `of_arrays`.
         values = {table.name: getattr(self, table.name) for table in fields(self)}
-        values["measured"] = [*self.measured[:4], *self.measured.growth]
+        values["measured"] = np.hstack(self.measured)
         return {
             name: np.asarray(value, np.float32 if name == "half_width68" else np.float64)
             for name, value in values.items()

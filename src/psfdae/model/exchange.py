@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -26,21 +26,6 @@ from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
-PSFEX = ".psf"
-"""End of the name of a file of PSFEx, written or read."""
-
-STDPSF = ".stdpsf.fits"
-"""End of the name of a file in the format STDPSF."""
-
-GRID_SAMPLES = 4
-"""Values per pixel and axis of a cube of PSFs; STDPSF has no others."""
-
-PSFEX_SAMPLES = 8
-"""Values per pixel and axis of a file of PSFEx."""
-
-UNKNOWN_WIDTH_PX = 1.0
-"""Width of a field in pixels that stands for an unknown one."""
-
 
 def load_field(path: Path) -> FieldPsfs:
     """Return the PSF over an image from a bundle of psfdae, or from a .psf file of PSFEx.
@@ -50,7 +35,7 @@ def load_field(path: Path) -> FieldPsfs:
     Error
         If the file cannot be read or is something else.
     """
-    return PsfexField(path) if path.suffix == PSFEX else load_model(path)
+    return PsfexField(path) if path.suffix == ".psf" else load_model(path)
 
 
 class PsfexField(FieldPsfs):
@@ -63,6 +48,8 @@ class PsfexField(FieldPsfs):
 
     Attributes
     ----------
+    order : int
+        Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere.
     terms : ndarray of int, shape (t, 2)
         Powers of u and v, the scaled positions, in the terms of the polynomial.
     basis : ndarray, shape (t, h, w)
@@ -81,6 +68,9 @@ class PsfexField(FieldPsfs):
     """
 
     image_px = None
+    order = 0
+    unknown_width_px: ClassVar[float] = 1.0
+    """Width of a field in pixels that stands for an unknown one."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.stem
@@ -123,12 +113,13 @@ class PsfexField(FieldPsfs):
         # Coordinates of the polynomial: none, or x and y in one group.
         axis_count = int(header["POLNAXIS"])
         names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axis_count)]
+        # Other coordinates, such as a magnitude, would need values for each star.
         is_position = re.fullmatch(r"X\S*_IMAGE Y\S*_IMAGE", " ".join(names))
         if names and not (is_position and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
-        self._order = int(header["POLDEG1"]) if names else 0
+        self.order = int(header["POLDEG1"]) if names else 0
         self.step_px = float(header["PSF_SAMP"])
-        zero, self.width = np.full(2, 0.0), np.full(2, UNKNOWN_WIDTH_PX)
+        zero, self.width = np.full(2, 0.0), np.full(2, self.unknown_width_px)
         if names:
             zero, self.width = (
                 np.array([float(header[f"{key}{i}"]) for i in (1, 2)])
@@ -139,12 +130,12 @@ class PsfexField(FieldPsfs):
         max_order, max_side = 12, 1025
         self.basis = mask.reshape(-1, *mask.shape[-2:])
         self.terms: np.ndarray = np.array(
-            psfex_powers(self._order) if self._order <= max_order else []
+            psfex_powers(self.order) if self.order <= max_order else []
         )
         # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         side = min(mask.shape[-2:])
         is_usable = (
-            0 <= self._order <= max_order
+            0 <= self.order <= max_order
             and len(self.terms) == len(self.basis)
             and 1 < side <= max(mask.shape[-2:]) <= max_side
             and 0.01 < self.step_px <= 10
@@ -157,11 +148,6 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.stamp_px = 2 * max(1, int(side * self.step_px / 2))
 
-    @property
-    def order(self) -> int:
-        """Order of the polynomial, POLDEG1; 0 for a PSF that is the same everywhere."""
-        return self._order
-
     @cached_property
     def sha256(self) -> str:
         """Checksum of the file."""
@@ -169,7 +155,7 @@ class PsfexField(FieldPsfs):
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
-        if (self.width <= UNKNOWN_WIDTH_PX).any():
+        if (self.width <= self.unknown_width_px).any():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
@@ -181,6 +167,7 @@ class PsfexField(FieldPsfs):
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
+        # Offset of the star from the middle of its pixel.
         phase = position - np.floor(position + 0.5)
         count = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
         axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
@@ -227,7 +214,10 @@ def _lanczos(offset: np.ndarray, count: int) -> np.ndarray:
 
 
 def psfex_powers(order: int) -> list[tuple[int, int]]:
-    """Return the powers of x and y in the terms of PSFEx's polynomial, in their order."""
+    """Return the powers of x and y in the terms of PSFEx's polynomial, in their order.
+
+    The power of x changes first: 1, x, x², …, y, x y, …, y².
+    """
     return [(i, j) for j in range(order + 1) for i in range(order + 1 - j)]
 
 
@@ -269,7 +259,8 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
             raise
         low, high, positions = np.zeros(2), np.zeros(2), np.zeros((1, 2))
     # Least squares for the image of each term: psf(u, v) = Σ uⁱ vʲ b_ij.
-    zero, width = (low + high) / 2, np.maximum(high - low, UNKNOWN_WIDTH_PX)
+    zero, width = (low + high) / 2, np.maximum(high - low, PsfexField.unknown_width_px)
+    # Scaled positions, from −½ to ½ over the field.
     u, v = ((positions - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in psfex_powers(order)], axis=1)
     x, y = positions.T
@@ -278,6 +269,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     error = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
     # Readers show the FWHM; it is that of the PSF in the middle of the list of positions.
     fwhm = float(measure_shapes(psfs[len(psfs) // 2][None]).fwhm_px[0]) / oversampling
+    # One table of one row, whose only cell has the images of all terms.
     size = basis.shape[-1]
     column = fits.Column(
         "PSF_MASK",
@@ -331,17 +323,28 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     cards: list[Card] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]
     cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(grid[0, :, 0])]
     cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(grid[:, 0, 1])]
-    _write_cube(path, model, positions, GRID_SAMPLES, cards)
+    _write_cube(path, model, positions, 4, cards)
 
 
 def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling: int) -> None:
-    """Write a cube of PSFs at positions (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
+    """Write a cube of PSFs at positions (n, 2), x and y, as STPSF's `psf_grid` lays it out.
+
+    Parameters
+    ----------
+    path : Path
+    model : FieldPsfs
+    positions : ndarray, shape (n, 2)
+        Columns and rows, 0-based; the header has them as rows and columns.
+    oversampling : int
+        Values per pixel and axis.
+    """
     cards: list[Card] = [
         ("OVERSAMP", oversampling, "values per pixel and axis"),
         # photutils 3.0 takes every key with these letters, in any case, for a position, and would
         # exchange x and y without a word: now it stops at this one. Others look for capitals.
         ("HIERARCH Det_yx for photutils 3.0", "this needs photutils 3.1 or newer", ""),
     ]
+    # Keys of more than eight letters, from 100 on, need HIERARCH.
     for number, (column, row) in enumerate(positions.tolist()):
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
@@ -369,6 +372,7 @@ def _write_cube(
     # PSFs about the middle of a pixel are centred.
     x, y = np.rint(positions).T
     first = model.psf_at(x[0], y[0], oversampling)
+    # A header of the right axes, by the first PSF; the number of PSFs is set after.
     header = fits.PrimaryHDU(first[None].astype(np.float32)).header
     header["NAXIS3"] = len(positions)
     model_cards: list[Card] = [

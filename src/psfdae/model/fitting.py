@@ -17,8 +17,8 @@ from psfdae.model.packing import model_of, with_wings
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
 from psfdae.model.star_choice import ENOUGH_STARS
-from psfdae.model.star_sets import field_positions, fit_apart, noise_model, training_set
-from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.model.star_sets import field_positions, fit_apart, noise_model
+from psfdae.model.stars import Stars
 from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
@@ -113,9 +113,7 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
         If the method needs a package that is not installed.
     """
     # The stars as the method takes them: of the image, without those that are held out.
-    data = training_set(
-        stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
-    )
+    data = stars.training_set(kind, checkpoint=checkpoint)
     with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
         return kind.fit(data, **kind.settings(stars.settings))
 
@@ -130,7 +128,7 @@ def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
         The fitted method, whose groups of settings count beside split and truth.
     """
     group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
-    return described_by(kind, group_settings, SPLIT, REFERENCE)
+    return described_by(kind, group_settings, Stars.split_kind, Stars.reference)
 
 
 def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
@@ -156,7 +154,7 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
     errors = {}
     for name, fitted in fits.items():
         judged, kind = fitted, type(fitted)
-        data = training_set(settings, kind, product, SPLIT, REFERENCE)
+        data = stars.training_set(kind)
         with fixed_threads(kind.threads(settings)):
             # A method that learns from the validation stars as well is fitted without them.
             if not kind.needs.validation:
@@ -190,7 +188,9 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
     settings = stars.settings
     description = described(stars, type(fitted))
     with fixed_threads(settings.evaluation.threads):
-        model = model_of(fitted, stars.product, REFERENCE, settings, description, name, licence)
+        model = model_of(
+            fitted, stars.product, Stars.reference, settings, description, name, licence
+        )
         if not fitted.knows_field or stars.observation.shape is None:
             return model
         # Light beyond the stamps, by all stars of each image; neighbours may have measured it.

@@ -45,9 +45,6 @@ from psfdae.rng import stream
 from psfdae.settings import OfTest
 from psfdae.version import __version__
 
-COMPONENTS = 48
-"""Leading eigenvectors of the flux model that a bundle stores."""
-
 
 def model_of(
     fitted: Method,
@@ -112,25 +109,36 @@ def uncalibrated(
     name: str,
     licence: str,
     largest_mb: float | None = None,
+    components: int = 48,
 ) -> tuple[Bundle, HeldOutStars]:
     """Return a fit with all that it takes to apply it, but its errors, and its test stars.
 
     Parameters are those of `model_of`; of the settings, seed, noise and parts are enough.
+    `components` is the number of leading eigenvectors of the flux model that the bundle stores.
+
+    Returns
+    -------
+    bundle : Bundle
+        Its errors are 0, but it has the noise that measures bright stars best (`with_misfit`).
+    stars : HeldOutStars
+        Test stars, by which the errors are to be calibrated.
     """
     split, noise = split_stars(stars, trained["split"], config), noise_model(config)
     images, references = stars["realisation"], stars[reference]
     held_out = HeldOutStars.of(stars, reference, noise, split.test)
     # The flux model, its variance beyond the leading eigenvectors spread evenly.
-    flux_model = leading(FluxModel.fit(images[split.train]), COMPONENTS)
+    flux_model = leading(FluxModel.fit(images[split.train]), components)
     # Range of noise, as pixel RMS over the flux, and of S/N.
     band, area = noise.kappa * np.asarray(config.noise.levels), star_area(stars, split.train)
     least_noise, greatest_noise = float(band.min()), float(band.max())
+    # Simulated stars are one image each.
     training_stars = len(split.train)
     if of_image(stars):  # each bright star is in several of the images
         training_stars = len(np.unique(stars["field_index"][split.train]))
     stamp_fields = _stamp_fields(stars)
     stamp_px = stamp_fields["stamp_px"]
     arrays, method_fields = packed(fitted, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
+    # Everything that is needed to apply the method, and to know what it was trained on.
     info = BundleInfo(
         psfdae_version=__version__,
         name=name,
@@ -143,7 +151,7 @@ def uncalibrated(
         snr_min=signal_to_noise(greatest_noise, area),
         snr_max=signal_to_noise(least_noise, area),
         noise_equivalent_px=area,
-        components=COMPONENTS,
+        components=components,
         training_sha256=checksum(images[split.train], references[split.train]),
         training_stars=training_stars,
         method=fitted.name,
@@ -161,9 +169,16 @@ def uncalibrated(
 
 
 def _stamp_fields(product: Product) -> dict[str, Any]:
-    """Return the keys of a bundle on stamps, from the configuration of the stars."""
+    """Return the keys of a bundle on stamps, from the configuration of the stars.
+
+    Raises
+    ------
+    ProductError
+        If the description of the stars lacks a key.
+    """
     config = product.config
     try:
+        # Simulated stars have a telescope with a diameter; of an image, only its scale is known.
         telescope, framing = config["telescope"], config["framing"]
         # Width of a pixel in λ/D, if the aperture is known.
         pixel_lambda_d = None
@@ -210,6 +225,7 @@ def packed(
     """
     # Steps of the noise up to that of the flux in every pixel.
     count = 64
+    # Axes that are finer than the noise cannot be seen: the more noise, the fewer bytes.
     noises = np.geomspace(noise, max(1.0, noise), count)
 
     @cache
@@ -227,7 +243,15 @@ def packed(
 
 
 def leading(model: FluxModel, components: int) -> FluxModel:
-    """Return the model with the variance beyond its leading eigenvectors spread evenly."""
+    """Return the model with the variance beyond its leading eigenvectors spread evenly.
+
+    Parameters
+    ----------
+    model : FluxModel
+        With a full basis; eigenvalues ascend.
+    components : int
+        Number of leading eigenvectors whose variance stays.
+    """
     variance = model.variance.copy()
     trailing = variance[: variance.size - components]
     if trailing.size:
@@ -271,9 +295,11 @@ def metrics_by_level(
     list of dict
         A row of mean metrics for each level, in their order.
     """
+    # Coverage is measured crosswise: on stars by the errors that the other stars show.
     rows, covered = [], crossed_coverage(errors)
     for level, images in noisy:
         noise, estimate = stars.noise.kappa * level, fitted.estimate(images, level, stars.position)
+        # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(
             {
@@ -290,7 +316,14 @@ def metrics_by_level(
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:
-    """Return the SHA-256 of training stars and of what was to be learnt from them."""
+    """Return the SHA-256 of training stars and of what was to be learnt from them.
+
+    Parameters
+    ----------
+    images, references : ndarray, shape (n, d, d)
+        Type, shape and bytes of both count.
+    """
+    # Arrays of the same bytes but another type or shape are different.
     digest = hashlib.sha256()
     for array in (images, references):
         digest.update(f"{array.dtype.str} {array.shape}".encode())

@@ -16,19 +16,23 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-UNUSABLE_FLAGS = (
-    StarFlag.NO_FLUX
-    | StarFlag.FAINT
-    | StarFlag.MASKED
-    | StarFlag.SATURATED
-    | StarFlag.TRUNCATED
-    | StarFlag.OFF_CENTRE
-    | StarFlag.UNLIKE_TRAINING
-)
-"""Flags of stars whose measured size and shape mean nothing; they are not drawn."""
 
-MAP_COLUMNS = ("x", "y", "snr", "fwhm_px", "ellipticity", "position_angle_deg", "flags")
-"""Columns of a prediction that a map needs; `psf_map` explains them."""
+def has_shape(flags: np.ndarray) -> np.ndarray:
+    """Return True for stars whose measured size and shape mean something, by their flags (n,).
+
+    It means nothing for stars without flux, faint, masked, saturated or truncated ones, and such
+    that are off their centre or unlike the training.
+    """
+    unusable = (
+        StarFlag.NO_FLUX
+        | StarFlag.FAINT
+        | StarFlag.MASKED
+        | StarFlag.SATURATED
+        | StarFlag.TRUNCATED
+        | StarFlag.OFF_CENTRE
+        | StarFlag.UNLIKE_TRAINING
+    )
+    return np.asarray((flags & int(unusable)) == 0)
 
 
 def usable_stars(stars: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -40,7 +44,7 @@ def usable_stars(stars: Mapping[str, np.ndarray]) -> np.ndarray:
         Columns of a prediction; see `psf_map`.
     """
     is_finite = np.isfinite([stars[name] for name in ("x", "y", "fwhm_px")]).all(axis=0)
-    usable = np.flatnonzero(is_finite & ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0))
+    usable = np.flatnonzero(is_finite & has_shape(stars["flags"]))
     return usable[np.argsort(-stars["snr"][usable], kind="stable")]
 
 
@@ -86,9 +90,8 @@ def map_of_file(path: Path) -> Figure:
     with fits.open(path, memmap=True) as file:
         table: Any = file["STARS"].data
         # Copies in the machine's byte order.
-        stars = {
-            name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in MAP_COLUMNS
-        }
+        names = ("x", "y", "snr", "fwhm_px", "ellipticity", "position_angle_deg", "flags")
+        stars = {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
         # Only the PSFs that are drawn are read: a file may have a million.
         def read_psfs(selected: np.ndarray) -> np.ndarray:
@@ -125,6 +128,7 @@ def psf_map(
     limits = (0.0, 1.0, 0.0, 1.0)
     if usable.size:
         limits = (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
+    # Height over width of the field, within what a page can show.
     aspect = np.clip((limits[3] - limits[2]) / (limits[1] - limits[0]), 0.3, 2.0)
     figure = new_figure(0.46 * WIDTH_IN * aspect + 1.5, layout="constrained")
     stamp_axes, whisker_axes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -181,6 +185,7 @@ def _draw_whiskers(
         return None
     # A whisker is as long as two stamps for an ellipticity of 1.
     px_per_ellipticity = 2.0 * spacing_px
+    # Ends of a whisker: the centre plus and minus half its length along the major axis.
     angle = np.deg2rad(stars["position_angle_deg"][selected])
     half = 0.5 * px_per_ellipticity * stars["ellipticity"][selected]
     step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)

@@ -30,7 +30,13 @@ if TYPE_CHECKING:
 
 
 def checks_html(rows: Sequence[Check]) -> str:
-    """Return an HTML table of checks, each passed or to be inspected."""
+    """Return an HTML table of checks, each passed or to be inspected.
+
+    Parameters
+    ----------
+    rows : sequence of Check
+        Question, answer, and True if the check is passed.
+    """
     words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
     cells = [(escape(a), escape(b), words[bool(is_passed)]) for a, b, is_passed in rows]
     return html_table(("check", "result", ""), cells)
@@ -57,13 +63,15 @@ def quality_page(
     residuals : Figure, optional
         Residuals of bright held-out stars (`residual_strip`), if there are any.
     """
+    # The method of the model, and held-out stars as it restores them.
     name, images = type(report.model.method).name, report.restored_by_snr
     # Checks of all stars come before the number of stars held out.
     *checks, held_out_check = report.checks()
+    # Sentences on the fit, and on the image and its list.
     facts = report.model.method.facts().values()
     notes = [line for note in report.stars.notes for line in note.splitlines()]
-    verdicts, flags = stars["verdict"], stars["flags"]
     # A star has one verdict, and may have several flags.
+    verdicts, flags = stars["verdict"], stars["flags"]
     verdict_counts = [(v, int((verdicts == v).sum())) for v in Verdict]
     flag_counts = [(f.name or "", int(((flags & int(f)) > 0).sum())) for f in StarFlag]
     unflagged = ("none", str(int((flags == 0).sum())))
@@ -77,7 +85,7 @@ def quality_page(
         truth_mse=f"{report.table['truth_mse'][0]:.1e}",
         errors_figure=_image_tag(errors_figure(report.table, name)),
         strip=_image_tag(report.strip_png),
-        photometry=_photometry_table(report.found),
+        photometry=_photometry_table(report.photometry),
         facts="".join(f"<p>{escape(fact)}.</p>\n" for fact in facts),
         field_map=_image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
         error_maps=_image_tag(error_maps(images)),
@@ -96,7 +104,14 @@ def quality_page(
 
 
 def _image_tag(picture: Figure | bytes) -> str:
-    """Return an HTML image with a figure, or the bytes of a PNG file, inside."""
+    """Return an HTML image with a figure, or the bytes of a PNG file, inside.
+
+    Parameters
+    ----------
+    picture : Figure or bytes
+        A figure is drawn with 110 dots per inch.
+    """
+    # The picture stands in the page itself, in base 64.
     content = picture if isinstance(picture, bytes) else as_png(picture, dpi=110)
     return f'<img src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
@@ -111,6 +126,7 @@ def _errors_table(errors: Table, model_method: str) -> str:
     model_method : str
         Name of the method that is marked as the model.
     """
+    # Columns are the S/N, ascending.
     levels = np.unique(errors["snr"])
     # A method that was not measured at a S/N has an empty cell.
     cells = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in errors}
@@ -126,7 +142,11 @@ def _photometry_table(photometry: Table) -> str:
     """Return the HTML table of photometry of held-out stars, given nothing but their stamps.
 
     `photometry` has the columns of `found.csv`.
+
+    Its columns are the S/N, the mean error of the flux in per cent, its pull and the RMS error of
+    the centre, which is empty where no centre was fitted.
     """
+    # Biases in per cent of the flux, with their standard errors.
     rows = [
         [
             f"{row['snr']:.3g}",

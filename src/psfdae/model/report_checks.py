@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 MEAN_PSF = "mean_psf"
 """Name, in tables, of the comparison with one mean PSF whose centre is fitted to each star."""
 
-MEAN_LABEL = "one mean PSF, its centre fitted"
-"""Words for `MEAN_PSF` in sentences and legends."""
-
 Check = tuple[str, str, bool]
 """Question, answer, and True if the check is passed."""
 
@@ -89,7 +86,10 @@ def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]
 
 
 def nearest_snr(values: Iterable[float]) -> float:
-    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors."""
+    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors.
+
+    Stars of S/N 10 are faint enough for models to differ, and bright enough to be seen in a figure.
+    """
     return min(values, key=lambda value: abs(np.log(value / 10.0)))
 
 
@@ -106,7 +106,8 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     # The S/N nearest to 10 stands for faint stars, for which models differ most.
     mean, linear = (mse_ratios(errors, method, name) for name in (MEAN_PSF, "lmmse"))
     snr = nearest_snr(mean)
-    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {MEAN_LABEL}"
+    mean_label = method_labels(errors)[MEAN_PSF]
+    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {mean_label}"
     if linear and method != "lmmse":
         sentence += f", {linear[snr]:.2f} times that of linear MMSE"
     levels = ", ".join(f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1)
@@ -134,9 +135,16 @@ def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def method_labels(errors: Table) -> dict[str, str]:
-    """Return the label of each method of a table, in the order of the table."""
+    """Return the label of each method of a table, in the order of the table.
+
+    Returns
+    -------
+    dict of str to str
+        Label for legends by name of the method; one mean PSF has the name `MEAN_PSF`.
+    """
     names = dict.fromkeys(errors["method"])
-    return {n: MEAN_LABEL if n == MEAN_PSF else method_of(n).look.label for n in names}
+    mean_label = "one mean PSF, its centre fitted"
+    return {n: mean_label if n == MEAN_PSF else method_of(n).look.label for n in names}
 
 
 def check_held_out(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
-from psfdae.model.plot import UNUSABLE_FLAGS
+from psfdae.model.plot import has_shape
 from psfdae.model.report_checks import MEAN_PSF, method_labels, nearest_snr, size_errors
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
     figure = new_figure(3.4, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="MSE")
     for index, (name, label) in enumerate(method_labels(errors).items()):
+        # A line for each method; the thick one is the model.
         rows = errors[errors["method"] == name]
         rows.sort("snr")
         color, width = SERIES_COLORS[index % len(SERIES_COLORS)], 2.2 if name == model_method else 1
@@ -37,6 +38,7 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
             rows["snr"], rows["mse"], rows["mse_stderr"], label=label, marker="o", ms=3,
             color=color, lw=width,
         )  # fmt: skip
+    # No method can be seen to be better than the noise of the bright images allows.
     axes.axhline(errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
     axes.grid(True, which="both")
     figure.legend(loc="outside right upper")
@@ -48,7 +50,13 @@ def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """Draw mean and RMS, over held-out stars, of restored minus bright image.
 
     `degraded` has images by S/N, as of `check_held_out`; those of the S/N nearest to 10 are shown.
+
+    Parameters
+    ----------
+    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Held-out stars by S/N: `truth`, and as `model` and one mean PSF restore them.
     """
+    # Faint stars, for which models differ most.
     snr = nearest_snr(degraded)
     images = degraded[snr]
     # In per cent of the mean peak; both means share one scale of colours, symmetric about 0.
@@ -57,6 +65,7 @@ def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     grid: Any = figure.subplots(1, 4, subplot_kw={"xticks": [], "yticks": []})
     for columns, name, label in ((grid[:2], "model", "model"), (grid[2:], MEAN_PSF, "mean PSF")):
         error = 100 * (images[name] - images["truth"]) / peak
+        # Mean error of each pixel over the stars, and its RMS.
         mean, rms = error.mean(axis=0), np.sqrt(np.square(error).mean(axis=0))
         limit = max(np.abs(mean).max(), 1e-9)
         for axes, image, statistic, look in (
@@ -87,6 +96,7 @@ def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
         # A square root shows core and wings in one picture.
         above.imshow(np.sqrt(np.clip(stamp / np.nanmax(stamp), 0, 1)), origin="lower", cmap="magma")
         artist = below.imshow(residual, origin="lower", cmap="RdBu_r", vmin=-5, vmax=5)
+    # Pixels of stamps need no ticks.
     for axes in grid.ravel():
         axes.set(xticks=[], yticks=[])
     figure.colorbar(artist, ax=grid, label="residual (σ)", shrink=0.8)
@@ -104,11 +114,21 @@ def shapes_figure(
     Upper panels: all usable stars, with held-out stars in colour. Lower panels: errors of the
     held-out stars after they were degraded to the S/N nearest to 10. Parameters are those of
     `quality_page`, with the images by S/N.
+
+    Parameters
+    ----------
+    stars : mapping of str to ndarray, shape (N,)
+        Columns flux, x, y, fwhm_px, ellipticity, flags and part of all stars.
+    degraded_rows : ndarray of int, shape (n,)
+        Star of each held-out image.
+    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Held-out images by S/N, as of `error_maps`.
     """
     snr = nearest_snr(degraded)
     # Shapes of flagged stars mean nothing.
-    usable = ((stars["flags"] & int(UNUSABLE_FLAGS)) == 0) & np.isfinite(stars["fwhm_px"])
+    usable = has_shape(stars["flags"]) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
+    # Errors of degraded stars: restored against bright image.
     size_error, ellipticity_error = size_errors(degraded[snr])
     figure = new_figure(7.6, layout="constrained")
     grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
@@ -121,6 +141,7 @@ def shapes_figure(
     coordinates = {"−2.5 log₁₀ flux": magnitude, "x (px)": stars["x"], "y (px)": stars["y"]}
     for column, (axis_label, place) in enumerate(coordinates.items()):
         for row, (label, name, error, error_label) in enumerate(rows):
+            # All stars above, errors of the held-out ones below.
             above, below = grid[2 * row : 2 * row + 2, column]
             above.plot(place[usable], stars[name][usable], ".", ms=2, color="#888888", label="all")
             above.plot(place[held_out], stars[name][held_out], ".", color=SERIES_COLORS[5],
@@ -141,6 +162,10 @@ def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
 
     `stars` has the columns flags, part, chi2 and snr, shape (n,) each. χ² is 1 where the model and
     the noise are right.
+
+    Parameters
+    ----------
+    stars : mapping of str to ndarray, shape (n,)
     """
     flagged, learnt = stars["flags"] != 0, stars["part"] == "training"
     # Both axes are logarithmic.

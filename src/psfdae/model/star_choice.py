@@ -16,7 +16,7 @@ import numpy as np
 from psfdae.image.camera import other_instruments
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
-from psfdae.image.observation import ASSUMED_SCALE_ARCSEC, Observation
+from psfdae.image.observation import Observation
 from psfdae.image.selection import Candidates, Verdict, collect
 from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.model.psf_model import SCALE_TOLERANCE
@@ -282,7 +282,7 @@ def require_one_camera(opened: Sequence[Observation]) -> None:
             raise ObservationError(observation.path, "a cube of stamps; expected an image")
         # The pixel scale, then telescope, camera and filter of the headers.
         images = (first, observation)
-        scales = [image.pixel_scale_arcsec or ASSUMED_SCALE_ARCSEC for image in images]
+        scales = [image.pixel_scale_arcsec or image.assumed_scale_arcsec for image in images]
         differences = other_instruments(*(image.instrument for image in images))
         if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
             name, (stated, text) = "the pixel scale", (f"{scale:.6g} arcsec" for scale in scales)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from psfdae.model.star_choice import (
     require_one_camera,
     require_unique_names,
 )
-from psfdae.model.star_sets import split_stars
+from psfdae.model.star_sets import split_stars, training_set
 from psfdae.rng import stream
 from psfdae.settings import Noise
 from psfdae.splits import Split, held_out_fields
@@ -42,16 +42,8 @@ if TYPE_CHECKING:
 
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
+    from psfdae.method import Method, TrainingSet
     from psfdae.model.wings import Wings
-
-SPLIT = "held_out"
-"""Kind of the split: all images of a star are in the training, or all are in the test."""
-
-REFERENCE = "realisation"
-"""Kind of the truth: the noise-free image of the star itself."""
-
-ALL = "all"
-"""Default name of a model of several exposures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +88,10 @@ class Stars:
     notes: Sequence[str]
     wings: Wings | None = None
     exposures: Sequence[Stars] = ()
+    split_kind: ClassVar[str] = "held_out"
+    """Kind of the split: all images of a star are in the training, or all are in the test."""
+    reference: ClassVar[str] = "realisation"
+    """Array of `product` with the truth: the noise-free image of the star itself."""
 
     @classmethod
     def from_image(
@@ -131,6 +127,7 @@ class Stars:
         images = as_images(image)
         if not images:
             raise ObservationError("image", "no image, expected at least one")
+        # Keywords are statements on the image, or else settings.
         names = {field.name for field in fields(ImageStatements)}
         settings = {name: value for name, value in statements.items() if name not in names}
         stated = {name: value for name, value in statements.items() if name in names}
@@ -160,90 +157,15 @@ class Stars:
             if len(sources) == 1:
                 min_stars = relaxed.calibration_stars.stars_min
                 measured.require(observation.path, min_stars, observation.remarks)
-            stars = cls.of_candidates(source, observation, measured, relaxed)
-            if stars.is_crowded:
+            stars = stars_of_candidates(source, observation, measured, relaxed)
+            if is_crowded(stars):
                 from psfdae.model.neighbours import without_neighbours
 
                 stars = without_neighbours(stars, calibration.neighbour_ratio)
             exposures.append(stars)
-        stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
+        stars = exposures[0] if len(exposures) == 1 else joined_stars(exposures)
         few_notes = few_stars_notes(stars.candidates.bright.row, stars.held_out)
         return replace(stars, notes=(*stars.notes, *notes, *few_notes))
-
-    @classmethod
-    def joined(cls, exposures: Sequence[Stars]) -> Stars:
-        """Join the stars of several images of one camera, chosen with the same settings.
-
-        A star is held out if it is in its own image.
-
-        Raises
-        ------
-        CalibrationStarsError
-            If all together are too few.
-        """
-        # The joined observation stands for all images, as large as the largest.
-        first, observations = exposures[0], [image.observation for image in exposures]
-        observation = replace(
-            first.observation,
-            path=Path(f"{first.observation.path} and {len(exposures) - 1} more"),
-            shape=tuple(map(max, zip(*(image.shape or () for image in observations), strict=True))),
-            header_cards=[card for image in observations for card in image.header_cards],
-        )
-        candidates = Candidates.joined([image.candidates for image in exposures])
-        candidates.require(observation.path, first.settings.calibration_stars.stars_min)
-        # The sky of a typical star: each image counts by its number of stars.
-        sky_photons = np.repeat(
-            [image.settings.noise.background_photons for image in exposures],
-            [len(image) for image in exposures],
-        )
-        return cls(
-            first.source,
-            observation,
-            candidates,
-            np.concatenate([image.held_out for image in exposures]),
-            _with_noise(first.settings, candidates.bright, float(np.median(sky_photons))),
-            [note for image in exposures for note in image.notes],
-            exposures=exposures,
-        )
-
-    @classmethod
-    def of_candidates(
-        cls,
-        source: ImageInput,
-        observation: Observation,
-        candidates: Candidates,
-        settings: Settings,
-    ) -> Stars:
-        """Return the bright stars among the measured stars of an observation.
-
-        Parameters
-        ----------
-        source : ImageInput
-        observation : Observation
-        candidates : Candidates
-            Measured stars of the observation.
-        settings : Settings
-            Settings by which the stars were chosen.
-        """
-        bright = candidates.bright
-        # A single star stands twice: the model is trained on it and tested on it.
-        if len(bright) == 1:
-            bright = bright.of(np.array([0, 0]))
-            candidates = replace(candidates, bright=bright)
-        # Median offset (x, y) between stars and list; a large one is refused unless accepted.
-        offset_note = list_offset(
-            observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
-        )
-        notes = [observation.summary(), *filter(None, [offset_note])]
-        # Advice on stamps and saturation needs enough stars for a median.
-        if len(bright) >= settings.calibration_stars.stars_min:
-            notes += advice(candidates, observation, settings.framing.stamp_px)
-        # Noise levels follow from the noise-equivalent area of the bright stars.
-        if len(bright):
-            sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
-            settings = _with_noise(settings, bright, sky)
-        held_out = held_out_fields(star_grid(bright.position))
-        return cls(source, observation, candidates, held_out, settings, tuple(notes))
 
     @property
     def images(self) -> Sequence[Stars]:
@@ -253,7 +175,13 @@ class Stars:
     @cached_property
     def split(self) -> Split:
         """Numbers of the training, validation and test images in `product`."""
-        return split_stars(self.product, SPLIT, self.settings)
+        return split_stars(self.product, self.split_kind, self.settings)
+
+    def training_set(self, kind: type[Method], **fields: Any) -> TrainingSet:
+        """Return what a method is fitted to; `fields` are further fields of `TrainingSet`."""
+        return training_set(
+            self.settings, kind, self.product, self.split_kind, self.reference, **fields
+        )
 
     @cached_property
     def columns(self) -> dict[str, Column]:
@@ -271,19 +199,6 @@ class Stars:
             stream(settings.seed, "own stars"),
             calibration.centring_px or 0.0,
         )
-
-    @property
-    def is_crowded(self) -> bool:
-        """True if so many bright stars have neighbours that it pays to subtract these."""
-        # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
-        has_image = self.observation.shape is not None
-        if not has_image or not np.isfinite(self.candidates.bright.position).all():
-            return False
-        # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that
-        # have neighbours than stars without, those without are enough.
-        crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
-        enough = max(len(self), ENOUGH_STARS)
-        return len(self) >= MIN_STARS_WITH_ERROR and bool(crowded >= enough)
 
     @property
     def _counts(self) -> str:
@@ -308,8 +223,8 @@ class Stars:
 
     @property
     def name(self) -> str:
-        """Default name of a model of these stars."""
-        return ALL if self.exposures else self.source.name
+        """Default name of a model of these stars: that of the image, or "all" of several."""
+        return "all" if self.exposures else self.source.name
 
     def with_settings(self, settings: Settings) -> Stars:
         """Return these stars with other settings of methods."""
@@ -334,6 +249,7 @@ class Stars:
         """
         from astropy.table import vstack
 
+        # Measurements of all stars; of several images, with the file that each star is in.
         columns = self.candidates.columns(self.held_out)
         observations = [image.observation for image in self.images]
         if self.exposures:
@@ -359,6 +275,7 @@ class Stars:
 
     def described(self) -> dict[str, Any]:
         """Return the description of the product "stars", as JSON holds it."""
+        # Settings that determine the stars, then the images, then what is known of the camera.
         observation = self.observation
         parts = {"seed", "calibration_stars", "framing", "parts"}
         description: dict[str, Any] = {
@@ -381,7 +298,107 @@ class Stars:
         return plain
 
 
-def _with_noise(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:
+def stars_of_candidates(
+    source: ImageInput, observation: Observation, candidates: Candidates, settings: Settings
+) -> Stars:
+    """Return the bright stars among the measured stars of an observation.
+
+    Parameters
+    ----------
+    source : ImageInput
+    observation : Observation
+    candidates : Candidates
+        Measured stars of the observation.
+    settings : Settings
+        Settings by which the stars were chosen.
+
+    Raises
+    ------
+    ObservationError
+        If the stars are far off the positions of their list, unless that is accepted.
+    """
+    bright = candidates.bright
+    # A single star stands twice: the model is trained on it and tested on it.
+    if len(bright) == 1:
+        bright = bright.of(np.array([0, 0]))
+        candidates = replace(candidates, bright=bright)
+    # Median offset (x, y) between stars and list; a large one is refused unless accepted.
+    offset = (bright.centre - bright.listed)[:, ::-1]
+    offset_note = list_offset(observation.catalogue, offset, source.accept_offset)
+    notes = [observation.summary(), *filter(None, [offset_note])]
+    # Advice on stamps and saturation needs enough stars for a median.
+    if len(bright) >= settings.calibration_stars.stars_min:
+        notes += advice(candidates, observation, settings.framing.stamp_px)
+    # Noise levels follow from the noise-equivalent area of the bright stars.
+    if len(bright):
+        sky_photons = bright.sky_photons(observation.gain, settings.noise.background_photons)
+        settings = with_degraded_levels(settings, bright, sky_photons)
+    # Every fifth star is held out, evenly over the field.
+    held_out = held_out_fields(star_grid(bright.position))
+    return Stars(source, observation, candidates, held_out, settings, tuple(notes))
+
+
+def is_crowded(stars: Stars) -> bool:
+    """Return True if so many bright stars have neighbours that it pays to subtract these.
+
+    Parameters
+    ----------
+    stars : Stars
+        Stars of one image.
+    """
+    # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
+    has_image = stars.observation.shape is not None
+    if not has_image or not np.isfinite(stars.candidates.bright.position).all():
+        return False
+    # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that have
+    # neighbours than stars without, those without are enough.
+    crowded = np.count_nonzero(stars.candidates.verdict == Verdict.CROWDED)
+    enough = max(len(stars), ENOUGH_STARS)
+    return len(stars) >= MIN_STARS_WITH_ERROR and bool(crowded >= enough)
+
+
+def joined_stars(exposures: Sequence[Stars]) -> Stars:
+    """Join the stars of several images of one camera, chosen with the same settings.
+
+    A star is held out if it is in its own image.
+
+    Parameters
+    ----------
+    exposures : sequence of Stars
+        The stars of each image, two images or more.
+
+    Raises
+    ------
+    CalibrationStarsError
+        If all together are too few.
+    """
+    # The joined observation stands for all images, as large as the largest.
+    first, observations = exposures[0], [image.observation for image in exposures]
+    observation = replace(
+        first.observation,
+        path=Path(f"{first.observation.path} and {len(exposures) - 1} more"),
+        shape=tuple(map(max, zip(*(image.shape or () for image in observations), strict=True))),
+        header_cards=[card for image in observations for card in image.header_cards],
+    )
+    candidates = Candidates.joined([image.candidates for image in exposures])
+    candidates.require(observation.path, first.settings.calibration_stars.stars_min)
+    # The sky of a typical star: each image counts by its number of stars.
+    sky_photons = np.repeat(
+        [image.settings.noise.background_photons for image in exposures],
+        [len(image) for image in exposures],
+    )
+    return Stars(
+        first.source,
+        observation,
+        candidates,
+        np.concatenate([image.held_out for image in exposures]),
+        with_degraded_levels(first.settings, candidates.bright, float(np.median(sky_photons))),
+        [note for image in exposures for note in image.notes],
+        exposures=exposures,
+    )
+
+
+def with_degraded_levels(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:
     """Return settings with the noise levels λ of the stated S/N, for noise-free stars of flux 1.
 
     S/N = 1 / (κ λ √A), with A the median noise-equivalent area of the bright stars.
@@ -396,6 +413,7 @@ def _with_noise(settings: Settings, bright: BrightStars, sky_photons: float) -> 
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
     degraded_snr = settings.calibration_stars.degraded()
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in degraded_snr]
+    # Levels ascend where S/N descend; nine digits, so that a file has the same number.
     noise = Noise(
         name=settings.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +15,13 @@ import numpy as np
 
 from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
-from psfdae.image.tables import shown_with_digits
+from psfdae.image.tables import table_of_rows
 from psfdae.method import Method
 from psfdae.methods import method as method_of
-from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
-from psfdae.model.calibration import COVERAGE
+from psfdae.metrics import all_metrics, mse, quality, summarised
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.flux_model import signal_to_noise
+from psfdae.model.held_out_photometry import measure_photometry
 from psfdae.model.packing import checksum
 from psfdae.model.plot import psf_map
 from psfdae.model.psf_model import PsfModel
@@ -39,9 +40,8 @@ from psfdae.model.star_sets import (
     noisy_test_images,
     own_noise,
     star_area,
-    training_set,
 )
-from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.model.stars import Stars
 from psfdae.progress import steps
 from psfdae.threads import fixed_threads
 
@@ -50,7 +50,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None = None) -> Report:
+def validate(
+    model: PsfModel, stars: Stars, further_fits: Mapping[str, Method] | None = None
+) -> Report:
     """Measure a model on the stars held out, degraded to the noise levels of their settings.
 
     It is compared with the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
@@ -60,8 +62,8 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     model : PsfModel
         It was fitted to these stars, or to another image of the same camera.
     stars : Stars
-    others : mapping of str to Method, optional
-        Further fits to these stars for the table, by name.
+    further_fits : mapping of str to Method, optional
+        Fits of other methods to these stars, by name, for the table.
 
     Raises
     ------
@@ -76,8 +78,9 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     True
     """
     _require_unseen(model, stars)
-    settings, product = stars.settings, stars.product
-    fits = {**(others or {}), model.info.method: model.method}
+    settings = stars.settings
+    # The fits that exist already, that of the model included.
+    fits = {**(further_fits or {}), model.info.method: model.method}
     # Every table has the noisy images and linear MMSE; both are quick to fit.
     baselines = ("noisy", "lmmse")
     names = [name for name in settings.methods if name in fits or name in baselines]
@@ -86,7 +89,7 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
         for name in dict.fromkeys([*names, model.info.method, *baselines]):
             if name not in fits:
                 method_class = method_of(name)
-                data = training_set(settings, method_class, product, SPLIT, REFERENCE)
+                data = stars.training_set(method_class)
                 fits[name] = method_class.fit(data, **method_class.settings(settings))
             methods[name] = fits[name]
         return _measure(model, stars, methods)
@@ -102,6 +105,7 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
         the same image.
     """
     info, product, path = model.info, stars.product, stars.observation.path
+    # Pixels and stamps must have the size of those of the model.
     model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
         raise PredictionError(
@@ -114,7 +118,9 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
         return
     # The training images of a model are those of these stars if their checksum is the same.
     train = stars.split.train
-    if info.training_sha256 != checksum(product["realisation"][train], product[REFERENCE][train]):
+    if info.training_sha256 != checksum(
+        product["realisation"][train], product[stars.reference][train]
+    ):
         raise PredictionError(
             f"{path}: the model {info.name!r} was trained on other stars of this image, among "
             "which may be those held out here; fit a model to these stars"
@@ -132,9 +138,10 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         Fits by name, that of the model included.
     """
     settings, product, test = stars.settings, stars.product, stars.split.test
-    truth, star = product[REFERENCE][test], product["field_index"][test]
+    # Held-out images with their truth, star and place.
+    truth, star = product[stars.reference][test], product["field_index"][test]
     position, data_range = field_positions(product)[test], settings.evaluation.data_range
-    key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
+    key = {"dataset": stars.name, "split": stars.split_kind, "reference": stars.reference}
     rows, mean_rows, per_star, restored = [], [], [], {}
     for level in steps("stars held out", settings.noise.levels):
         noisy = noisy_test_images(settings, product, test, level)
@@ -147,6 +154,7 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
             # The model may be of another image, whose noise level λ has another κ.
             scale = settings.noise.kappa / model.info.kappa if is_model else 1.0
             estimate = method.estimate(noisy, scale * level, position)
+            # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
             rows += summarised(row, metrics, star)
@@ -159,100 +167,22 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         stars,
         methods,
         _error_table([*rows, *mean_rows], stars, methods),
-        _stacked(rows),
+        table_of_rows(rows),
         _joined(per_star),
-        _measure_photometry(model, stars, restored),
+        measure_photometry(model, stars, restored),
         restored,
     )
-
-
-def _measure_photometry(
-    model: PsfModel, stars: Stars, restored: Mapping[float, Mapping[str, np.ndarray]]
-) -> Table:
-    """Predict held-out stars of flux 1 at each λ from their places alone (`Report.found`).
-
-    The bright star that is the truth has noise itself, which counts in every error.
-
-    Parameters
-    ----------
-    model : PsfModel
-    stars : Stars
-    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
-        Degraded images (`noisy`) by noise level λ.
-
-    Returns
-    -------
-    Table
-        Rows by S/N, ascending.
-    """
-    product, test = stars.product, stars.split.test
-    kappa, background = stars.settings.noise.kappa, stars.settings.noise.background_photons
-    area = star_area(product, stars.split.train)
-    star, truth = product["field_index"][test], product[REFERENCE][test]
-    # Errors of the truth: of its flux and pixels by its noise, of its centre by a fit.
-    truth_errors = own_noise(product, product[REFERENCE], background)
-    truth_flux_error, truth_sigma = (errors[test] for errors in truth_errors)
-    positions, noise = field_positions(product)[test], product["noise"][star]
-    bright = model.predict(truth, flux=1.0, background=0.0, noise=noise, position=positions)
-    rows = []
-    for level in sorted(restored, reverse=True):  # S/N ascending
-        # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
-        gain = np.sqrt(background) / (kappa * level)
-        estimate = model.predict(restored[level]["noisy"], gain=gain, position=positions)
-        usable = np.isfinite(estimate.psf).all(axis=(1, 2)) & (estimate.flux_error > 0)
-        # Offsets of the centre, and their standard errors, along x and y.
-        offset = np.stack([estimate.x_fit - bright.x_fit, estimate.y_fit - bright.y_fit])
-        offset_error = np.stack(
-            [np.hypot(estimate.x_error, bright.x_error), np.hypot(estimate.y_error, bright.y_error)]
-        )
-        # Pull of the flux: its error over the standard error, that of the truth included.
-        pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
-        flux_bias, flux_bias_stderr = _usable_mean(estimate.flux - 1.0, star, usable)
-        flux_pull = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
-        mean_square_px = _usable_mean(np.square(offset).sum(axis=0), star, usable)[0]
-        row = {
-            "snr": signal_to_noise(kappa * level, area),
-            "lost": float(1.0 - usable.mean()),
-            "flux_bias": flux_bias,
-            "flux_bias_stderr": flux_bias_stderr,
-            "flux_pull": flux_pull,
-            "centre_rms_px": mean_square_px**0.5,
-        }
-        # Coverage: fraction of errors within the stated ones.
-        pixel_error = np.hypot(estimate.uncertainty, truth_sigma)
-        has_centre = np.isfinite(offset).all(axis=0)
-        coverage = {
-            "flux": np.where(usable, pull < 1.0, np.nan),
-            "centre": np.where(has_centre, (np.abs(offset) < offset_error).mean(axis=0), np.nan),
-            "psf": (np.abs(estimate.psf - truth) < pixel_error).mean(axis=(1, 2)),
-        }
-        for name, fraction in coverage.items():
-            row[f"{name}_within"], row[f"{name}_within_stderr"] = _usable_mean(
-                fraction, star, usable
-            )
-        rows.append(row)
-    return _stacked(rows)
-
-
-def _usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
-    """Return the mean of usable images and its standard error, clustered by star; NaN of none.
-
-    `values`, `star` and the mask `usable` have the shape (n,).
-    """
-    return clustered_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)
-
-
-def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
-    """Return a table of rows that have the same keys."""
-    from astropy.table import Table
-
-    return shown_with_digits(Table({name: [row[name] for row in rows] for name in rows[0]}))
 
 
 def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return one table of blocks of columns, NaN in the columns that a block does not have.
 
     A block has the array `star` (n,); its other values are arrays as long, or constants.
+
+    Returns
+    -------
+    Table
+        Columns stand in the order in which they first appear.
     """
     from astropy.table import Table
 
@@ -279,12 +209,13 @@ def _error_table(
         Methods in the order of the rows; one mean PSF comes last.
     """
     settings, product, split = stars.settings, stars.product, stars.split
+    # S/N = 1 / (κ λ √A) with the noise-equivalent area A of a typical star.
     area = star_area(product, split.train)
     # Mean and standard error of each metric, by noise level and method.
     cells = {(row["noise_level"], row["method"], row["metric"]): row for row in statistics}
     # Noise of the bright images: the variance of their pixels is a part of every MSE.
     sky_photons = settings.noise.background_photons
-    _, truth_sigma = own_noise(product, product[REFERENCE], sky_photons)
+    _, truth_sigma = own_noise(product, product[stars.reference], sky_photons)
     rows = []
     for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
         noise = settings.noise.kappa * level
@@ -303,7 +234,7 @@ def _error_table(
                     "truth_mse": float(np.square(truth_sigma[split.test]).mean()),
                 }
             )
-    return _stacked(rows)
+    return table_of_rows(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +253,7 @@ class Report:
         Every metric of every method at every noise level.
     per_star : Table
         Every metric of every image.
-    found : Table
+    photometry : Table
         Photometry by S/N: what `predict` makes of the held-out images where no flux, sky, noise
         and centre is given. Bias of the flux over the flux, its pull (what 68.27 % of |error| over
         `flux_error` are below: 1 if errors hold), RMS of the centre, and the parts of fluxes,
@@ -345,7 +276,7 @@ class Report:
     table: Table
     evaluation: Table
     per_star: Table
-    found: Table
+    photometry: Table
     restored: dict[float, dict[str, np.ndarray]]
 
     def __str__(self) -> str:
@@ -360,12 +291,24 @@ class Report:
         return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
 
     def checks(self) -> list[Check]:
-        """Check the model on the stars held out: question, answer, and True if it is passed."""
+        """Check the model on the stars held out: question, answer, and True if it is passed.
+
+        Returns
+        -------
+        list of Check
+            They compare errors with those of the simplest models, sizes of stars, stated errors.
+        """
         # Coverage was measured when the model was made, at S/N of its own.
         rows = self.model.info.metrics
         coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
         method = self.model.info.method
-        return check_held_out(method, self.table, self.found, coverage, self.restored_by_snr)
+        return check_held_out(method, self.table, self.photometry, coverage, self.restored_by_snr)
+
+    @property
+    def found(self) -> Table:
+        """Former name of `photometry`, for one version more."""
+        warnings.warn("Report.found is now Report.photometry", DeprecationWarning, stacklevel=2)
+        return self.photometry
 
     @property
     def restored_by_snr(self) -> dict[float, dict[str, np.ndarray]]:
@@ -377,12 +320,25 @@ class Report:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the page, one HTML file that needs no other."""
+        """Write the page, one HTML file that needs no other.
+
+        Parameters
+        ----------
+        path : path-like
+            File that is written, or replaced.
+        """
         write_text(path, self.page())
 
     def strip(self) -> Figure:
-        """Draw held-out stars degraded to S/N 10, as each method restores them."""
+        """Draw held-out stars degraded to S/N 10, as each method restores them.
+
+        Returns
+        -------
+        Figure
+            Six stars, evenly over the field: the bright star, then a row for each method.
+        """
         product, test = self.stars.product, self.stars.split.test
+        # S/N of each noise level, for stars of the typical size.
         kappa = self.stars.settings.noise.kappa
         area = star_area(product, self.stars.split.train)
         # The noise level whose S/N is the nearest to 10.
@@ -438,6 +394,12 @@ def _evenly_spread(position: np.ndarray, count: int) -> np.ndarray:
     """Return indices of at most `count` stars, evenly over the field if positions (n, 2) are known.
 
     Where one is NaN, they are the first stars.
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        (x, y) of the stars.
+    count : int
     """
     if not np.isfinite(position).all():
         return np.arange(min(count, len(position)))
@@ -462,6 +424,7 @@ def _predict_all(
     psf : ndarray, shape (N, d, d)
     residuals : ndarray, shape (k, d, d)
     """
+    # Lists of the batches: columns, PSFs, and residuals of the stars shown.
     columns: dict[str, list[np.ndarray]] = {}
     psfs, residuals, count = [], [], 0
     streams = (

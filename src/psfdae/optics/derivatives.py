@@ -222,10 +222,9 @@ class ModalStamps:
         # Degrees (a, b) of the Legendre products in the modes.
         self._products = [*map(tuple, degrees)]
         # Degrees along y that go with each degree along x; the constant first, it is the field.
-        self._degrees = [
-            [0] * (a == 0) + [b for c, b in self._products if c == a]
-            for a in range(degrees[:, 0].max() + 1)
-        ]
+        self._degrees = {0: [0]}
+        for a, b in sorted(self._products):
+            self._degrees.setdefault(a, []).append(b)
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Compute the stamps of a batch.
@@ -309,12 +308,13 @@ class ModalStamps:
         """Return intensities and slopes as above, by a field per product of polynomials."""
         sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
-        for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
+        rows_of_degrees = sampling.along_x(pupil_fields, [*self._degrees])
+        for (a, y_degrees), rows in zip(self._degrees.items(), rows_of_degrees, strict=True):
             # P_a(x) along x serves all P_b(y) that go with it; P_0 P_0 is the field itself.
-            changes = sampling.along_y(rows, self._degrees[a])
+            changes = sampling.along_y(rows, y_degrees)
             if a == 0:
                 image = changes[0]
-            for b, change in zip(self._degrees[a], changes, strict=True):
+            for b, change in zip(y_degrees, changes, strict=True):
                 # Im E Re G − Re E Im G, as by direction; kept as pixels, which are fewer.
                 slope = image.imag * change.real - image.real * change.imag
                 slopes[a, b] = sampling.to_pixels(slope)

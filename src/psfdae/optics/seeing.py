@@ -14,18 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from psfdae.optics.propagation import Precision, complex_field, real_dtype
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import legendre
-
-NEGLIGIBLE_WING = 1e-4
-"""Fraction of the profile's maximum below which wings of the next period do not matter.
-
-In a stamp that is some 1e-5 of the light on single pixels at its edge, an MSE of 1e-10.
-"""
 
 
 @dataclass(frozen=True)
@@ -42,6 +37,11 @@ class Profile:
 
     fwhm: float
     beta: float | None = None
+    negligible_wing: ClassVar[float] = 1e-4
+    """Fraction of the profile's maximum below which wings of the next period do not matter.
+
+    In a stamp that is some 1e-5 of the light on single pixels at its edge, an MSE of 1e-10.
+    """
 
     @property
     def scale(self) -> float:
@@ -69,11 +69,11 @@ class Profile:
 
     @property
     def reach(self) -> float:
-        """Radius in λ/D at which the profile has fallen to `NEGLIGIBLE_WING` of its maximum."""
+        """Radius in λ/D at which the profile has fallen to `negligible_wing` of its maximum."""
         # The radius r of exp(−r²/2σ²) or (1 + r²/a²)^−β = wing.
         if self.beta is None:
-            return float(self.scale * np.sqrt(-2.0 * np.log(NEGLIGIBLE_WING)))
-        return float(self.scale * np.sqrt(NEGLIGIBLE_WING ** (-1.0 / self.beta) - 1.0))
+            return float(self.scale * np.sqrt(-2.0 * np.log(self.negligible_wing)))
+        return float(self.scale * np.sqrt(self.negligible_wing ** (-1.0 / self.beta) - 1.0))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
 from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
+from psfdae.sensing.summary import nearest_modes, summarise_modes, wavefront_table
 from psfdae.telescope.field import Terms, telescope_model, terms_of
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
@@ -237,15 +238,7 @@ class Wavefronts:
     @cached_property
     def mode_of_draw(self) -> np.ndarray:
         """Mode that is nearest to every draw, (m, s), by the Mahalanobis distance."""
-        nearest = np.empty(self.draws.shape[:2], int)
-        for row, star in enumerate(self.star):
-            # Squared distance (x − μ)ᵀ C⁻¹ (x − μ) of all draws from all modes of the star.
-            modes = np.flatnonzero(self.modes.star == star)
-            gap = self.draws[row][None] - self.modes.parameters[modes][:, None]
-            precision = np.linalg.inv(self.modes.covariance[modes])
-            distance = np.einsum("mni,mij,mnj->mn", gap, precision, gap)
-            nearest[row] = modes[distance.argmin(axis=0)]
-        return nearest
+        return nearest_modes(self.draws, self.modes)
 
     @cached_property
     def summary(self) -> dict[str, np.ndarray]:
@@ -253,25 +246,7 @@ class Wavefronts:
 
         `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
         """
-        # Draws belong to the mode that is nearest; a mode without draws is left out.
-        k = len(self.terms.names)
-        rows: list[tuple[Any, ...]] = []
-        for row, star in enumerate(self.star):
-            # The probability of a mode is its fraction of the star's draws.
-            modes, count = np.unique(self.mode_of_draw[row], return_counts=True)
-            for mode in modes[np.argsort(-count, kind="stable")]:
-                draws = self.coefficients[row, self.mode_of_draw[row] == mode]
-                # Too few draws have no useful covariance: that of the peak takes its place.
-                if len(draws) > 2 * k:
-                    covariance = np.atleast_2d(np.cov(draws, rowvar=False))
-                else:
-                    sd = self.terms.sd[star]
-                    covariance = self.modes.covariance[mode, :k, :k] * sd * sd[:, None]
-                probability = len(draws) / self.draws.shape[1]
-                rows.append((star, probability, draws.mean(axis=0), covariance))
-        names = ("star", "probability", "mean", "covariance")
-        columns = zip(*rows, strict=True)
-        return {name: np.array(values) for name, values in zip(names, columns, strict=True)}
+        return summarise_modes(self.coefficients, self.mode_of_draw, self.modes, self.terms.sd)
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
         """Return central intervals of the coefficients over all modes of each star.
@@ -394,14 +369,20 @@ class Wavefronts:
             deviations over all modes. NaN for stars without usable pixels.
         """
         star, photons, side = self.star, self.search.photons, self.stamps.data.shape[-1]
+
+        def middle(position: np.ndarray) -> np.ndarray:
+            # Stamps begin at the first pixel about a position; at 0 where it is unknown.
+            corner = np.where(np.isfinite(position), central_pixel(position) - side // 2, 0)
+            return np.asarray(corner[star] + 0.5 * (side - 1))
+
         # Zero and unit of each parameter. Places count from the middle of the stamp, flux and sky
         # are in electrons, the sky in units of the root of its counts.
         gain = photons.gain[star]
         unit_px = np.ones(len(star))
         columns: dict[str, np.ndarray] = {}
         scales = {
-            "x": (self._corner(self.stamps.x) + 0.5 * (side - 1), unit_px),
-            "y": (self._corner(self.stamps.y) + 0.5 * (side - 1), unit_px),
+            "x": (middle(self.stamps.x), unit_px),
+            "y": (middle(self.stamps.y), unit_px),
             "flux": (np.zeros(len(star)), self.search.flux[star] / gain),
             "sky": (photons.sky_level[star], np.sqrt(photons.sky_counts[star]) / gain),
         }
@@ -411,11 +392,6 @@ class Wavefronts:
             columns[name] = self._for_all_stars(zero + unit * draws.mean(axis=1))
             columns[f"{name}_error"] = self._for_all_stars(unit * draws.std(axis=1))
         return columns
-
-    def _corner(self, position: np.ndarray) -> np.ndarray:
-        """Return the first pixel (m,) of stamps about positions (n,); 0 where these are unknown."""
-        corner = central_pixel(position) - self.stamps.data.shape[-1] // 2
-        return np.asarray(np.where(np.isfinite(position), corner, 0)[self.star])
 
     def _for_all_stars(self, values: np.ndarray) -> np.ndarray:
         """Return values (m, ...) of the usable stars as (n, ...), NaN for the others."""
@@ -435,43 +411,4 @@ class Wavefronts:
         - `rms` of the wavefront over all modes and `rms_error`, in nanometres;
         - place, flux and sky with errors, as in `measured`.
         """
-        from astropy.table import Column, Table
-
-        # Rows of the summary, then one for each star without usable pixels, ordered by star.
-        summary, stamps = self.summary, self.stamps
-        star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), self.star))
-        unusable = np.full(star.size - summary["star"].size, np.nan)
-        order = np.argsort(star, kind="stable")
-        star = star[order]
-
-        def completed(values: np.ndarray) -> np.ndarray:
-            # Values of the summary, and NaN for stars that it has not.
-            return np.append(values, unusable)[order]
-
-        columns: list[tuple[str, np.ndarray, str | None]] = [
-            ("id", stamps.id[star], None),
-            # Number of the mode: rows since the first one of the star.
-            ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
-            ("probability", completed(summary["probability"]), None),
-            ("explained", self.explained[star], None),
-            ("chi2", self.chi2[star], None),
-            ("snr", self.snr[star], None),
-            ("x_deg", self.field_deg[star, 0], "deg"),
-            ("y_deg", self.field_deg[star, 1], "deg"),
-        ]
-        for k, name in enumerate(self.terms.names):
-            # Coefficients with the standard deviation of their mode.
-            error = np.sqrt(summary["covariance"][:, k, k])
-            columns.append((name, completed(summary["mean"][:, k]), "wave"))
-            columns.append((f"{name}_error", completed(error), "wave"))
-        # The RMS is that of the whole posterior, the same for all modes of a star.
-        for name, waves in zip(("rms", "rms_error"), self.rms, strict=True):
-            columns.append((name, self.wavelength_nm * waves[star], "nm"))
-        for name, values in self.measured().items():
-            columns.append((name, values[star], "pix" if name[0] in "xy" else None))
-        table = Table()
-        for name, values, unit in columns:
-            # A wave is no unit of the FITS standard; the description has it.
-            fits_unit = None if unit == "wave" else unit
-            table[name] = Column(values, unit=fits_unit, description=unit)
-        return table
+        return wavefront_table(self)

@@ -40,9 +40,6 @@ below a thousandth of the noise of stars of S/N 200.
 MAX_Z = 6.0
 """Standard deviations of the prior beyond which no coefficient is searched."""
 
-STARS_AT_ONCE = 128
-"""Stars of 16 × 16 px that are worked on together, to bound the memory."""
-
 
 class SensingError(Error, ValueError):
     """Stars, or a telescope, from which no wavefronts can be measured."""
@@ -281,6 +278,9 @@ class WavefrontSearch:
         Flux of the best candidate of each star in electrons, the unit of fluxes.
     """
 
+    stars_at_once: ClassVar[int] = 128
+    """Stars of 16 × 16 px that are worked on together, to bound the memory."""
+
     def __init__(self, optics: StarOptics, photons: Photons, seed: int) -> None:
         self.optics, self.photons, self.seed = optics, photons, seed
         self.flux = np.ones(len(photons.counts))
@@ -311,7 +311,7 @@ class WavefrontSearch:
 
     def _blocks(self, stars: np.ndarray) -> list[np.ndarray]:
         # Memory grows with the number of pixels.
-        size = max(1, int(STARS_AT_ONCE * (16 / self.optics.stamp_px) ** 2))
+        size = max(1, int(self.stars_at_once * (16 / self.optics.stamp_px) ** 2))
         return np.split(stars, range(size, stars.size, size))
 
     def _find_modes_of(self, stars: np.ndarray) -> StarModes:

@@ -143,6 +143,7 @@ class Prescription(Group):
 
         The order of a mapping in a file, or of overrides, does not matter.
         """
+        # Light comes down from the secondary: the highest front is met first.
         return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
 
     @model_validator(mode="after")
@@ -191,6 +192,7 @@ class Seidel(Group):
     @property
     def coefficients(self) -> np.ndarray:
         """Coefficients in waves, in the order of `SEIDEL_TERMS`, shape (5,)."""
+        # Settings by name, as an array in the order of all wavefronts.
         return np.array([getattr(self, term) for term in SEIDEL_TERMS])
 
 

@@ -150,6 +150,7 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
     RayTracingError, MissingExtraError
         As `static_zernikes`.
     """
+    # Terms, modes of the pupil and static coefficients, by the kind of the aberrations.
     aberrations = telescope.aberrations
     jitter = 0.0
     if isinstance(aberrations, Seidel):
@@ -236,12 +237,14 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
     angle_deg : ndarray, shape (n, 2)
         Field angles (x, y) of the stars.
     """
+    # Each kind of aberrations has its own numbers and their prior.
     angle_deg = np.asarray(angle_deg, float)
     prior, aberrations, seeing = telescope.prior, telescope.aberrations, telescope.seeing
     if isinstance(aberrations, Seidel):
         # Seidel coefficients are the same for all stars: row k of the basis is a unit of term k.
         count = len(VISIBLE_SEIDEL_TERMS)
         basis = np.broadcast_to(np.eye(count)[:, None], (count, len(angle_deg), count))
+        # Distortion, the last term, is left out: it only moves stars.
         mean, waves = aberrations.coefficients[:count], prior.waves or 0.0
         model = _linear_model(VISIBLE_SEIDEL_TERMS, mean, basis, prior.fraction, waves)
     elif isinstance(aberrations, Zernike):
@@ -253,6 +256,7 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
         for row, (j, power) in enumerate(rows):
             x, y = (field[:, axis] ** power.count(letter) for axis, letter in enumerate("xy"))
             basis[row, :, noll.index(j)] = x * y
+        # Each power of the field is a number with a prior of its own, about its value in the file.
         mean = np.array([aberrations.terms[f"z{j}"][power] for j, power in rows])
         waves = aberrations.jitter_waves if prior.waves is None else prior.waves
         names = tuple(f"z{j}.{power}" for j, power in rows)
@@ -321,6 +325,7 @@ def _ray_traced_model(
             lambda numbers: trace_zernikes(telescope, angle_deg, numbers[0], units * numbers[1:]),
         )
     # Without a secondary, the optical axis may be off the middle of the field.
+    # A star is traced at its angle from the axis; there is nothing to misalign.
     aligned = np.zeros(4)
     return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),

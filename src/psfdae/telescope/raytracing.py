@@ -45,6 +45,7 @@ def misalign(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
     x, y, tilt_x, tilt_y = (float(value) for value in misalignment)
     # One turn about an axis in the mirror's plane: neither tilt comes before the other.
     turn = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).as_matrix()
+    # Decentred first, then tilted about the vertex, which has moved along.
     return optic.withLocallyShiftedOptic("M2", [x, y, 0.0]).withLocallyRotatedOptic("M2", turn)
 
 
@@ -77,6 +78,7 @@ class ZernikeTracer:
     ) -> None:
         import batoid
 
+        # Facts of the trace that do not change with the misalignment.
         self.optic = optic
         self.wavelength_m = wavelength_m
         self.field_rad = np.asarray(field_rad, float)

@@ -95,23 +95,15 @@ class AlignmentStamps:
         alignment: Alignment,
         movable: bool = False,
     ) -> None:
-        # Settings, kept for those who use the operator.
-        self.telescope = telescope
-        self.optics = optics
-        self.alignment = alignment
-        self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
-        """Noll indices of the J coefficients."""
-        self.movable = movable
+        self.alignment, self.movable = alignment, movable
         # Pupil modes whose sum is the OPD of a centred stamp.
-        self._modes: PupilModes = partial(
-            centred_modes, alignment.highest_zernike, telescope.obscuration
-        )
+        modes: PupilModes = partial(centred_modes, alignment.highest_zernike, telescope.obscuration)
         if movable:
-            self._modes = partial(movable_modes, self._modes, telescope.pixel)
+            modes = partial(movable_modes, modes, telescope.pixel)
         # Stamps are nearly as wide as the period of the image, which is transformed whole.
         self.propagation = SampledStamps(
             telescope.obscuration,
-            self._modes,
+            modes,
             PeriodSampling,
             alignment.stamp_px,
             telescope.pixel,

@@ -70,6 +70,8 @@ class BoundedStars:
 
 def bounded_stars(config: Config, product: Product) -> BoundedStars:
     """Read the first test stars of a product "stars", with the noise of their datasets."""
+    # Errors of bounds and methods are compared star by star: stars and noise are those of the stage
+    # `evaluate`.
     star = split_stars(product, SPLIT, config).test[: config.bounds.test_stars]
     return BoundedStars(
         star=star,
@@ -109,6 +111,7 @@ class Estimates:
     ) -> Estimates:
         """Return the estimates of importance samples, which are in four parts."""
         measure = partial(star_measures, static=static, stars=stars)
+        # Four parts give means over a quarter, a half and all of the samples.
         quarter, _, full = nested_means(samples.parts, measure).values()
         return cls(full, quarter, measure(samples.with_truth))
 
@@ -137,6 +140,7 @@ class Estimates:
             return self, 0
         # Only where the bank is too thin, and never by fewer samples than it has.
         is_better = (self.ess[stars] < ENOUGH_ESS) & (samples.ess > self.ess[stars])
+        # Columns of better stars are replaced in copies.
         measures = {name: values.copy() for name, values in vars(self).items()}
         for name, values in measures.items():
             values[:, stars[is_better]] = getattr(samples, name)[:, is_better]
@@ -158,6 +162,7 @@ class Estimates:
 
 def _relative_change(errors: np.ndarray, full: np.ndarray) -> float:
     """Return the relative difference of mean errors, over the stars that have both."""
+    # Means over the same stars: those of which neither estimate is missing.
     has_both = np.isfinite(errors) & np.isfinite(full)
     if not has_both.any():
         return float("nan")
@@ -183,6 +188,7 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     changes = {"name": f"{config.stars.name}_{suffix}", "count": count}
     config = config.model_copy(update={"stars": config.stars.model_copy(update=changes)})
     rng = stream(config.seed, "field", config.stars.name)
+    # Fields of the stars, equally many in each, and their random wavefronts.
     star_field = assign_fields(count, config.grid.points**2, rng)
     source = star_wavefronts(config, star_field)
     # Smaller pupil grids than for training stars where the sampling guard allows them: stamps of
@@ -192,6 +198,7 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     optics = config.optics.model_copy(update={"pupil_samples": grid_sizes, "threads": threads})
     framing = config.framing
     propagation = Propagation(source, config.telescope, optics, framing, config.stars.search_px)
+    # Framed without centring error, with a margin from which all errors and mirror images are cut.
     margin = framing.jitter_px + Bank.mirror_margin
     framed, peak = propagation.framed(framing.stamp_px + 2 * margin)
     return {
@@ -211,6 +218,7 @@ def static_psfs(config: Config) -> np.ndarray:
     propagation = Propagation(
         template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
     )
+    # Framed with a margin of the largest centring error; then cut at every error.
     framed, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
     return jittered_templates(framed.astype(np.float32), framing.jitter_px)
 
@@ -238,6 +246,7 @@ def true_modes(model: StampModel, product: Product, stars: BoundedStars) -> Mode
     return Modes.at(
         np.arange(count),
         stars.field,
+        # The middle of a stamp is the framed pixel less the centring error.
         product["peak"][stars.star] - product["jitter"][stars.star],
         np.full(count, Knowledge.TRUTH),
         model.standardised(product["seidel"][stars.star]),
@@ -302,6 +311,7 @@ def weigh_bank(
     subsets = [(stars.take(group), np.array_split(members, pieces)) for group, members in groups]
 
     def weigh(subset: BoundedStars, cuts: list[np.ndarray]) -> list[PosteriorSums]:
+        # Sums over each part of the bank; parts are merged to banks of all sizes.
         field = subset.field if field_is_known else None
         return [
             posterior_sums(bank.take(cut), subset.noisy[level], likelihood, star_field=field)

@@ -69,11 +69,7 @@ class Comparison:
 
     @classmethod
     def paired(
-        cls,
-        errors: np.ndarray,
-        bounds: np.ndarray,
-        field: np.ndarray,
-        tolerance: float = tolerance,
+        cls, errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = tolerance
     ) -> Comparison:
         """Compare squared errors and bounds of the same stars, which lie in `field`, all (n,)."""
         difference, stderr = clustered_mean(errors - bounds, field)

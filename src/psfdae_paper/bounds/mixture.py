@@ -35,6 +35,7 @@ class Mixture:
 
     def squared_distance(self, draws: np.ndarray) -> np.ndarray:
         """Return (x − μ)ᵀ (LLᵀ)⁻¹ (x − μ) of draws x (n, D) from every mode, shape (M, n)."""
+        # With L u = x − μ the squared distance is |u|².
         offset = np.linalg.solve(self.factor, (draws - self.mean[:, None]).swapaxes(1, 2))
         return np.asarray((offset**2).sum(axis=1))
 
@@ -45,6 +46,7 @@ class Mixture:
         − (D/2) ln(νπ) − ln |L| − (ν + D)/2 ln(1 + distance²/ν).
         """
         terms = self.mean.shape[1]
+        # ln |L| of a triangular matrix is the sum over its diagonal.
         log_determinant = np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(axis=1)
         constant = lgamma(0.5 * (self.freedom + terms)) - lgamma(0.5 * self.freedom)
         constant -= 0.5 * terms * np.log(self.freedom * np.pi)
@@ -93,6 +95,7 @@ class Mixture:
         # Distant draws weigh (ν + D)/(ν + distance²), as in the maximum-likelihood fit of t.
         share *= (self.freedom + terms) / (self.freedom + squared_distance)
         share /= np.maximum(share.sum(axis=1, keepdims=True), smallest)
+        # Weighted mean and scale matrix of the draws, as far as they are trusted.
         mean = self.mean + gain * (share @ draws - self.mean * share.sum(axis=1, keepdims=True))
         offset = draws - mean[:, None]
         scale = (share[:, :, None] * offset).swapaxes(1, 2) @ offset

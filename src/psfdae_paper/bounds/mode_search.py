@@ -99,11 +99,7 @@ def search(
 
 
 def best_matches(
-    bank: Bank,
-    posteriors: StarPosteriors,
-    fields: int,
-    offsets: int,
-    star_field: np.ndarray | None,
+    bank: Bank, posteriors: StarPosteriors, fields: int, offsets: int, star_field: np.ndarray | None
 ) -> Modes:
     """Find the best star of the bank in each of the best `fields` of every image.
 
@@ -133,6 +129,7 @@ def best_matches(
     # The middle of the stamp is the framed pixel less the jitter, after each symmetry.
     peaks = np.stack([s.pixel(bank.peak) for s in SYMMETRIES], axis=1)
     middle = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
+    # A start is an image, a field, a frame (symmetry and jitter) and the knowledge that led to it.
     rows = []
     for star, scores in enumerate(best_score):
         # Without knowledge of the field, the best frame in each of the best fields.
@@ -148,6 +145,8 @@ def best_matches(
             if np.isfinite(scores[field, frame]) and offset not in used and len(used) < offsets:
                 used.add(offset)
                 rows.append((star, field, frame, Knowledge.FIELD))
+    # The bank's star of each start: its middle after the symmetry, and its coefficients, which the
+    # symmetry leaves unchanged.
     star, field, frame, knowledge = np.array(rows).T
     match = best_star[star, field, frame]
     z = posteriors.model.standardised(bank.seidel[match])
@@ -185,6 +184,7 @@ def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
     shift_sd_px = 1.5
     tilts = shift_sd_px * posteriors.model.tilt_coefficients(np.eye(2))
     # A tilt that moves the image by +u replaces an offset of the stamp by −u.
+    # Unknowns are z, then the shift in units of its standard deviation.
     parameters = _climb_along(modes, posteriors, tilts).parameters
     z, shifts = np.split(parameters, [modes.z.shape[1]], axis=1)
     offset = modes.offset - np.rint(shift_sd_px * shifts).astype(int)
@@ -246,6 +246,7 @@ def unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -
     """
     modes = modes.best_of_group
     stamps = posteriors.model.stamps(modes.z, modes.field, modes.offset).astype(np.float64)
+    # χ² of the photons about the counts that the mode predicts.
     expected = posteriors.likelihood.expected(stamps.reshape(len(stamps), -1))
     chi2 = ((posteriors.counts[modes.star] - expected) ** 2 / expected).sum(axis=1)
     pixels = expected.shape[1]
@@ -312,6 +313,7 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
     even_signs = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
     # Best log-mass and z by star, field and offset.
     places: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
+    # From each mode, and from its twin with the even part negated, to all fields and offsets.
     for m, star in enumerate(source.star):
         for sign in (np.ones(len(MONOMIALS)), even_signs):
             # Change of the coefficients that every field and offset needs to give this image, and
@@ -324,6 +326,7 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
                 key = (star, f, *(source.offset[m] + shifts[k]))
                 if key not in places or log_mass[f, k] > places[key][0]:
                     places[key] = (log_mass[f, k], z[f, k])
+    # Star, field and offset of every candidate, with its log-mass and z.
     keys = np.array(list(places))
     log_mass, z = (np.array(column) for column in zip(*places.values(), strict=True))
     # The best offset of every field, then the best fields: no field crowds out another.

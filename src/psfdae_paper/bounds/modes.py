@@ -74,6 +74,7 @@ class Modes:
         z: np.ndarray,
     ) -> Modes:
         """Make places from which modes are sought, with unit scales and no evidence yet."""
+        # A climb replaces these unit scales by the inverse of the information.
         scales = np.tile(np.eye(z.shape[1]), (len(z), 1, 1))
         return cls(star, field, offset, knowledge, z, scales, np.zeros(len(z)))
 
@@ -110,12 +111,14 @@ class Modes:
 
     def _log_support(self, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return 0 for draws in a mode's own field and offset, otherwise −∞, shape (M, n)."""
+        # Fields and offsets are discrete: a mode proposes draws of its own place alone.
         is_own = self.field[:, None] == field
         is_own &= (self.offset[:, None] == offset).all(axis=2)
         return np.where(is_own, 0.0, -np.inf)
 
     def adapted(self, draws: Place, log_weight: np.ndarray) -> Modes:
         """Adapt places, scales and masses to the weights (n,) of all draws of the star."""
+        # A mode adapts to the draws in its own field and at its own offset.
         log_support = self._log_support(draws.field, draws.offset)
         mixture = self.mixture.adapted(draws.z, log_weight, log_support)
         return replace(self, z=mixture.mean, factor=mixture.factor, evidence=mixture.evidence)
@@ -152,6 +155,7 @@ class Modes:
             share[in_field] += shortage * mass / mass.sum()
         # Rounded up, so that every mode has a draw, whose weight may show that its mass is larger.
         number = np.ceil(share * count).astype(int)
+        # Number of the mode of each draw; modes follow one another.
         mode = np.repeat(np.arange(share.size), number)
         return Place(self.field[mode], self.offset[mode], self.mixture.draw(mode, rng)), number
 
@@ -170,6 +174,7 @@ def separate(modes: Modes) -> Modes:
     Of modes of a star in the same field and offset that are less than one of their standard
     deviations apart, the best is kept. It is known by the least knowledge that led to any of them.
     """
+    # Best log-mass of each star, by the knowledge that led to it.
     best_evidence = group_maximum(modes.evidence, modes.group)
     noticeable = np.flatnonzero(modes.evidence > best_evidence - modes.max_drop)
     distinct: dict[tuple[int, ...], list[int]] = {}

@@ -77,6 +77,7 @@ class Bank:
     def stamps(self, window: tuple[int, int]) -> np.ndarray:
         """Cut stamps at a window (first row, first column), sum 1, shape (M, d, d), float64."""
         row, column = window
+        # The margin stands on either side of a stamp.
         side = self.framed.shape[-1] - 2 * self.margin
         # A slice: the same window in all stars needs no list of pixels for each.
         cut = self.framed[:, row : row + side, column : column + side]
@@ -277,6 +278,7 @@ class PosteriorSums:
     def rescaled(self, log_scale: np.ndarray) -> PosteriorSums:
         """Return the same sums with weights relative to exp(`log_scale`), shape (n,)."""
         # A star without any possible image has scale 0 and keeps sums of zero.
+        # Σw changes by the ratio of the scales, Σw² by its square.
         scale = np.exp(self.log_scale - np.maximum(log_scale, np.finfo(float).min))
         return PosteriorSums(
             log_scale,
@@ -488,6 +490,7 @@ def exact_posterior(
     """
     fields, shifts = templates.shape[:2]
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
+    # Log-likelihood of every template at every centring error.
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(noisy) @ ratio.T + offset
     # Templates of other fields are impossible if the field is known.
@@ -496,6 +499,7 @@ def exact_posterior(
     # Bayes' rule with a flat prior; the largest score is subtracted against overflow.
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
+    # Moments of the mixture; a template's probability is that of all its centring errors.
     mean, variance = mixture_moments(weight, images)
     probability = weight.reshape(-1, fields, shifts).sum(axis=2)
     return mean.reshape(noisy.shape), variance.mean(axis=1), probability
@@ -524,6 +528,7 @@ def nested_means(
     means: dict[int, np.ndarray] = {}
     banks = list(parts)
     while True:
+        # Mean over all banks of this size.
         means[len(parts) // len(banks)] = np.mean([measure(sums) for sums in banks], axis=0)
         if len(banks) == 1:
             return means

@@ -97,6 +97,7 @@ def sample_posterior(
 
     def sample(stars: np.ndarray, modes: Modes) -> list[_Sampler]:
         """Sample the stars with these numbers, their draws propagated together."""
+        # A sampler has the modes of its star alone, and the star's own random numbers.
         samplers = [
             _Sampler(
                 modes.take(np.flatnonzero(modes.star == star)),
@@ -116,6 +117,7 @@ def sample_posterior(
     undetected = np.unique(modes.star[modes.knowledge == Knowledge.TRUTH])
     rows: list[tuple[PosteriorSums, ...]] = []
     for stars in np.array_split(np.arange(len(rngs)), -(-len(rngs) // stars_at_once)):
+        # These stars, then those among them of which the search has missed a mode.
         samplers = sample(stars, detected)
         resampled = stars[np.isin(stars, undetected)]
         with_truth = dict(zip(resampled, sample(resampled, modes), strict=True))
@@ -160,6 +162,7 @@ class _Sampler:
         self, modes: Modes, star_field: int, counts: np.ndarray, rng: np.random.Generator
     ) -> None:
         self.modes, self.star_field, self.counts, self.rng = modes, star_field, counts, rng
+        # A field counts as detected if a mode in it was found without knowledge of the star.
         is_blind = modes.knowledge == Knowledge.NONE
         self.field_is_detected = bool((is_blind & (modes.field == star_field)).any())
         self.mixtures: list[tuple[Modes, np.ndarray]] = []
@@ -175,6 +178,7 @@ class _Sampler:
         """Draw about `count` places, from the mixture adapted to the draws before."""
         if self.rounds:
             self.modes = self.modes.adapted(Place(*self.draws[:3]), self.log_weight())
+        # The density of a draw needs the mixture of its round: it is kept with the number of draws.
         place, number = self.modes.draw(count, self.star_field, self.rng)
         self.mixtures.append((self.modes, number))
         return place
@@ -237,8 +241,10 @@ class _Sampler:
                 # Weights relative to the largest, as in `PosteriorSums`.
                 sums.log_scale[:] = log_weight[used].max()
                 weight = np.exp(log_weight[used] - sums.log_scale)
+                # Σw and Σw² give the effective sample size (Σw)²/Σw².
                 sums.weight_sum[:] = weight.sum()
                 sums.weight_square_sum[:] = (weight**2).sum()
+                # Σw p and Σw p², and the weight of each static PSF, by field and centring error.
                 images = draws.image[used].astype(np.float64)
                 sums.image_sum[:] = weight @ images
                 sums.image_square_sum[:] = weight @ images**2

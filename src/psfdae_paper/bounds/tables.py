@@ -132,8 +132,10 @@ class Tables:
         self, method: str, level: float, estimates: Estimates, source: str, **columns: float
     ) -> None:
         """Add rows of a posterior mean over samples for all references, tight by its evidence."""
+        # One set of samples serves both references; each has evidence of its own.
         columns["ess_median"] = float(np.median(estimates.ess))
         for number, reference in enumerate(self.stars.truth):
+            # Rows with the evidence as further columns.
             values = estimates.values(number)
             evidence = estimates.evidence(number, self.stars.field)
             row = {**columns, **vars(evidence)}
@@ -144,6 +146,7 @@ class Tables:
 
         `measures` are those of `weigh_bank`.
         """
+        # Errors by number of draws, and the power law a + b M^−c that extrapolates them.
         draws, bank = np.array(list(measures)), Estimates.over_bank(measures)
         for number, reference in enumerate(self.stars.truth):
             errors = np.array([values[number].mean() for values in measures.values()])
@@ -173,6 +176,7 @@ class Tables:
 
 def add_floor(config: Config, product: Product, tables: Tables) -> None:
     """Add the local error floor of every star, from the slopes of its stamp."""
+    # Relative field vectors of the stars, at which the Seidel terms are evaluated.
     stars, model = tables.stars, stamp_model(config)
     field = model.field[stars.field]
     # Slopes of the noise-free stamps by the Seidel coefficients, in waves, as they were simulated.
@@ -257,6 +261,7 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     """
     stars = tables.stars
     for level in config.noise.levels:
+        # The counts are taken about the mean static PSF without centring error.
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
         for method, field_is_known in POSTERIOR_MEANS.items():
             field = stars.field if field_is_known else None
@@ -268,6 +273,7 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
                 error, variance = np.zeros_like(error), np.zeros_like(error)
             values = {"mse": error, "variance": variance}
             if not field_is_known:
+                # Posterior probability of the star's own field.
                 values["p_right"] = probability[np.arange(stars.field.size), stars.field]
             score = calibration(error, variance, stars.field)
             tables.add("realisation", method, level, values, True, "sum", calibration=score)
@@ -297,6 +303,7 @@ def compare_methods(
     """
     place = f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}"
     for bound in bounded["method"].unique():
+        # Values of this bound by star; its summary tells if it is tight.
         limits, is_floor = bounded[bounded["method"] == bound], bound == "floor"
         level = f"{key['noise_level']:.6g}"
         is_tight = (key["dataset"], key["reference"], bound, level) in tight
@@ -354,6 +361,7 @@ def compare_methods(
 
 def paper_verdict(paper: Comparison, tight: bool) -> str:
     """Return the verdict of a bound, tight or not, on the paper's error, in words."""
+    # Only a tight bound can show that an error is smaller than possible.
     if paper.difference >= 0:
         return "above"
     if not tight:

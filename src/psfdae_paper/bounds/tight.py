@@ -51,6 +51,7 @@ class Evidence:
         Stars without an estimate have an `mse` of NaN, and count as stars without samples.
         """
         has_estimate = np.isfinite(mse)
+        # Effective size that all but the allowed fraction of stars reach; 0 without an estimate.
         ascending_ess = np.sort(np.where(has_estimate, ess, 0.0))
         ess_low = float(ascending_ess[int(cls.max_sparse * ess.size)])
         score = calibration(mse[has_estimate], variance[has_estimate], field[has_estimate])
@@ -75,6 +76,7 @@ def calibration(error: np.ndarray, variance: np.ndarray, field: np.ndarray) -> f
     difference = error - variance
     if not difference.any():
         return 0.0
+    # Stars of one field are not independent: the standard error is clustered.
     mean, stderr = clustered_mean(difference, field)
     with np.errstate(divide="ignore"):
         return float(np.divide(mean, stderr))

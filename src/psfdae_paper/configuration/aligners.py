@@ -6,7 +6,7 @@ One entry says what a method estimates states from; products, rules, tables and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from psfdae.method import Look
 
@@ -34,13 +34,18 @@ class Aligner:
         The input of the network is the output of the DAE.
     borrowed_network : str
         Method whose network this one uses: to estimate, or to start a fit.
-    fitted : bool
-        Every state is fitted by maximum likelihood.
+    product : str
+        Product with the results of the method, without "alignment_": estimates of networks, fits of
+        single states by maximum likelihood, or bounds; empty if they are in none.
     unknown_flux : bool
         Flux and position of the stars in their stamps are not given.
     swept : tuple of str
         Settings that a sweep may change.
+    weights_file : str
+        Name of the file with the weights of a network, in its folder.
     """
+
+    weights_file: ClassVar = "network.safetensors"
 
     name: str
     look: Look
@@ -49,7 +54,7 @@ class Aligner:
     noisy: bool = False
     denoised: bool = False
     borrowed_network: str = ""
-    fitted: bool = False
+    product: Literal["", "estimates", "fit", "bound"] = ""
     unknown_flux: bool = False
     swept: tuple[str, ...] = ()
 
@@ -58,95 +63,110 @@ class Aligner:
         """Method whose network is used, this or another one; empty if none is."""
         return self.name if self.states else self.borrowed_network
 
+    @property
+    def is_drawn(self) -> bool:
+        """True if figures show estimates and errors: a network is used, and the flux is given."""
+        return bool(self.network) and not self.unknown_flux
 
-_ALIGNERS = [
-    # The aligned telescope, whatever the stamps: the error that a method must beat.
-    Aligner("constant", Look("always the middle", "black")),
-    # The paper's network: it learns noise-free stamps of the grid, and estimates from noisy ones.
-    Aligner(
-        "original",
-        Look("CNN, noisy stamps", "#4d4d4d", paper=("original", "Original data")),
-        "original",
-        states="grid",
-        swept=("cnn", "train_original"),
-    ),
-    # The same network behind the DAE, which takes the noise from the stamps.
-    Aligner(
-        "dae",
-        Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
-        "dae",
-        denoised=True,
-        borrowed_network="original",
-    ),
-    # Not in the paper: a network that has seen noise needs no DAE, and one that is trained on the
-    # DAE's output knows its errors.
-    Aligner(
-        "noise_trained",
-        Look("network trained on noisy stamps", "#d55e00"),
-        "noise-trained",
-        states="train",
-        noisy=True,
-        swept=("cnn", "perceptron", "train_noise_trained", "noise.levels"),
-    ),
-    Aligner(
-        "dae_retrained",
-        Look("network trained on DAE output", "#cc79a7"),
-        "DAE, retrained",
-        states="train",
-        noisy=True,
-        denoised=True,
-    ),
-    # Fits of single states, which start at the estimate of a network.
-    Aligner(
-        "max_likelihood",
-        Look("maximum likelihood", "#009e73"),
-        "max. likelihood",
-        borrowed_network="noise_trained",
-        fitted=True,
-    ),
-    Aligner(
-        "max_likelihood_free",
-        Look("maximum likelihood, flux and place free", "black"),
-        borrowed_network="noise_trained",
-        fitted=True,
-        unknown_flux=True,
-    ),
-    # Bounds of unbiased estimates: of each state, of the errors of all states together, and with
-    # unknown flux and position.
-    Aligner("cramer_rao", Look("Cramér–Rao bound", "black")),
-    Aligner("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
-    Aligner(
-        "cramer_rao_free", Look("Cramér–Rao bound, flux and place free", "black"), unknown_flux=True
-    ),
-]
-ALIGNERS = {aligner.name: aligner for aligner in _ALIGNERS}
+
+ALIGNERS = {
+    aligner.name: aligner
+    for aligner in (
+        # The aligned telescope, whatever the stamps: the error that a method must beat.
+        Aligner("constant", Look("always the middle", "black")),
+        # The paper's network: it learns noise-free stamps of the grid, and estimates from noisy
+        # ones.
+        Aligner(
+            "original",
+            Look("CNN, noisy stamps", "#4d4d4d", paper=("original", "Original data")),
+            "original",
+            states="grid",
+            product="estimates",
+            swept=("cnn", "train_original"),
+        ),
+        # The same network behind the DAE, which takes the noise from the stamps.
+        Aligner(
+            "dae",
+            Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
+            "dae",
+            denoised=True,
+            borrowed_network="original",
+            product="estimates",
+        ),
+        # Not in the paper: a network that has seen noise needs no DAE, and one that is trained on
+        # the DAE's output knows its errors.
+        Aligner(
+            "noise_trained",
+            Look("network trained on noisy stamps", "#d55e00"),
+            "noise-trained",
+            states="train",
+            noisy=True,
+            product="estimates",
+            swept=("cnn", "perceptron", "train_noise_trained", "noise.levels"),
+        ),
+        Aligner(
+            "dae_retrained",
+            Look("network trained on DAE output", "#cc79a7"),
+            "DAE, retrained",
+            states="train",
+            noisy=True,
+            product="estimates",
+            denoised=True,
+        ),
+        # Fits of single states, which start at the estimate of a network.
+        Aligner(
+            "max_likelihood",
+            Look("maximum likelihood", "#009e73"),
+            "max. likelihood",
+            borrowed_network="noise_trained",
+            product="fit",
+        ),
+        Aligner(
+            "max_likelihood_free",
+            Look("maximum likelihood, flux and place free", "black"),
+            borrowed_network="noise_trained",
+            product="fit",
+            unknown_flux=True,
+        ),
+        # Bounds of unbiased estimates: of each state, of the errors of all states together, and
+        # with unknown flux and position.
+        Aligner("cramer_rao", Look("Cramér–Rao bound", "black"), product="bound"),
+        Aligner("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
+        Aligner(
+            "cramer_rao_free",
+            Look("Cramér–Rao bound, flux and place free", "black"),
+            product="bound",
+            unknown_flux=True,
+        ),
+    )
+}
 """Methods and bounds by name."""
 
-ESTIMATORS = [aligner for aligner in _ALIGNERS if aligner.network]
-"""Methods that estimate states with a network, alone or before a fit."""
 
-LEARNED = [aligner for aligner in ESTIMATORS if not aligner.fitted]
-"""Methods of the product "alignment_estimates", in its order."""
-
-FITTED = [aligner for aligner in ESTIMATORS if aligner.fitted]
-"""Methods of the product "alignment_fit", in its order."""
-
-BOUNDS = [ALIGNERS["cramer_rao"], ALIGNERS["cramer_rao_free"]]
-"""Bounds of the product "alignment_bound", in its order."""
-
-TRAINED = [aligner.name for aligner in _ALIGNERS if aligner.states]
-"""Methods that have a network of their own."""
-
-SWEPT = [aligner.name for aligner in _ALIGNERS if aligner.swept]
-"""Networks that sweeps may train."""
-
-WEIGHTS = "network.safetensors"
-"""Name of a network's file in its folder."""
-
-
-def methods_of_set(aligners: list[Aligner], test_set: str) -> list[Aligner]:
-    """Return the methods that are applied to a test set.
+def aligners_of(product: str, test_set: str = "uniform") -> list[Aligner]:
+    """Return the methods of a product, or the bounds, in the order of its arrays.
 
     Those with unknown flux and position are applied to uniform states only.
+
+    Parameters
+    ----------
+    product : str
+        "estimates", "fit" or "bound"; see `Aligner.product`.
+    test_set : str
+        "uniform" or "grid".
     """
-    return [aligner for aligner in aligners if test_set == "uniform" or not aligner.unknown_flux]
+    return [
+        aligner
+        for aligner in ALIGNERS.values()
+        if aligner.product == product and (test_set == "uniform" or not aligner.unknown_flux)
+    ]
+
+
+def trained_networks() -> list[str]:
+    """Return the names of the methods that have a network of their own."""
+    return [name for name, aligner in ALIGNERS.items() if aligner.states]
+
+
+def swept_networks() -> list[str]:
+    """Return the names of the networks that sweeps may train."""
+    return [name for name, aligner in ALIGNERS.items() if aligner.swept]

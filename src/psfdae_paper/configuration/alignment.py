@@ -6,13 +6,12 @@ fit, and the keys that decide which products belong together.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from psfdae.settings import CheckpointSeconds, Count, Group, Positive
-from psfdae_paper.configuration.aligners import TRAINED
 
 
 class Alignment(Group):
@@ -20,7 +19,27 @@ class Alignment(Group):
 
     A state has four numbers: decentre x, y and tilt x, y of the secondary mirror, in units of their
     ranges from −1 to 1.
+
+    Attributes
+    ----------
+    choice : tuple of str
+        Override that chooses scene 3 among the datasets.
+    state_groups : tuple of str
+        Groups of the configuration that decide the stamps of states.
+    wavefront_keys, stamp_keys : tuple of str
+        Keys that decide the wavefront of a state, and its stamps. Products that differ in one of
+        them do not belong together.
     """
+
+    choice: ClassVar = ("dataset=alignment",)
+    state_groups: ClassVar = ("seed", "telescope", "prescription", "alignment", "optics")
+    wavefront_keys: ClassVar = (
+        *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m"),
+        *("prescription", "alignment.decenter_range_m", "alignment.tilt_range_deg"),
+        *("alignment.defocus_m", "alignment.field_radius_deg", "alignment.field_points"),
+        "alignment.highest_zernike",
+    )
+    stamp_keys: ClassVar = (*wavefront_keys, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
 
     # The paper's ranges (section 3.3).
     decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
@@ -42,6 +61,7 @@ class Alignment(Group):
     field_points: Annotated[int, Field(ge=1, le=64)] = Field(
         8, description="Field points on the circle"
     )
+    # Terms of higher order are small in this telescope; few terms make the model fast.
     highest_zernike: Annotated[int, Field(ge=11, le=28)] = Field(
         22, description="Highest Noll index of the wavefront"
     )
@@ -59,12 +79,14 @@ class Alignment(Group):
     grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
         5, description="Levels per degree of freedom of the grid of states"
     )
+    # As many states as the grid has, but drawn at random.
     test_states: Count = Field(625, description="Uniform states of the independent test set")
     train_states: Count = Field(12000, description="Uniform states of the large training set")
 
     @property
     def unit(self) -> np.ndarray:
         """Ranges of decentre x, y in metres and tilt x, y in radians, shape (4,)."""
+        # Both axes have the same ranges.
         tilt = np.deg2rad(self.tilt_range_deg)
         return np.array([self.decenter_range_m, self.decenter_range_m, tilt, tilt])
 
@@ -82,6 +104,7 @@ class Cnn(Group):
     strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
         [2, 1, 2, 1, 2], description="Strides of the convolutions"
     )
+    # A neuron that is never active would not learn otherwise.
     leak: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.01, description="Slope of the leaky ReLU below 0"
     )
@@ -89,10 +112,13 @@ class Cnn(Group):
     @model_validator(mode="after")
     def check_layers(self) -> Cnn:
         """Require odd kernels, and as many kernels and strides as widths."""
+        # An even kernel would shift the image by half a pixel.
         if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
+        # Each convolution has a width, a kernel and a stride.
         for name in ("kernels", "strides"):
             values = getattr(self, name)
+            # A list that is too short would drop layers.
             if len(values) != len(self.widths):
                 raise ValueError(
                     f"{name} = {values}: {len(self.widths)} widths need as many {name}, "
@@ -104,6 +130,7 @@ class Cnn(Group):
 class Perceptron(Group):
     """Fully connected layers after the stamps' leading principal components; not in the paper."""
 
+    # Fewer inputs than pixels, so that layers may be fully connected.
     components: Count = Field(
         128, description="Principal components of all stamps of a state together"
     )
@@ -122,9 +149,11 @@ class NetworkTrain(Group):
     The defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋.
     """
 
+    # What is trained, and for how long.
     network: Literal["cnn", "perceptron"] = Field("cnn", description="Network that is trained")
     epochs: Count = Field(100, description="Passes over the training states")
     batch: Annotated[int, Field(ge=2)] = Field(10, description="States per step")
+    # Course of the optimisation.
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         1e-3, description="Adam's learning rate (its maximum if one-cycle)"
     )
@@ -135,6 +164,7 @@ class NetworkTrain(Group):
         0.1, description="Factor of the learning rate at each step of the schedule"
     )
     decay_epochs: Count = Field(30, description="Epochs between steps of the schedule")
+    # What makes more of the training states.
     mirrors: bool = Field(
         False, description="Train on the telescope's mirror images and average estimates over them"
     )
@@ -143,6 +173,7 @@ class NetworkTrain(Group):
         description="Draws of each field's noise where the DAE's output is learnt, whose "
         "computation takes long; noisy stamps get new noise in every epoch",
     )
+    # These change no result but by rounding.
     threads: Count = Field(1, description="Threads of the training")
     checkpoint_seconds: CheckpointSeconds = Field(
         20.0, description="Least time between checkpoints; repeats nothing"
@@ -164,6 +195,7 @@ class Fit(Group):
     outer_states: Count = Field(
         1000, description="States beyond the range that are computed for it"
     )
+    # A fit ends by its tolerance, or here.
     iterations: Count = Field(12, description="Most steps of a fit")
     # After a step of 0.3 standard errors, a few hundredths remain to the maximum.
     tolerance: Positive = Field(
@@ -174,32 +206,3 @@ class Fit(Group):
     limit: Annotated[float, Field(ge=1, le=2)] = Field(
         1.25, description="States are kept within ± this, in units of the range"
     )
-
-
-NAME = "alignment"
-"""Name of scene 3 among the datasets."""
-
-CHOICE = (f"dataset={NAME}",)
-"""Override that chooses scene 3."""
-
-SHARED_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
-"""Groups of which an option that is chosen for a whole run applies to scene 3, too."""
-
-GROUPS = (
-    *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
-    *("cnn", "perceptron", *(f"train_{name}" for name in TRAINED), "evaluation", "fit"),
-)
-"""Groups of the configuration that scene 3 reads."""
-
-STATE_GROUPS = ("seed", "telescope", "prescription", "alignment", "optics")
-"""Groups that decide the stamps of states."""
-
-WAVEFRONT_KEYS = (
-    *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m", "prescription"),
-    *("alignment.decenter_range_m", "alignment.tilt_range_deg", "alignment.defocus_m"),
-    *("alignment.field_radius_deg", "alignment.field_points", "alignment.highest_zernike"),
-)
-"""Keys that decide the wavefront of a state of scene 3."""
-
-STAMP_KEYS = (*WAVEFRONT_KEYS, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
-"""Keys that decide the stamps of a state of scene 3."""

@@ -7,35 +7,24 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from psfdae.settings import ConfigError
-
-SEARCH = 48.0
-"""λ/D around the chief ray within which brightest pixels are searched by default.
-
-Four times the distance of the farthest template of scene 1; a peak that lies
-farther out is searched at twice the distance, then refused.
-"""
 
 SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)]
 """Search distance in λ/D. Products do not contain it, but the distance in pixels that follows."""
 
 
-def _ascending(grid_sizes: list[int]) -> list[int]:
-    """Return grid sizes unchanged; ValueError if they do not ascend.
+def search_distance(distance: object = None) -> float:
+    """Return the distance around the chief ray within which a brightest pixel is searched, in λ/D.
 
-    The first size that suffices is chosen for each wavefront, which must be the smallest one.
+    It is the given one or, if that is no positive number, the default.
     """
-    if sorted(set(grid_sizes)) != grid_sizes:
-        raise ValueError(f"{grid_sizes} must be ascending")
-    return grid_sizes
-
-
-PupilSamples = Annotated[
-    list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1), AfterValidator(_ascending)
-]
-"""Ascending numbers of samples across the pupil, of which each wavefront uses one."""
+    if isinstance(distance, int | float) and not isinstance(distance, bool) and distance > 0:
+        return distance
+    # Four times the distance of the farthest template of scene 1. A peak that lies farther out is
+    # searched at twice the distance, then refused.
+    return 48.0
 
 
 def config_dir() -> Path:
@@ -53,10 +42,13 @@ def _folder(environment_value: str) -> Path:
 
     A wheel has a copy of the configuration in the package; in the source tree it is beside `src`.
     """
+    # The folder psfdae_paper, wherever it is.
     package = Path(__file__).resolve().parents[1]
+    # Of an installed package, or of a source tree; the latter is named if there is neither.
     candidates = (package / "config", package.parents[1] / "config")
     folder = next((path for path in candidates if path.is_dir()), candidates[-1])
     folder = Path(environment_value or folder)
+    # A folder without it would give errors of Hydra that name no file.
     if not (folder / "config.yaml").is_file():
         raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
     return folder.resolve()

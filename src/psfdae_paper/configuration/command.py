@@ -53,9 +53,11 @@ class Groups:
         self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]
     ) -> Config:
         """Return the checked groups, from a file of the workflow, or from overrides `words`."""
+        # Hydra and pydantic models are imported for commands that need them only.
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
         # The workflow passes one file; a user writes words such as noise.kappa=4.98.
+        # Some commands read other groups with other options, such as `fit METHOD`.
         reads = self.names(options)
         if file is not None:
             return load_settings(file, reads)
@@ -79,4 +81,5 @@ def command(
 
     See `psfdae.cli.command`, and `Groups` for `reads` and `choice`.
     """
+    # The command line calls `Groups` with the options, the file and the words that are left.
     return cli.command(name, Groups(reads, choice))

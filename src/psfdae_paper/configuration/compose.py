@@ -15,7 +15,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,14 +24,9 @@ from typing import Any, TypeVar, cast
 from psfdae.errors import did_you_mean
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
-from psfdae.settings import (
-    NEUTRAL,
-    ConfigError,
-    Group,
-    leaves,
-    parse_settings,
-)
-from psfdae_paper.configuration import alignment
+from psfdae.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
+from psfdae_paper.configuration.aligners import trained_networks
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import stage_model, with_derived_values
 from psfdae_paper.configuration.methods import all_groups, methods_in
@@ -74,9 +70,11 @@ def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(folder), overrides=list(overrides))
+        # Plain values, with ${…} replaced by the keys that they name.
         resolved: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
+    # A root file that is a list or a number.
     if not isinstance(resolved, dict):
         raise ConfigError(f"{folder / 'config.yaml'}: must be a mapping")
     return resolved
@@ -90,27 +88,8 @@ def _primary(folder: Path) -> str:
     """
     from hydra.core.config_store import ConfigStore
 
-    tree = parse_yaml(folder / "config.yaml")
-    defaults = tree.get("defaults", [])
-    listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    # Settings of methods come before the file's list: datasets and presets may change them.
-    method_defaults = [
-        {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
-    ]
-    all_defaults = ["class_defaults", *method_defaults, *defaults]
-    # Hydra composes in the order of the list; a later entry replaces values of an earlier one.
-    store = ConfigStore.instance()
-    store.store("class_defaults", _class_defaults(), package="_global_")
-    store.store("with_class_defaults", {**tree, "defaults": all_defaults})
-    return "with_class_defaults"
-
-
-def _class_defaults() -> dict[str, Any]:
-    """Return the groups of a configuration with the defaults of their classes, if any.
-
-    Fields without a default must be in the files; excluded ones are inputs of derived values.
-    """
-    groups = {
+    # Fields without a default must be in the files; excluded ones are inputs of derived values.
+    class_defaults = {
         name: {
             key: field.get_default(call_default_factory=True)
             for key, field in group_class.model_fields.items()
@@ -118,7 +97,22 @@ def _class_defaults() -> dict[str, Any]:
         }
         for name, group_class in _group_classes().items()
     }
-    return {name: values for name, values in groups.items() if values}
+    class_defaults = {name: values for name, values in class_defaults.items() if values}
+    # Groups that the root's list has, each with the name of one of its files.
+    tree = parse_yaml(folder / "config.yaml")
+    defaults = tree.get("defaults", [])
+    listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
+    # Settings of methods come before the file's list: datasets and presets may change them.
+    method_defaults = [
+        {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
+    ]
+    # From the weakest to the strongest.
+    all_defaults = ["class_defaults", *method_defaults, *defaults]
+    # Hydra composes in the order of the list; a later entry replaces values of an earlier one.
+    store = ConfigStore.instance()
+    store.store("class_defaults", class_defaults, package="_global_")
+    store.store("with_class_defaults", {**tree, "defaults": all_defaults})
+    return "with_class_defaults"
 
 
 def _group_classes() -> dict[str, type[Group]]:
@@ -154,6 +148,7 @@ def _reason(error: Exception, folder: Path) -> str:
     if unknown := re.match("Could not override '(.+?)'", str(error)):
         keys = [*_group_classes(), *(key for key, _ in leaves(compose()))]
         return f"{unknown[1]}: unknown key{did_you_mean(unknown[1], keys)}"
+    # A damaged file: the first that cannot be read is named.
     if not isinstance(error, HydraException | OmegaConfBaseException):
         for path in sorted(folder.rglob("*.yaml")):
             try:
@@ -182,25 +177,31 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
     if not _is_alignment(tree):
         return parse_settings(whole_config(), tree)
     _require_known_groups(tree)
-    return part(alignment.GROUPS, tree)
+    reads = (
+        *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
+        *("cnn", "perceptron", *(f"train_{name}" for name in trained_networks())),
+        *("evaluation", "fit"),
+    )
+    return part(reads, tree)
 
 
 def _is_alignment(tree: Mapping[str, Any]) -> bool:
     """Return True for the configuration of scene 3."""
+    # A group may be damaged, and is then refused by the check of all groups.
     dataset = tree.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else None
-    return "scene" not in tree and name == alignment.NAME
+    return "scene" not in tree and name == "alignment"
 
 
 def _require_known_groups(tree: Mapping[str, Any]) -> None:
     """Raise ConfigError if a tree has a group that the configuration does not have."""
+    # Groups that a user adds by mistake would be ignored otherwise.
     unknown = sorted(set(tree) - set(whole_config().model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
 
 
 Model = TypeVar("Model", bound=Group)
-Checked = TypeVar("Checked")
 
 
 def load_file(model: type[Model], path: Path) -> Model:
@@ -221,16 +222,17 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    return _with_file_name(
-        path, lambda: parse_settings(model, tree if isinstance(tree, dict) else {})
-    )
+    with _named_in_errors(path):
+        return parse_settings(model, tree if isinstance(tree, dict) else {})
 
 
-def _with_file_name(path: Path, check: Callable[[], Checked]) -> Checked:
-    """Return the result of a check; each line of its ConfigError begins with the file's name."""
+@contextmanager
+def _named_in_errors(path: Path) -> Iterator[None]:
+    """Begin each line of a ConfigError with the name of the file that is checked."""
     try:
-        return check()
+        yield
     except ConfigError as error:
+        # An error may have several lines, one for each key.
         lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
         raise ConfigError(lines) from None
 
@@ -263,9 +265,11 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
         If the file is no YAML or has other groups; names file, key and range.
     """
     tree = parse_yaml(path)
+    # A file that is no mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
     # All groups of the file are checked: one that the stage does not read is refused.
-    return _with_file_name(path, lambda: _checked(reads, groups))
+    with _named_in_errors(path):
+        return _checked(reads, groups)
 
 
 def write_settings(
@@ -299,6 +303,7 @@ def write_settings(
     """
     import yaml
 
+    # Checked values in the order of the classes.
     settings = part(reads, stage_tree(reads, tree)).model_dump()
     # The name is a hash of what can change the result: another name makes Snakemake repeat a job.
     serialised = json.dumps(decisive_settings(settings), sort_keys=True)
@@ -321,6 +326,7 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
+    # A model becomes a tree again, so that it is checked anew.
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     groups = {key: tree[key] for key in reads if key in tree}
     return _checked(reads, groups)
@@ -328,6 +334,7 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
 
 def _checked(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
     """Return checked groups; type checkers take them for a whole `Config`, as stages state it."""
+    # `stage_model` makes a class of these groups alone.
     return cast(Config, parse_settings(stage_model(reads, whole_config()), groups))
 
 
@@ -343,6 +350,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     """
     # Values that are null in the files because they follow from other groups.
     try:
+        # Edge and spacing of fields, and search distances in pixels.
         tree = with_derived_values(tree)
     except ValueError as error:
         raise ConfigError(str(error)) from None
@@ -350,7 +358,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     missing = [key for key in reads if key not in tree]
     if missing and _is_alignment(tree):
         raise ConfigError(
-            f"dataset = {alignment.NAME}: scene 3 has no simulated stars, which are needed here; "
+            "dataset = alignment: scene 3 has no simulated stars, which are needed here; "
             "its commands are `psfdae alignment …`, its target is scene3"
         )
     if missing:
@@ -362,8 +370,8 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     """Select those of a workflow's overrides that concern a dataset.
 
     The workflow takes one list for everything. A key that only other datasets have is left
-    out; one that no dataset has stays, so that it is refused by name. Options of a group apply
-    to all datasets, but only those of `alignment.SHARED_OPTIONS` to scene 3.
+    out; one that no dataset has stays, so that it is refused by name. Options of a group, such as
+    train=onecycle, apply to all datasets, but to scene 3 only those of groups that it has as well.
 
     Parameters
     ----------
@@ -378,13 +386,14 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     """
     # Words such as train=onecycle choose a file of a group; scene 3 takes few of these groups.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
-    is_alignment = tuple(choice) == alignment.CHOICE
-    applicable_options = [
-        word for word in options if not is_alignment or _key(word) in alignment.SHARED_OPTIONS
-    ]
+    applicable_options = options
+    if tuple(choice) == Alignment.choice:
+        shared_groups = ("preset", "prescription", "dae_train", "network_train")
+        applicable_options = [word for word in options if _key(word) in shared_groups]
 
     def has_key(choice: Sequence[str], dotted_key: str) -> bool:
         """Return True if the configuration of a dataset has a key."""
+        # The composition of the other dataset, with options that apply to it.
         node: Any = compose((*choice, *applicable_options))
         for name in dotted_key.split("."):
             if not isinstance(node, Mapping) or name not in node:
@@ -394,7 +403,13 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
 
     def concerns(override: str) -> bool:
         """Return True if this dataset has the override's key, or if no dataset has it."""
-        for key in _deciding_keys(override):
+        # `key=value` changes a key; `+group.key=value` adds one to a group, which must be there;
+        # `++group.key=value` does either, hence first the key and then the group decides.
+        key = _key(override)
+        keys = [] if override.startswith("+") and not override.startswith("++") else [key]
+        keys += [key.rpartition(".")[0]] if override.startswith("+") and "." in key else []
+        # The first key that any dataset has decides.
+        for key in keys:
             if has_key(choice, key):
                 return True
             if any(has_key([f"dataset={name}"], key) for name in dataset_names()):
@@ -418,25 +433,17 @@ def _key(override: str) -> str:
     return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
 
 
-def _deciding_keys(override: str) -> list[str]:
-    """Return keys whose presence decides which datasets an override concerns.
-
-    That is the override's key; for `+group.key`, which adds a key, the group; for `++group.key`,
-    which changes or adds one, first the key and then the group.
-    """
-    key = _key(override)
-    group = key.rpartition(".")[0]
-    if not override.startswith("+"):
-        return [key]
-    return ([key] if override.startswith("++") else []) + ([group] if group else [])
-
-
 def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration tree without the settings that cannot change a result.
 
     These are marked `NEUTRAL` in their class, such as the time between checkpoints.
     """
-    neutral = _neutral_keys()
+    neutral = {
+        (group, name)
+        for group, group_class in _group_classes().items()
+        for name, field in group_class.model_fields.items()
+        if NEUTRAL in field.metadata
+    }
     return {
         group: {key: value for key, value in values.items() if (group, key) not in neutral}
         if isinstance(values, Mapping)
@@ -445,18 +452,8 @@ def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-@cache
-def _neutral_keys() -> frozenset[tuple[str, str]]:
-    """Return group and name of the settings that cannot change a result."""
-    return frozenset(
-        (group, name)
-        for group, group_class in _group_classes().items()
-        for name, field in group_class.model_fields.items()
-        if NEUTRAL in field.metadata
-    )
-
-
 def _first_lines(error: Exception) -> str:
     """Return the first two lines of an error's text as one line."""
+    # Hydra and OmegaConf explain themselves at length.
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines[:2])

@@ -15,7 +15,7 @@ from pydantic import ValidationError, create_model, model_validator
 
 from psfdae.settings import Group
 from psfdae.telescope.settings import Telescope, has_own_aberrations
-from psfdae_paper.configuration.base import SEARCH
+from psfdae_paper.configuration.base import search_distance
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
@@ -38,13 +38,43 @@ class Consistent(Group):
         """Fill in derived values before the groups are checked."""
         if not isinstance(tree, Mapping):
             return tree
-        _check_scene(tree)
         return with_derived_values(tree)
+
+    @model_validator(mode="before")
+    @classmethod
+    def check_scene(cls, tree: object) -> object:
+        """Refuse a scene and a telescope that do not have the same source of aberrations.
+
+        The aberrations are settings of the scene or of the telescope: exactly one of them has some.
+        """
+        groups: Mapping[str, Any] = tree if isinstance(tree, Mapping) else {}
+        # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
+        scene, telescope = groups.get("scene"), groups.get("telescope")
+        if scene is None and "alignment" in groups:
+            scene = {"name": "alignment"}
+        # Groups that a stage does not read are absent; others than mappings are refused later.
+        if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
+            return tree
+        name, has_aberrations = telescope.get("name"), has_own_aberrations(telescope)
+        if has_aberrations and scene.get("name") != "telescope":
+            raise ValueError(
+                f"telescope = {name}: brings its own aberrations, but scene = {scene.get('name')} "
+                "has others; choose a dataset made for it (dataset=_telescope, or one that starts "
+                "from it)"
+            )
+        if not has_aberrations and scene.get("name") == "telescope":
+            raise ValueError(
+                f"telescope = {name}: has no aberrations; scene = telescope needs a telescope "
+                "with the keys field_edge_deg and aberrations, such as example_zernike"
+            )
+        return tree
 
     @model_validator(mode="after")
     def check_jitter(self) -> Consistent:
         """Refuse a jitter of aberrations for stars that have no random aberrations."""
+        # Groups that a stage does not read are absent, and telescopes may have no aberrations.
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
+        # In waves RMS; own telescopes alone have it.
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
         if stars is None or not jitter:
             return self
@@ -59,6 +89,7 @@ class Consistent(Group):
     @model_validator(mode="after")
     def check_scene_groups(self) -> Consistent:
         """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
+        # Both groups have keys that only one kind of dataset needs.
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
         # Groups that a stage does not read are absent, and are not checked.
         if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
@@ -85,15 +116,25 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
         The same groups with `grid.edge_deg` and `grid.spacing_deg` in degrees, and
         `framing.search_px` and `stars.search_px` in pixels.
     """
+    # Copies of the groups, in which nulls are replaced.
     derived = {
         name: dict(group) if isinstance(group, Mapping) else group for name, group in tree.items()
     }
     telescope, grid = derived.get("telescope"), derived.get("grid")
     if isinstance(telescope, dict):
+        # Width of a pixel in λ/D, from the aperture, the wavelength and the pixel scale. Settings
+        # that the next check refuses have none, and any number is right.
+        keys = [key for key in Telescope.model_fields if key in telescope]
+        try:
+            pixel = Telescope.model_validate({key: telescope[key] for key in keys}).pixel or 1.0
+        except ValidationError:
+            pixel = 1.0
         # Brightest pixels are searched within a distance in λ/D, whatever the telescope's pixels.
         for group in (derived.get("framing"), derived.get("stars")):
             if isinstance(group, dict) and group.get("search_px", 0) is None:
-                group["search_px"] = _search_px(group.get("search_lambda_d"), telescope)
+                distance = search_distance(group.get("search_lambda_d"))
+                # Stamps between 4 and 256 pixels on either side of the chief ray.
+                group["search_px"] = int(np.clip(np.ceil(distance / pixel), 4, 256))
         # The relative field H is 1 at the edge of the telescope's field.
         if isinstance(grid, dict) and grid.get("edge_deg", 0) is None:
             grid["edge_deg"] = telescope.get("field_edge_deg")
@@ -102,54 +143,16 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
         # which any distance is right; `points` that are no integer are refused by the next check.
         edge, points = grid.get("edge_deg"), grid.get("points")
         if isinstance(edge, int | float):
+            # n points have n − 1 intervals.
             intervals = max(points - 1, 1) if isinstance(points, int) else 2
             grid["spacing_deg"] = 2.0 * edge / intervals
     return derived
 
 
-def _check_scene(tree: Mapping[str, Any]) -> None:
-    """Raise ValueError if scene and telescope do not have the same source of aberrations.
-
-    The aberrations are settings of the scene or of the telescope: exactly one of them has some.
-    """
-    # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
-    scene, telescope = tree.get("scene"), tree.get("telescope")
-    if scene is None and "alignment" in tree:
-        scene = {"name": "alignment"}
-    if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
-        return
-    name, has_aberrations = telescope.get("name"), has_own_aberrations(telescope)
-    if has_aberrations and scene.get("name") != "telescope":
-        raise ValueError(
-            f"telescope = {name}: brings its own aberrations, but scene = {scene.get('name')} has "
-            "others; choose a dataset made for it (dataset=_telescope, or one that starts from it)"
-        )
-    if not has_aberrations and scene.get("name") == "telescope":
-        raise ValueError(
-            f"telescope = {name}: has no aberrations; scene = telescope needs a telescope "
-            "with the keys field_edge_deg and aberrations, such as example_zernike"
-        )
-
-
-def _search_px(distance: object, telescope: Mapping[str, Any]) -> int:
-    """Return a search distance in pixels from one in λ/D, between 4 and 256.
-
-    `SEARCH` stands for none; for settings that the next check refuses, any number is right.
-    """
-    if isinstance(distance, bool) or not isinstance(distance, int | float) or not distance > 0:
-        distance = SEARCH
-    # Width of a pixel in λ/D, from the aperture, the wavelength and the pixel scale.
-    keys = [key for key in Telescope.model_fields if key in telescope]
-    try:
-        pixel = Telescope.model_validate({key: telescope[key] for key in keys}).pixel
-    except ValidationError:
-        pixel = 1.0
-    return int(np.clip(np.ceil(distance / (pixel or 1.0)), 4, 256))
-
-
 @cache
 def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
     """Return a model of some groups of a whole configuration."""
+    # Fields keep their types, but none is optional: a stage needs all groups that it names.
     fields: dict[str, Any] = {
         key: (whole_model.model_fields[key].rebuild_annotation(), ...) for key in keys
     }

@@ -43,8 +43,10 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
             raise ProductError("methods: must be a list of different names")
         listed = tuple(method(str(name)) for name in names)
     except ProductError as error:
+        # Errors of the file name it already; those of a method do not.
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    # Registered methods that are not listed may still be asked for by name.
     return (*listed, *(kind for kind in all_methods() if kind not in listed))
 
 
@@ -61,5 +63,6 @@ def oracles_last(names: Iterable[str]) -> list[type[Method]]:
 
     Within both kinds the order is that of the configuration.
     """
+    # `sorted` keeps the order of equals.
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

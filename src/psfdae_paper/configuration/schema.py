@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
 
 from psfdae.method import Method
 from psfdae.methods import MethodNames
@@ -34,15 +34,9 @@ from psfdae.settings import (
 )
 from psfdae.telescope.aberrations import Prescription, Seidel
 from psfdae.telescope.settings import AnyTelescope
-from psfdae_paper.configuration.aligners import TRAINED
-from psfdae_paper.configuration.alignment import (
-    Alignment,
-    Cnn,
-    Fit,
-    NetworkTrain,
-    Perceptron,
-)
-from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
+from psfdae_paper.configuration.aligners import trained_networks
+from psfdae_paper.configuration.alignment import Alignment, Cnn, Fit, NetworkTrain, Perceptron
+from psfdae_paper.configuration.base import SearchDistance, search_distance
 from psfdae_paper.configuration.consistency import Consistent
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
@@ -54,6 +48,7 @@ class Grid(Group):
     Every star lies at one of them. Angles are from the optical axis.
     """
 
+    # Null values are derived in `consistency`.
     points: Count = Field(description="Field points along a side")
     spacing_deg: Positive = Field(
         description="Distance of neighbouring field points; null: the outermost lie at edge_deg"
@@ -79,6 +74,7 @@ class Stars(Group):
     """
 
     name: Name = Field(description="Names the file of the stars")
+    # Stars of all splits together.
     count: Count = Field(description="Number of stars")
     # The paper's 10 and 50 %; 0 makes every star its template.
     aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
@@ -88,7 +84,8 @@ class Stars(Group):
         description="Search distance for the brightest pixel of a star; null: search_lambda_d"
     )
     search_lambda_d: SearchDistance = Field(
-        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+        default=search_distance(),
+        description="The same in λ/D of whatever telescope, if search_px is null",
     )
 
 
@@ -103,7 +100,8 @@ class Framing(Stamp):
         "null: search_lambda_d"
     )
     search_lambda_d: SearchDistance = Field(
-        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+        default=search_distance(),
+        description="The same in λ/D of whatever telescope, if search_px is null",
     )
     # Mirror-symmetric PSFs have equal maxima, between which rounding would choose.
     tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
@@ -118,25 +116,35 @@ class WholePeriodOptics(Group):
     number of samples, and by rounding on batch and threads.
     """
 
-    pupil_samples: PupilSamples = Field(
-        description="Grid sizes N, ascending; each wavefront takes the first that suffices"
+    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
+        Field(description="Grid sizes N, ascending; each wavefront takes the first that suffices")
     )
     precision: Literal["complex64", "complex128"] = Field(
         description="Precision of the propagation"
     )
+    # More per batch need more memory.
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(
         description="Batches in parallel, each with one thread of linear algebra"
     )
 
+    @field_validator("pupil_samples")
+    @classmethod
+    def check_order(cls, grid_sizes: list[int]) -> list[int]:
+        """Require ascending grid sizes, so that the first that suffices is the smallest one."""
+        if sorted(set(grid_sizes)) != grid_sizes:
+            raise ValueError(f"{grid_sizes} must be ascending")
+        return grid_sizes
+
 
 class Optics(WholePeriodOptics):
     """Numerical settings of the propagation by matrix products, which computes stamps only."""
 
+    # Both give the same results but for rounding.
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
-def _optics(tree: object) -> object:
+def checked_optics(tree: object) -> object:
     """Check settings of the optics by the class that has their keys.
 
     Scene 3 propagates the whole period of the image and has no choice of a backend.
@@ -150,7 +158,7 @@ if TYPE_CHECKING:
     # Every dataset with a scene has it (`Consistent`); scene 3 reads the base class only.
     AnyOptics = Optics
 else:
-    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
+    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(checked_optics)]
 
 
 class Dataset(Group):
@@ -160,6 +168,7 @@ class Dataset(Group):
     """
 
     name: Name = Field(description="Names folders, tables and figures")
+    # Each combination of split and reference is a training.
     splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
         description="Test stars of all fields, or of fields never seen in training"
     )
@@ -185,6 +194,7 @@ class Calibration(Group):
     r0_m: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Fried parameters scanned (scene 2; scene 1 has none)"
     )
+    # The SSIM has constants in proportion to the square of the dynamic range.
     data_ranges: Annotated[list[Positive], Field(min_length=2)] = Field(
         description="SSIM dynamic ranges scanned, ascending"
     )
@@ -193,9 +203,11 @@ class Calibration(Group):
 class Benchmark(Group):
     """Run time against error; needs a quiet machine."""
 
+    # A machine is never quite without other work.
     repeats: Count = Field(description="Timings of every point; the median is reported")
     stamps: Count = Field(description="Stamps per timing of a kernel")
     peers: bool = Field(description="Time POPPY beside our kernels")
+    # From these the growth of the costs is read.
     star_counts: Annotated[list[Count], Field(min_length=2)] = Field(
         description="Numbers of stars at which time, memory and disk are measured, ascending"
     )
@@ -211,7 +223,9 @@ class Bounds(Group):
     A larger bank has stars more like a test star, and takes more time and memory.
     """
 
+    # Accuracy of the bounds against time and memory.
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    # Stars of one field are few in a bank for all fields.
     position_stars: Count = Field(
         description="Further draws, which only the bound uses that is given the field"
     )
@@ -234,7 +248,7 @@ class Config(Consistent):
     """The whole configuration of one dataset.
 
     Stages get a model with those of these groups that they read, and annotate it as `Config`, too.
-    Scene 3 reads `alignment.GROUPS`. `whole_config` adds the settings of methods.
+    Scene 3 reads those that `compose.validate_tree` names. `whole_config` adds settings of methods.
     """
 
     if TYPE_CHECKING:
@@ -307,8 +321,9 @@ def whole_config() -> type[Config]:
 @cache
 def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
     """Return the model with the settings of some methods; it is made only once."""
+    # Settings of methods and of the networks of scene 3; none has a default of its own.
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }
-    groups |= {f"train_{name}": (NetworkTrain, ...) for name in TRAINED}
+    groups |= {f"train_{name}": (NetworkTrain, ...) for name in trained_networks()}
     return create_model("Config", __base__=Config, **groups)

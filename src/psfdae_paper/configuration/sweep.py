@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
-from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT
-from psfdae_paper.configuration.alignment import CHOICE, NAME, NETWORKS
+from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
+from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load_file
 from psfdae_paper.configuration.methods import registered
@@ -26,34 +26,22 @@ AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
 
-def _trainable(name: str) -> str:
-    """Return the name of a model unchanged; ValueError if a sweep cannot train it.
-
-    Sweeps train methods that store a model, and the networks of scene 3.
-    """
-    stored = (method_class.name for method_class in registered() if method_class.storage)
-    models = (*stored, *SWEPT)
-    if name not in models:
-        raise ValueError(f"{name!r} is not one of {', '.join(models)}")
-    return name
-
-
-Model = Annotated[str, AfterValidator(_trainable)]
-
-
 class Axis(Group):
     """Setting that a sweep varies: listed values, named sets of values, or a range."""
 
+    # One of three forms: values, choices or a range.
     values: Annotated[list[Value], Field(min_length=1)] | None = Field(
         default=None, description="Listed values; a bare list means the same"
     )
     choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = Field(
         default=None, description="Name of each choice, and the keys with values that it stands for"
     )
+    # Both ends belong to the range.
     low: Finite | None = Field(default=None, description="Lower end of a range")
     high: Finite | None = Field(default=None, description="Upper end of a range")
     log: bool = Field(default=False, description="A range that is even in the logarithm")
     integer: bool = Field(default=False, description="A range of whole numbers")
+    # What the value of the axis changes.
     keys: Annotated[list[str], Field(min_length=1)] | None = Field(
         default=None, description="Configuration keys that get the value; default: the axis' name"
     )
@@ -80,15 +68,18 @@ class Axis(Group):
         form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
         if form_count != 1 or end_count == 1:
             raise ValueError("needs either values, or choices, or low and high")
+        # Keys that only one of the forms has.
         if self.choices is not None and (self.keys or self.repeat):
             raise ValueError("choices contain their keys: remove keys and repeat")
         if self.low is not None and self.high is not None:
+            # A range needs a length, and a logarithmic one numbers above 0.
             if not self.low < self.high:
                 raise ValueError(f"low = {self.low:g}: must be below high = {self.high:g}")
             if self.log and self.low <= 0:
                 raise ValueError(f"low = {self.low:g}: must be above 0 on a logarithmic range")
             if self.integer and not (self.low.is_integer() and self.high.is_integer()):
                 raise ValueError(f"low = {self.low:g}, high = {self.high:g}: must be whole numbers")
+        # Listed values say by themselves what they are.
         elif self.log or self.integer:
             raise ValueError("log and integer belong to a range, low and high")
         return self
@@ -114,6 +105,7 @@ class Axis(Group):
         if self.choices is not None:
             return dict(self.choices[str(value)])
         if self.repeat is not None:
+            # A list of equal numbers, such as one width for all layers.
             assert not isinstance(value, list)
             return dict.fromkeys(self.keys or [name], [value] * self.repeat)
         return dict.fromkeys(self.keys or [name], value)
@@ -126,7 +118,7 @@ class Sweep(Group):
     kind: Literal["grid", "random", "adaptive"] = Field(
         description="Every combination, random draws, or draws that learn from earlier ones"
     )
-    model: Model = Field(description="Method, or one of scene 3's networks")
+    model: str = Field(description="Method, or one of scene 3's networks")
     dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
     split: SplitKind = Field(default="random", description="Split of the stars")
     reference: Reference = Field(default="realisation", description="What the DAE is to restore")
@@ -146,10 +138,21 @@ class Sweep(Group):
     startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
     parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
 
+    @field_validator("model")
+    @classmethod
+    def check_name(cls, name: str) -> str:
+        """Require a method that stores a model, or a network of scene 3."""
+        # Methods without a file have nothing to train.
+        stored = (method_class.name for method_class in registered() if method_class.storage)
+        models = (*stored, *swept_networks())
+        if name not in models:
+            raise ValueError(f"{name!r} is not one of {', '.join(models)}")
+        return name
+
     @property
     def choice(self) -> tuple[str, ...]:
         """Override that chooses the dataset, or scene 3."""
-        return CHOICE if self.dataset is None else (f"dataset={self.dataset}",)
+        return Alignment.choice if self.dataset is None else (f"dataset={self.dataset}",)
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -161,7 +164,7 @@ class Sweep(Group):
         """Keys and groups that may differ between points; all points share their stars."""
         return (
             ALIGNERS[self.model].swept
-            if self.model in SWEPT
+            if self.model in swept_networks()
             else (*method(self.model).groups, "noise.levels")
         )
 
@@ -171,10 +174,11 @@ class Sweep(Group):
         # A grid has as many points as combinations.
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
-        if (self.model in SWEPT) != (self.dataset is None):
+        # Methods restore the stars of a dataset; networks of scene 3 have states.
+        if (self.model in swept_networks()) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
-        if self.dataset == NAME:
-            raise ValueError(f"dataset = {NAME}: scene 3 has no stars that methods restore")
+        if self.choice == Alignment.choice and self.dataset is not None:
+            raise ValueError(f"dataset = {self.dataset}: scene 3 has no stars that methods restore")
         # Networks of scene 3 err in states of misalignment, methods in images of stars.
         metrics = ["validation_mae"]
         if self.dataset is not None:
@@ -188,12 +192,15 @@ class Sweep(Group):
     @model_validator(mode="after")
     def check_axes(self) -> Sweep:
         """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
+        # The summary has these columns beside those of the axes.
         columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
             if name in columns or name.startswith(("validation_", "test_")):
                 raise ValueError(f"space.{name}: is a column of the summary; choose another name")
+            # A range has no end of values.
             if self.kind == "grid" and not axis.options:
                 raise ValueError(f"space.{name}: a grid needs values or choices, not a range")
+            # A list of lists is no value of a key.
             if axis.repeat and any(isinstance(value, list) for value in axis.options):
                 raise ValueError(f"space.{name}: repeat needs single values, not lists")
         return self
@@ -212,6 +219,7 @@ class Sweep(Group):
                 raise ValueError(
                     f"{key}: a sweep of {self.model} may change {', '.join(self.varied)}"
                 )
+            # The later axis would win without a word.
             if keys.count(key) > 1:
                 raise ValueError(f"{key}: set more than once")
         return self
@@ -219,7 +227,7 @@ class Sweep(Group):
 
 def point_groups(model: str) -> tuple[str, ...]:
     """Return the groups of the configuration that a point of a model reads."""
-    if model in SWEPT:
+    if model in swept_networks():
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
 

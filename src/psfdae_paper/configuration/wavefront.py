@@ -20,26 +20,31 @@ class VonKarman(Group):
     """
 
     kind: Literal["von_karman"] = Field(description="Tells which keys follow")
+    # The turbulence is static: one realisation for all stars.
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Seed of the turbulence")
     r0_m: Positive = Field(description="Fried parameter of all layers at the telescope's band")
     outer_scale_m: Positive = Field(description="Outer scale L0")
+    # A layer at height h is seen from the field angle θ displaced by h θ.
     layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)] = Field(
         description="Heights of the layers above the telescope"
     )
     layer_strengths: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Fraction of the turbulence in each layer"
     )
+    # A layer is a sum of plane waves with random phases.
     waves: Annotated[int, Field(ge=16, multiple_of=8)] = Field(description="Plane waves per layer")
     remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
 
     @model_validator(mode="after")
     def check_layers(self) -> VonKarman:
         """Require one strength for each layer, which add up to 1."""
+        # Layers are two lists of equal length in the file.
         if len(self.layer_heights_m) != len(self.layer_strengths):
             raise ValueError(
                 f"layer_strengths = {self.layer_strengths}: one for each of the "
                 f"{len(self.layer_heights_m)} layer_heights_m"
             )
+        # Fractions of the whole turbulence; rounding of typed decimals is allowed.
         if abs(sum(self.layer_strengths) - 1.0) > 1e-6:
             raise ValueError(f"layer_strengths = {self.layer_strengths}: must add up to 1")
         return self

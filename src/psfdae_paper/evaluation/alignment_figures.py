@@ -39,12 +39,14 @@ def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) ->
     titles : sequence of str
         One per group; a group has a common grey scale from 0 to its first row's peak.
     """
+    # A part of the figure for each group, with a common grey scale.
     fields = rows[0][1].shape[1]
     figure = new_figure(0.9 * len(rows) * len(titles) + 0.5 * len(titles), layout="constrained")
     parts = figure.subfigures(len(titles), 1, squeeze=False)[:, 0]
     for group, (part, title) in enumerate(zip(parts, titles, strict=True)):
         # Rows are treatments, columns are fields.
         panels = part.subplots(len(rows), fields, squeeze=False)
+        # The peak of the first treatment is white in all rows of a group.
         peak = rows[0][1][group].max()
         for row_panels, (label, stamps) in zip(panels, rows, strict=True):
             for axes, stamp in zip(row_panels, stamps[group], strict=True):
@@ -59,6 +61,7 @@ def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) ->
 
 def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> None:
     """Draw a stamp in grey; the square root of the flux makes wings visible."""
+    # Rows run along +y: the first one is at the bottom.
     scaled = np.clip(stamp / peak, 0.0, 1.0) ** 0.5
     axes.imshow(scaled, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     axes.set_xticks([])
@@ -78,6 +81,7 @@ def predicted_against_true(
     estimates : by method and noise level, arrays (n, 4)
         Estimates in units of the range, at up to two noise levels.
     """
+    # Panels share both axes, so that methods are compared by eye.
     figure = new_figure(1.75 * len(estimates) + 0.7, layout="constrained")
     panels = figure.subplots(len(estimates), 4, sharex=True, sharey=True, squeeze=False)
     for row_panels, (method, by_level) in zip(panels, estimates.items(), strict=True):
@@ -106,6 +110,7 @@ def predicted_against_true(
 
 def size_of(states: np.ndarray) -> np.ndarray:
     """Return the size of misalignments: RMS of their four numbers, in units of the range, (n,)."""
+    # √⟨t²⟩ over decentre x, y and tilt x, y.
     size: np.ndarray = np.sqrt((states**2).mean(axis=1))
     return size
 
@@ -144,6 +149,7 @@ def errors_against_size(
         axes.set_xlabel("RMS of the state's four numbers / range")
         axes.set_yscale("log")
         axes.grid(True, which="both")
+    # All panels have the same methods: one legend serves them.
     drawing.readable_log_axis(panels[0])
     panels[0].set_ylabel("mean absolute error / range")
     handles, labels = panels[0].get_legend_handles_labels()
@@ -187,6 +193,7 @@ def twin_ambiguity(
     panels = top.subplots(1, curves.noise_level.nunique(), sharey=True, squeeze=False)[0]
     for axes, (level, rows) in zip(panels, curves.groupby("noise_level"), strict=True):
         for color, (defocus, line) in zip(SERIES_COLORS, rows.groupby("defocus_mm"), strict=False):
+            # In focus the stamps of a state and its twin nearly agree, beyond focus they differ.
             label = "in focus" if defocus == 0 else f"CCD {defocus:g} mm beyond focus"
             axes.plot(line.position, np.maximum(line.chi2, 1e-2), color=color, label=label)
         # χ² = 9 is a difference of three standard deviations.
@@ -239,5 +246,6 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
                 if np.isfinite(value):
                     color = "white" if abs(value) > 0.6 else "black"
                     axes.text(b, a, f"{value:.2f}", ha="center", va="center", size=6.5, color=color)
+    # One colour bar: all matrices have the range −1 … 1.
     figure.colorbar(images[-1], ax=all_axes, shrink=0.5, label="correlation of signed errors")
     return figure

@@ -60,6 +60,7 @@ def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndar
     covariances : ndarray, shape (n, 4, 4)
         Cramér–Rao bounds of the states, in squared units of the range.
     """
+    # Marginal variance of each parameter, for every state.
     variance = np.diagonal(covariances, axis1=1, axis2=2)
     # ⟨|e|⟩ over all states; the variance of |e| is ⟨e²⟩ − ⟨|e|⟩².
     absolute = expected_abs_error(covariances).mean(axis=0)
@@ -77,6 +78,7 @@ def _in_both_units(
 ) -> list[Row]:
     """Return a row in units of the range and one in SI units for each parameter."""
     rows: list[Row] = []
+    # Decentres are lengths, tilts are angles.
     si_units = ("m", "m", "rad", "rad")
     for index, (parameter, si_unit) in enumerate(zip(DEGREES_OF_FREEDOM, si_units, strict=True)):
         for unit_name, scale in (("range", 1.0), (si_unit, unit[index])):
@@ -105,6 +107,7 @@ def correlation_rows(
             "ci_low": low[a, b],
             "ci_high": high[a, b],
         }
+        # All ordered pairs, the diagonal included.
         for a, b in product(range(4), repeat=2)
     ]
 
@@ -143,6 +146,7 @@ def predicted_correlations(key: Mapping[str, object], covariances: np.ndarray) -
     with np.errstate(divide="ignore"):
         z = np.arctanh(np.clip(pooled, -1.0, 1.0))
     key = {**key, "method": "cramer_rao_pooled"}
+    # Back from z = artanh r to correlations.
     low, high = np.tanh(z - half_width), np.tanh(z + half_width)
     return rows + correlation_rows(key, pooled, low, high)
 
@@ -204,6 +208,7 @@ def _pivoted(
     methods = list(ALIGNERS)
     table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
     table.columns.name = None
+    # Methods by their rank in the configuration, other keys by value.
     rank = table["method"].map(methods.index)
     keys = [rank if name == "method" else table[name] for name in index]
     # `lexsort` sorts by its last key first.
@@ -276,6 +281,7 @@ def error_correlation(
     # In units of the largest deviation, so that no square under- or overflows.
     deviation = errors - errors.mean(axis=0)
     deviation = deviation / np.where(varies, np.abs(deviation).max(axis=0), 1.0)
+    # Cosine of the angle between the deviations of two parameters: Pearson's r.
     length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
     matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)

@@ -80,6 +80,7 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
         if "no" in tightness:
             open_marker = {**look, "mfc": "white", "label": "its draws too few: upper limit"}
             handles.append(drawing.legend_entry(**open_marker, ls="--", lw=1.2, ms=6))
+    # Stars without a posterior mean are missing from its n: the largest n counts all.
     title = f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars"
     drawing.finish_panels(figure, panels, title, [*handles, *floor_entries], 3)
     return figure
@@ -104,10 +105,12 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
                 style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
                 axes.plot(values["noise_level"], values["efficiency"], **style)
         axes.axhline(1.0, color="black", lw=1.0)
+        # Without a tight bound there is no efficiency to draw.
         if method_rows["efficiency"].isna().all():
             axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
         _whole_noise_axis(axes, rows)
     panels[0][0].set_yscale("log")
+    # An efficiency above 1 is noise, or the floor is too rough an approximation.
     panels[0][0].set_ylim(top=2.0)
     # Line styles of both bounds, as far as they are drawn.
     handles = drawing.method_entries(set(measured["method"]))
@@ -132,14 +135,17 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """
     dataset_rows = growth[growth.dataset == dataset]
     figure, panels = drawing.reference_panels(dataset_rows)
+    # One colour for each noise level, the same in both panels.
     levels = np.unique(dataset_rows["noise_level"])
     colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
     for axes, _, rows in panels:
         # Measured errors as lines with markers, the limit of the fit as a dashed line.
         for (level, name), sizes in rows.sort_values("draws").groupby(["noise_level", "method"]):
+            # Both posterior means of a level have its colour, and a marker of their own.
             color, marker = colors[level], MEANS[str(name)]["marker"]
             axes.plot(sizes["draws"], sizes["mse"], color=color, marker=marker, ms=4.5, lw=1.4)
             axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
+        # A tick at each size of the bank.
         draws = np.unique(rows["draws"])
         drawing.log_axis(axes, draws, [f"{count:d}" for count in draws])
         axes.set_xlabel("draws of the simulator in the bank")
@@ -159,6 +165,7 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
 
 def _whole_noise_axis(axes: Axes, rows: pd.DataFrame) -> None:
     """Show all noise levels of a table, with 5 % of the axis' length beyond either end."""
+    # Points at the ends stay clear of the frame.
     levels = np.unique(rows["noise_level"])
     drawing.noise_axis(axes, levels)
     margin_factor = max(levels.max() / levels.min(), 2.0) ** 0.05
@@ -238,6 +245,7 @@ def headline(
     for number, row in enumerate(rows, 1):
         row_bottom = top * figure.get_figheight() - number * cell[1]
         draw_row(stamps, row, (left_edge * WIDTH_IN, row_bottom), cell, peak)
+    # Each title is above the middle of its part.
     figure.text(left_edge + 0.5 * columns * cell_width, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _draw_errors(panel, methods, efficiency, bounds)
@@ -301,6 +309,7 @@ def _write_name(
     axes: Axes, level: pd.Series, value: pd.Series, name: str, color: str, *, below: bool = False
 ) -> None:
     """Write the name of a line beside its second point, where lines are separate."""
+    # Names stand right of and below a point, or left of and above it.
     point = min(1, len(level) - 1)
     position = (float(level.iloc[point]), float(value.iloc[point]))
     offset, ha, va = ((6, -3), "left", "top") if below else ((-2, 5), "right", "bottom")

@@ -36,6 +36,7 @@ def original_noise_rows() -> list[OriginalNoise]:
     """Return the paper's original-noise columns, by dataset and noise level."""
     paper = published("psf")
     rows = paper[paper.method == "original_noise"]
+    # One row for each dataset and noise level, with both metrics.
     by_metric = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
     by_metric = by_metric.reset_index()
     # The columns have the names of the fields.
@@ -94,6 +95,7 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     published_ssim = np.array([row.ssim for row in rows])
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
+        # SSIM of the interpolated scan minus that of the paper, for each of its columns.
         data_range, scales = np.exp(logarithms[0]), np.exp(logarithms[1:])
         ssim = [
             surface(scales[index], data_range)
@@ -110,6 +112,7 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
         bounds.append((scales.min(), scales.max()))
     low, high = np.log(np.array(bounds)).T
     solution = least_squares(residuals, 0.5 * (low + high), bounds=(low, high), diff_step=1e-3)
+    # Back from logarithms: the range, then the scale of each experiment.
     data_range, *pixel_scales = (float(np.exp(logarithm)) for logarithm in solution.x)
     rms = float(np.sqrt(np.mean(solution.fun**2)))
     return ScaleFit(data_range, dict(zip(experiments, pixel_scales, strict=True)), rms)
@@ -142,6 +145,7 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
 
 def _fitted_rows(scan: pd.DataFrame) -> list[OriginalNoise]:
     """Return the paper's columns that are used in fits and are in a scan."""
+    # A scan may have the datasets of one experiment alone.
     datasets = set(scan.dataset)
     return [row for row in original_noise_rows() if row.fitted and row.dataset in datasets]
 
@@ -150,6 +154,7 @@ def _ssim_surface(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, fl
     """Interpolate the SSIM of one column as a function of pixel scale and dynamic range."""
     from scipy.interpolate import RectBivariateSpline
 
+    # SSIM on the scanned grid: rows are pixel scales, columns are dynamic ranges.
     part = scan[(scan.dataset == row.dataset) & np.isclose(scan.noise_level, row.noise_level)]
     grid = part.pivot(index="pixel_scale_arcsec", columns="data_range", values="ssim")
     # A spline through the scanned points in both logarithms, cubic if there are enough points.

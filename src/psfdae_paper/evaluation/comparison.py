@@ -34,6 +34,7 @@ def seed_scatter() -> Scatter:
 
     Fits without a row were not measured.
     """
+    # A row for each fit: dataset, reference, method and relative scatter of its MSE.
     with resources.files(__package__).joinpath("seed_scatter.csv").open() as file:
         return dict(pd.read_csv(file, index_col=FITTED)["scatter"])
 
@@ -49,6 +50,7 @@ def config_differences(
         Flattened configurations, see `psfdae.settings.leaves`. A dash stands for a
         setting that one of them does not have.
     """
+    # Keys of either configuration; equal values are left out.
     keys = sorted(first.keys() | second.keys())
     rows = [(key, first.get(key, "–"), second.get(key, "–")) for key in keys]
     return [row for row in rows if row[1] != row[2]]
@@ -62,6 +64,7 @@ def training_summary(history: pd.DataFrame) -> dict[str, float]:
     history : DataFrame
         A row per epoch: epoch, train_mse, validation_mse (NaN where not measured), seconds.
     """
+    # Only some epochs are validated.
     validated = history.dropna(subset=["validation_mse"])
     best_epoch = validated.iloc[validated["validation_mse"].argmin()]
     epochs = float(history["epoch"].max())
@@ -96,6 +99,7 @@ def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
         table[table["method"] == "noisy"].set_index(["noise_level", "star"])["mse"].sort_index()
         for table in (first, second)
     )
+    # Equal up to the rounding of another processor.
     same_stars = first_mse.index.equals(second_mse.index)
     return same_stars and bool(np.allclose(first_mse, second_mse, rtol=1e-5, atol=0.0))
 
@@ -124,6 +128,7 @@ def compare_evaluations(
         "same", for methods and levels that both have.
     """
     # Methods and levels that both evaluations have, in the order of the first one.
+    # On the same noisy stars their scatter is common to both, and cancels.
     paired = same_noisy_stars(first, second)
     rows = []
     keys = ["method", "noise_level"]
@@ -267,6 +272,7 @@ def _mse_signs(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
     signs = {}
     for pair in combinations(methods, 2):
         difference = mse[pair[0]] - mse[pair[1]]
+        # Scatter of the difference of two independent fits.
         scatter_of_pair = np.hypot(scatter[pair[0]], scatter[pair[1]])
         is_significant = difference.abs() > SIGNIFICANT * scatter_of_pair
         signs[pair] = np.sign(difference).where(is_significant, 0.0)
@@ -294,6 +300,7 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
     rows = []
     keys = [*FITTED, "noise_level"]
     for key, errors in stars.groupby(keys, sort=False):
+        # Errors of one method at one noise level, in both splits.
         by_split = [errors[errors.split == split] for split in ("random", "held_out")]
         # Stars that both splits test: their two errors differ by what the fit has seen.
         shared = by_split[0].merge(
@@ -320,5 +327,6 @@ def seed_stderr(scatter: float, metric: str, mean: float) -> float:
     mean : float
         Mean of the metric.
     """
+    # The scatter is relative to the error: the MSE, or 1 − SSIM.
     error = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
     return scatter * error

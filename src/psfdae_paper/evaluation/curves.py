@@ -31,6 +31,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
         measured); errors are per pixel of stamps with sum 1.
     title : str
     """
+    # One panel; errors of all networks of the dataset are on the same scale.
     figure = new_figure(4.6, layout="constrained")
     axes = figure.add_subplot()
     entries = []
@@ -39,6 +40,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
         color = SERIES_COLORS[i % len(SERIES_COLORS)]
         axes.plot(history["step"], history["train_mse"], color=color, lw=1.0, ls=":")
         validated = history.dropna(subset=["validation_mse"])
+        # Validation has fewer points, of which the best decides the network.
         step, mse = validated["step"], validated["validation_mse"]
         axes.plot(step, mse, color=color, lw=1.6, marker="o", ms=3.5)
         # The network of the smallest validation error is the result of the training.
@@ -46,6 +48,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
         star: Style = {"marker": "*", "ms": 13, "mfc": color, "mec": "black", "ls": ""}
         axes.plot(step.iloc[lowest], mse.iloc[lowest], **star)
         entries.append(drawing.legend_entry(label, color=color, lw=1.6))
+    # Below the networks the legend explains lines and markers.
     entries += [
         drawing.legend_entry("training stars", lw=1.0, ls=":"),
         drawing.legend_entry("validation stars", lw=1.6, marker="o", ms=3.5),
@@ -77,9 +80,11 @@ def error_against_noise(
     dataset : str
     metric : "mse" or "ssim"
     """
+    # Measured and published values; the paper's rows get our names of its methods.
     measured = metrics[(metrics.dataset == dataset) & (metrics.metric == metric)]
     published = paper[(paper.dataset == dataset) & (paper.metric == metric)]
     published = published.assign(method=published["method"].map(paper_rows()))
+    # Test stars of all fields, and of fields that have no training star.
     split_lines = {"random": "-", "held_out": "--"}
     figure, panels = drawing.reference_panels(measured)
     levels = np.unique(measured["noise_level"])
@@ -105,6 +110,7 @@ def error_against_noise(
             drawing.legend_entry(split_labels[split], ls=line, lw=1.4)
             for split, line in split_lines.items()
         ]
+    # An MSE spans decades over the noise levels; an SSIM lies between 0 and 1.
     title = f"{metric.upper()} of {dataset} against the noise level"
     label = drawing.METRIC_LABELS[metric]
     drawing.finish_panels(figure, panels, title, handles, 4, label, logarithmic=metric == "mse")

@@ -59,6 +59,7 @@ def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
     panels : list of (Axes, str, DataFrame)
         Axes, name of the reference and its rows.
     """
+    # A panel for each reference that the table has; sorted by name, realisations are first.
     figure = new_figure(4.9, layout="constrained")
     references = sorted(set(table["reference"]))
     all_axes = figure.subplots(1, len(references), squeeze=False, sharey=True)[0]
@@ -80,6 +81,7 @@ def finish_panels(
     logarithmic: bool = True,
 ) -> None:
     """Label the common axis of errors, and add the title and the legend below the panels."""
+    # The panels share one axis of errors: the first one's scale and label hold for all.
     first = panels[0][0]
     if logarithmic:
         first.set_yscale("log")
@@ -96,12 +98,14 @@ def by_method(table: pd.DataFrame) -> list[tuple[type[Method], pd.DataFrame]]:
 
 def method_line(method_class: type[Method]) -> Style:
     """Return the style of a method's line."""
+    # Colour and marker of a method are the same in all figures.
     look = method_class.look
     return {"color": look.color, "marker": look.marker, "lw": 1.4, "ms": 4.5}
 
 
 def paper_marker(method_class: type[Method]) -> Style:
     """Return the style of the paper's published values: an open marker without a line."""
+    # The paper has no standard errors: its markers are larger and open.
     return {**method_line(method_class), "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
 
 
@@ -114,6 +118,7 @@ def legend_entry(label: str, **style: Any) -> Artist:
 
 def method_entries(methods: set[str], published: Set[str] = frozenset()) -> list[Artist]:
     """Return legend entries of measured methods, each followed by the paper's open marker."""
+    # Methods that are given the noise level stand last.
     entries: list[Artist] = []
     for method_class in oracles_last(methods | published):
         label = method_class.look.label
@@ -139,6 +144,7 @@ def log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
     """Make the x axis logarithmic with these ticks and no others."""
     from matplotlib.ticker import NullLocator
 
+    # A logarithmic axis would add minor ticks of its own.
     axes.set_xscale("log")
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xticks(ticks, labels=labels)
@@ -148,6 +154,7 @@ def readable_log_axis(axes: Axes) -> None:
     """Write numbers on the y axis between decades, too: it often spans only one or two."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
+    # Labels at 1, 2 and 5 times each power of ten.
     axes.yaxis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(10, 10)))
     axes.yaxis.set_minor_formatter(NullFormatter())

@@ -68,6 +68,7 @@ def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
     # Pixels between stamps, and where there is none, are NaN, which is drawn in grey.
     side = stamps.shape[-1]
     pitch = side + gap  # pixels from one stamp to the next
+    # Columns run along x, rows along y.
     columns, rows = grid.max(axis=0) + 1
     canvas = np.full((rows * pitch + gap, columns * pitch + gap), np.nan)
     for stamp, (ix, iy) in zip(stamps, grid, strict=True):
@@ -105,6 +106,7 @@ def stamp_energy_map(
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
+    # A coloured cell for each field point, with its number where there is room.
     image = _draw_values(axes, energy, grid, field, "viridis")
     _field_axes(axes, field)
     # On grids with more than 15 points a side the numbers would touch.
@@ -208,6 +210,7 @@ def _draw_values(
 ) -> AxesImage:
     """Draw a value of each field point (F,) as a coloured cell."""
     return axes.imshow(
+        # A value is a stamp of one pixel; there are no gaps.
         mosaic(values[:, None, None], grid, gap=0),
         origin="lower",
         extent=_extent(grid, field, 1, 0),
@@ -224,6 +227,7 @@ def _write_values(
     """Write numbers into the cells of an image, dark on light or light on dark."""
     position, _ = in_field_unit(field)
     for (x, y), value in zip(position, values, strict=True):
+        # Colour of the cell, from which that of the number follows.
         red, green, blue, _ = image.cmap(image.norm(value))
         # Luma of ITU-R BT.601, the brightness that the eye perceives.
         color = "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.5 else "black"
@@ -243,6 +247,8 @@ def _extent(
     # The centre of a stamp is gap + side/2 pixels from the edge of the mosaic.
     def edges(axis: int) -> tuple[float, float]:
         points = int(grid[:, axis].max()) + 1
+        # Width of a pixel of the mosaic in the unit of the axes, from the spacing of the field
+        # points.
         first, last = position[:, axis].min(), position[:, axis].max()
         # A single field point has no spacing; its width is arbitrary.
         pixel = ((last - first) / (points - 1) if points > 1 else 1.0) / pitch
@@ -274,6 +280,7 @@ def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     unit : str
         "deg" or "arcmin".
     """
+    # The unit suits the whole field, so that axes of one telescope agree.
     degrees = np.rad2deg(field)
     if np.abs(degrees).max() >= 1.0:
         return degrees, "deg"

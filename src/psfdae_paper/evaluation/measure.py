@@ -38,6 +38,7 @@ def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> 
     ProductError
         If a file is missing or damaged, or has not all columns.
     """
+    # All files must have the columns that are taken; others are left out.
     tables = [read_table(path) for path in paths]
     columns = list(tables[0].columns if columns is None else columns)
     for path, table in zip(paths, tables, strict=True):
@@ -76,6 +77,7 @@ class MeasuredStars:
     @classmethod
     def of(cls, product: Product, star: np.ndarray, reference: str) -> MeasuredStars:
         """Take some stars of a product "stars", with one of its references as the truth."""
+        # A method may be given the position; errors are clustered by field.
         field, position = product["field_index"][star], field_positions(product)[star]
         return cls(star, field, position, product[reference][star])
 
@@ -100,6 +102,7 @@ class MeasuredStars:
         per_star : DataFrame
             `row`, star, field, and a column for each metric.
         """
+        # Metrics of every star; their means have standard errors clustered by field.
         metrics = quality(estimate, self.truth, data_range)
         per_star = pd.DataFrame({**row, "star": self.star, "field": self.field, **metrics})
         return summarised(row, metrics, self.field), per_star

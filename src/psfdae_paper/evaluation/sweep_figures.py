@@ -45,12 +45,14 @@ class Scale:
 
     def to_unit(self, coordinate: np.ndarray) -> np.ndarray:
         """Scale coordinates so that the smallest and largest of this axis become 0 and 1."""
+        # An axis of one value lies in the middle.
         low, high = np.nanmin(self.coordinate), np.nanmax(self.coordinate)
         constant = np.full(np.shape(coordinate), 0.5)
         return (coordinate - low) / (high - low) if high > low else constant
 
     def draw_upright(self, panel: Axes, x: float) -> None:
         """Draw an upright line at `x`, with the ticks of this axis and their labels."""
+        # The line from the smallest to the largest value, then a stroke and a label at each tick.
         panel.plot([x, x], [0, 1], color="black", lw=0.9, zorder=3)
         for height, label in zip(self.to_unit(self.ticks), self.labels, strict=True):
             panel.plot([x - 0.012, x + 0.012], [height, height], color="black", lw=0.9, zorder=3)
@@ -78,6 +80,7 @@ def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
         The scale of numbers is logarithmic; otherwise their range decides.
     """
     try:
+        # Texts that are no numbers are options: they follow each other at equal distances.
         numbers = np.array([float(text) for text in texts])
     except ValueError:
         options = list(dict.fromkeys(texts))
@@ -147,6 +150,7 @@ class SweepPoints:
 
         `column` is the metric, or METRIC_LEVEL for one noise level.
         """
+        # Columns of the test part differ by this word alone.
         names = (column, column.replace("validation", "test"))
         validation, test = (self.table[name].to_numpy(dtype=float) for name in names)
         return validation, test
@@ -158,6 +162,7 @@ class SweepPoints:
     def draw(self, panel: Axes, scale: Scale, name: str, line: Style) -> str:
         """Draw all points, and lines through the best; return the axis that the lines stand for."""
         table, definition = self.table, self.definition
+        # Points that failed have no metric.
         validation, test = self.errors(self.metric)
         succeeded = np.isfinite(validation)
         # In a grid of two axes each value of the second axis has a line, if there are at most six.
@@ -176,6 +181,7 @@ class SweepPoints:
             panel.plot(positions, heights, marker="o", ms=4, color=color, **line, label=value)
             panel.plot(coordinate, validation[members], ls="", marker="o", ms=4, color=color)
             panel.plot(coordinate, test[members], **_open_marker(color))
+        # The best point has a star around its marker.
         star: Style = {"ls": "", "marker": "*", "ms": 14, "mfc": "none", "mec": "black"}
         panel.plot(scale.coordinate[self.is_best], validation[self.is_best], **star)
         # Failed points are crosses at the upper edge of the panel.
@@ -209,6 +215,7 @@ def parallel_coordinates(points: SweepPoints) -> Figure:
     # Heights of every line on every axis, from 0 to 1; the last axis is the metric.
     names, table = list(points.definition["space"]), points.table
     metric_values, _ = points.errors(points.metric)
+    # Points that failed have no metric, and no rank.
     succeeded = np.isfinite(metric_values)
     values = metric_values[succeeded]
     scales = [points.scale(name) for name in names]
@@ -252,6 +259,7 @@ def parallel_coordinates(points: SweepPoints) -> Figure:
     panel.set_title(f"Sweep {points.definition['sweep']}: {len(table)} points")
     panel.spines[:].set_visible(False)
     panel.tick_params(axis="x", length=0)
+    # Colours run from the best point to the worst, by rank.
     handles = [legend_entry("best point", color=colormaps["viridis"](0.0), lw=3.2)]
     handles += [legend_entry("worst point", color=colormaps["viridis"](0.92), lw=1.1)]
     if not succeeded.all():
@@ -282,6 +290,7 @@ def response_curves(points: SweepPoints) -> Figure:
         scale = points.scale(name)
         # Only listed numbers are joined; draws from a range are scattered.
         joined = scale.numeric and points.definition["space"][name].get("low") is None
+        # The legend's title is the quantity that the lines stand for.
         title = draw(panel, scale, name, {"ls": "-" if joined else "", "lw": 1.3})
         if points.is_logarithmic:
             panel.set_yscale("log")
@@ -294,6 +303,7 @@ def response_curves(points: SweepPoints) -> Figure:
         panel.set_visible(False)
     for row in range(rows):
         panels[row * columns].set_ylabel(points.label)
+    # Crosses are explained if a point has failed.
     failed = ", × failed" if (points.table["status"] == "failed").any() else ""
     name = points.definition["sweep"]
     figure.suptitle(f"Sweep {name}: filled validation, open test, star the best{failed}")

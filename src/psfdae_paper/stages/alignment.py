@@ -35,7 +35,7 @@ from psfdae_paper.alignment.telescope import (
     uniform_states,
     verify,
 )
-from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS, STATE_GROUPS, WAVEFRONT_KEYS
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 
@@ -44,7 +44,9 @@ StatesFile = Annotated[File, "Product of `alignment states`."]
 TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-@command("alignment model", reads=("telescope", "prescription", "alignment"), choice=CHOICE)
+@command(
+    "alignment model", reads=("telescope", "prescription", "alignment"), choice=Alignment.choice
+)
 def model(
     config: Config,
     out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
@@ -59,7 +61,8 @@ def model(
     # Few small arrays: threads would not pay.
     limit_threads(1)
     # 25 states of a central composite design determine all terms of the model.
-    tracer, design = _tracer(config), design_states()
+    tracer = StateTracer(config.telescope, config.prescription, config.alignment)
+    design = design_states()
     quadratic = fit_quadratic(design, tracer(design))
     # The grid, with other states, tests it: no wavefront may differ by more than the tolerance.
     grid = grid_states(config.alignment.grid_levels)
@@ -97,7 +100,7 @@ def read_model(
     """
     # The wavefront of a state depends on the telescope's optics and on the range of the states.
     product = read_product(path, "alignment_model", ("coefficients",))
-    require(path, product.config, WAVEFRONT_KEYS, expected_config, owner)
+    require(path, product.config, Alignment.wavefront_keys, expected_config, owner)
     return QuadraticModel(product["coefficients"])
 
 
@@ -121,13 +124,14 @@ def read_states(
     ProductError
         If the product is missing or damaged, or does not agree.
     """
+    # Stamps are (n, F, d, d), states (n, 4) in units of their range.
     product = read_product(path, "alignment_states", ("states", "stamps"))
     if expected_config is not None:
-        require(path, product.config, STAMP_KEYS, expected_config, owner)
+        require(path, product.config, Alignment.stamp_keys, expected_config, owner)
     return product
 
 
-@command("alignment states", reads=STATE_GROUPS, choice=CHOICE)
+@command("alignment states", reads=Alignment.state_groups, choice=Alignment.choice)
 def states(
     config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
@@ -153,7 +157,8 @@ def states(
         count = alignment.test_states if kind == "uniform" else alignment.train_states
         state_set = uniform_states(count, stream(config.seed, "alignment", "states", kind))
     # Wavefronts by the quadratic model, or by rays; then stamps of all fields.
-    zernikes = quadratic(state_set) if quadratic else _tracer(config)(state_set)
+    wavefronts = quadratic or StateTracer(config.telescope, config.prescription, alignment)
+    zernikes = wavefronts(state_set)
     stamps, energy = AlignmentStamps(config.telescope, config.optics, alignment)(zernikes)
     columns = {
         "states": Column(state_set, "range", "decentre x, y and tilt x, y of the secondary"),
@@ -170,17 +175,6 @@ def states(
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
-def _tracer(config: Config) -> StateTracer:
-    """Return the ray trace of the configured telescope.
-
-    Raises
-    ------
-    MissingExtraError
-        If batoid is not installed.
-    """
-    return StateTracer(config.telescope, config.prescription, config.alignment)
-
-
 def _geometry(config: Config) -> dict[str, Column]:
     """Return the columns that explain the axes of arrays.
 
@@ -189,6 +183,7 @@ def _geometry(config: Config) -> dict[str, Column]:
     """
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
+    # Noll's numbering of the Zernike polynomials; piston and tilt do not blur a centred stamp.
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
     return {
         "fields": Column(fields, "rad", "field angle (x, y)"),
@@ -197,7 +192,7 @@ def _geometry(config: Config) -> dict[str, Column]:
     }
 
 
-@command("alignment telescope", reads=("telescope", "alignment"), choice=CHOICE)
+@command("alignment telescope", reads=("telescope", "alignment"), choice=Alignment.choice)
 def telescope(
     config: Config,
     model: ModelFile,
@@ -217,15 +212,17 @@ def telescope(
         for name, path in (("grid", grid), ("uniform", uniform))
     }
     # All products must be those of the configured telescope.
-    require(model, quadratic.config, WAVEFRONT_KEYS, config)
+    require(model, quadratic.config, Alignment.wavefront_keys, config)
     for product in sets.values():
-        require(product.path, product.config, STAMP_KEYS, config)
+        require(product.path, product.config, Alignment.stamp_keys, config)
+    # Arrays [field, term, Zernike], [state, field], [Zernike].
     coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
     # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:
     # its condition number says how well states can be separated.
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
     # Defocus (Noll 4) of the aligned telescope in each field; the first field is the centre.
     defocus = coefficients[:, 0, noll == 4][:, 0]
+    # Width of a pixel in λ/D: up to 1/2 an image is sampled without aliasing.
     pixel = config.telescope.pixel
     rows = [
         ("pixel", pixel, "lambda/D"),
@@ -247,5 +244,6 @@ def telescope(
             (f"peak_greatest_{name}", peak.max(), "1"),
             (f"stamps_{name}", energy.size, "1"),
         ]
+    # One row for each quantity, with its unit.
     table = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
     write_csv(out, table, digits=6)

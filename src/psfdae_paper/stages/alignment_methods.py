@@ -37,17 +37,8 @@ from psfdae.rng import stream
 from psfdae.settings import deciding, parse_settings
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    BOUNDS,
-    FITTED,
-    LEARNED,
-    TRAINED,
-    WEIGHTS,
-    Aligner,
-    methods_of_set,
-)
-from psfdae_paper.configuration.alignment import CHOICE, NETWORKS, STAMP_KEYS, NetworkTrain
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of, trained_networks
+from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model, read_states
@@ -60,18 +51,20 @@ if TYPE_CHECKING:
 else:
     NetworkFolders = make_dataclass(
         "NetworkFolders",
-        [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
+        [
+            (name, Annotated[Folder, "Folder of the network of that name."])
+            for name in trained_networks()
+        ],
     )
 
 Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
 Trained = Annotated[Folder, "Folder for weights, config and history."]
 DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 
-DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
-"""Networks that are trained on the DAE's output."""
 
-
-@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=CHOICE)
+@command(
+    "alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=Alignment.choice
+)
 def train_dae(
     config: Config,
     grid: Annotated[File, "Product of `alignment states --set grid`."],
@@ -84,6 +77,7 @@ def train_dae(
     It learns to restore single stamps with noise of all levels to those without, and is applied
     to the stamps of a state before a network estimates the state.
     """
+    # Both sets must have stamps of the same telescope.
     grid_product = read_states(grid)
     large_product = read_states(train, grid_product.config, grid)
     # The DAE restores stamps one by one, whatever their state and field.
@@ -91,6 +85,7 @@ def train_dae(
     training = _single_stamps(grid_product["stamps"])
     validation = _single_stamps(large_product["stamps"][:100])
     images = np.concatenate([training, validation])
+    # Input and target are the same stamps: noise is drawn while it trains.
     data = TrainingSet(
         images=images,
         references=images,
@@ -114,25 +109,25 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
         Name of the network; empty for all.
     """
     # Noise, and the settings of a DAE that is applied, only where some network needs them.
-    kinds = [kind] if kind else TRAINED
+    kinds = [kind] if kind else trained_networks()
     noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
     dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-network", reads=network_groups, choice=CHOICE)
+@command("alignment train-network", reads=network_groups, choice=Alignment.choice)
 def train_network(
     config: Config,
     kind: Annotated[
         str,
-        click.Choice(TRAINED),
+        click.Choice(trained_networks()),
         "Clean stamps, noisy stamps, or the DAE's output for noisy stamps.",
     ],
     states: Annotated[File, "Product of `alignment states`: the grid or the large set."],
     checkpoint: Checkpoint,
     out: Trained,
     dae: Annotated[
-        DaeFolder | None, f"Folder of `alignment train-dae`. For {DENOISED} only."
+        DaeFolder | None, "Folder of `alignment train-dae`. For networks behind the DAE only."
     ] = None,
 ) -> None:
     """Train a network that estimates states of misalignment.
@@ -147,11 +142,13 @@ def train_network(
 
     # Settings and training data of this kind of network.
     if ALIGNERS[kind].denoised != (dae is not None):
-        raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
+        denoised = [name for name in trained_networks() if ALIGNERS[name].denoised]
+        raise click.UsageError(f"--dae goes with --kind {', '.join(denoised)}, and only with it")
+    # Every network has a group train_NAME.
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_states(states)
     if dae:
-        require_origin(dae, STAMP_KEYS, product)
+        require_origin(dae, Alignment.stamp_keys, product)
     # Stamps without noise, with noise that is drawn anew in every epoch, or the DAE's output.
     data = TrainingStates(product["states"], product["stamps"])
     if ALIGNERS[kind].noisy:
@@ -163,19 +160,22 @@ def train_network(
     # Settings that describe the network to those who load it; `network_predictor` reads them.
     fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
+    # Kind of the network, and whether estimates are averaged over mirror images.
     described |= {"network": settings.network, "mirrors": settings.mirrors}
 
     def begin(attempt: int) -> NetworkTraining:
         """Start the training; every attempt starts alike."""
+        # Group of the network's layers: cnn or perceptron.
         network = getattr(config, settings.network)
         return training_of(network, data, settings, config.seed, kind)
 
     # A checkpoint is resumed only if settings and stamps are the same.
     with progress(settings.epochs) as report:
+        # The fingerprint holds settings and stamps, but not what cannot change the result.
         identity = fingerprint(described | deciding(config), data.stamps)
         training = train(begin, checkpoint, identity, report)
     # Weights first: a folder with a configuration is complete.
-    save_weights(out / WEIGHTS, training.result, described)
+    save_weights(out / Aligner.weights_file, training.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(training.history))
     write_text(out / CONFIG, as_yaml(described))
@@ -288,21 +288,26 @@ def network_predictor(
     _, fields, _, side = states["stamps"].shape
     shape = {"fields": fields, "stamp_px": side}
     require(path, described, tuple(shape), shape, states.path)
-    require_origin(folder, STAMP_KEYS, states)
+    require_origin(folder, Alignment.stamp_keys, states)
     if name:
         require(path, described, ("name",), {"name": name}, "the command")
     # It describes training and network, and is checked as settings are.
     training = f"train_{from_tree(path, described, 'name')}"
     trained = from_tree(path, described, training, make=partial(parse_settings, NetworkTrain))
+    # Class of the settings of its layers.
     kind = NETWORKS[trained.network]
     settings = from_tree(path, described, trained.network, make=partial(parse_settings, kind))
+    # Threads as configured: their number can change the last digits.
     torch.set_num_threads(config.evaluation.threads)
-    model = with_weights(lambda: empty_network(settings, fields, side), folder / WEIGHTS)
+    model = with_weights(
+        lambda: empty_network(settings, fields, side), folder / Aligner.weights_file
+    )
+    # The field points are a centre and a circle of points; a mirror image permutes these.
     mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
 
-@command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=CHOICE)
+@command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
 def estimate(
     config: Config,
     test_set: TestSet,
@@ -318,28 +323,32 @@ def estimate(
     """
     limit_threads(config.evaluation.threads)
     product = read_states(states)
-    require_origin(dae, STAMP_KEYS, product)
+    require_origin(dae, Alignment.stamp_keys, product)
     predict = {
         name: network_predictor(folder, product, config, name)
         for name, folder in vars(networks).items()
     }
     # The same noisy stamps for all methods, with the time that each takes; λ = 0 is no noise.
-    levels = [0.0, *config.noise.levels]
-    estimates = np.empty((len(levels), len(LEARNED), *product["states"].shape))
+    levels, learned = [0.0, *config.noise.levels], aligners_of("estimates")
+    # Array [λ, method, state, number].
+    estimates = np.empty((len(levels), len(learned), *product["states"].shape))
     rows = []
     for row, level in enumerate(levels):
         noisy = noisy_test_states(config, product["stamps"], test_set, level)
-        for column, method in enumerate(LEARNED):
+        for column, method in enumerate(learned):
             started = time.perf_counter()
+            # Networks behind the DAE get its output.
             stamps = denoise(dae, config, noisy) if method.denoised else noisy
             estimates[row, column] = predict[method.network](stamps)
+            # With the time of the DAE, which is part of the method.
             seconds = time.perf_counter() - started
+            # Seconds for all states of the set, with the DAE if there is one.
             rows.append((test_set, level, method.name, seconds, len(stamps)))
     # True states go along: products of one test are compared by them.
     columns = {
         "states": Column(product["states"], "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "estimates": Column(estimates, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
+        "estimates": Column(estimates, "range", f"[λ, method, state, number]; {_names(learned)}"),
     }
     # The test set is not part of the configuration, but tells products apart.
     described = {**config.model_dump(), "test_set": test_set}
@@ -369,7 +378,7 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
 @command(
     "alignment fit",
     reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
-    choice=CHOICE,
+    choice=Alignment.choice,
 )
 def fit_alignment_method(
     config: Config,
@@ -394,12 +403,13 @@ def fit_alignment_method(
     limit_threads(1)
     # States to fit, states for the emulator, the model of the wavefront, and the network.
     product, large_product = read_states(states, config), read_states(train, config)
+    # Zernike coefficients of a state, quadratic in its four numbers.
     wavefronts = read_model(model, product.config, states)
     predict = network_predictor(network, product, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     # Columns of the fits, with an entry for each method.
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows, methods = [], methods_of_set(FITTED, test_set)
+    rows, methods = [], aligners_of("fit", test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
     columns = {"states": Column(product["states"], "range", "true states")}
     # The emulator interpolates stamps between those of the large set, and the network's estimate
@@ -411,6 +421,7 @@ def fit_alignment_method(
         large_product["stamps"],
         config.fit,
     )
+    # The network's estimate is near enough to the maximum for Levenberg steps.
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
@@ -426,11 +437,13 @@ def fit_alignment_method(
         final_fit = best_fit
         if fast is not exact:
             final_fit = exact.maximise(best_fit.parameters, config.fit)
+        # None if all steps were exact.
         last_evaluations = final_fit.evaluations * (fast is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
         start = final_fit.parameters[:, :4]
         fits["estimates"].append(final_fit.parameters[:, :4])
+        # Deviance −2 ln L, with ln L = 0 for a perfect fit.
         fits["deviance"].append(-2.0 * final_fit.height)
         fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
         fits["converged"].append(final_fit.converged)
@@ -447,13 +460,16 @@ def fit_alignment_method(
     }
     for name, text in about.items():
         unit = "range" if name == "estimates" else "1"
+        # Arrays [method, state, …].
         columns[name] = Column(np.array(fits[name]), unit, text)
     described = {**config.model_dump(), "test_set": test_set, "level": level}
     write_product(out, "alignment_fit", columns, described)
     _write_times(times, rows)
 
 
-@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), choice=CHOICE)
+@command(
+    "alignment bound", reads=("telescope", "alignment", "optics", "noise"), choice=Alignment.choice
+)
 def bound(
     config: Config,
     test_set: TestSet,
@@ -474,7 +490,7 @@ def bound(
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
     # Bounds with flux and place of the stars known, or unknown: the stamps are then movable.
-    methods = methods_of_set(BOUNDS, test_set)
+    methods = aligners_of("bound", test_set)
     unknown_flux = [method.unknown_flux for method in methods]
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(unknown_flux))
     optics = StateOptics(wavefronts, operator)

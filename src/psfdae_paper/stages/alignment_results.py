@@ -31,16 +31,8 @@ from psfdae_paper.alignment.telescope import (
     design_states,
     fit_quadratic,
 )
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    BOUNDS,
-    ESTIMATORS,
-    FITTED,
-    LEARNED,
-    Aligner,
-    methods_of_set,
-)
-from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
+from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import alignment_figures, alignment_tables
@@ -53,9 +45,6 @@ Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fi
 Bounds = Annotated[tuple[File, ...], "Product of `alignment bound`.", {"flag": "--bound"}]
 ErrorTable = Annotated[File, "CSV of `alignment tables`."]
 Png = Annotated[File, "PNG."]
-
-FIGURE_METHODS = [method.name for method in ESTIMATORS if not method.unknown_flux]
-"""Methods whose estimates and errors are drawn."""
 
 
 class Key(TypedDict):
@@ -97,18 +86,19 @@ def read_results(
     """
     for product in products_of_one_test(estimates, fits, bounds):
         truth, test_set = product["states"], product.config["test_set"]
+        # A bound has covariances instead of estimates.
         is_bound = product.kind == "alignment_bound"
         # Names of the methods, and their values as an array [λ, method, state, ...].
         if is_bound:
-            aligners = methods_of_set(BOUNDS, test_set)
+            aligners = aligners_of("bound", test_set)
             levels, values = product["levels"], product["covariances"].swapaxes(0, 1)
         elif product.kind == "alignment_fit":
             # A product of maximum-likelihood fits has one noise level.
-            aligners = methods_of_set(FITTED, test_set)
+            aligners = aligners_of("fit", test_set)
             levels, values = np.array([product.config["level"]]), product["estimates"][None]
         else:
             # The networks, and the constant estimate of the aligned telescope, which is 0.
-            aligners = [ALIGNERS["constant"], *LEARNED]
+            aligners = [ALIGNERS["constant"], *aligners_of("estimates", test_set)]
             levels = product["levels"]
             values = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
         for level, by_method in zip(levels, values, strict=True):
@@ -127,7 +117,7 @@ def products_of_one_test(
     ProductError
         With the first value that differs.
     """
-    same_keys = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
+    same_keys = ("noise.kappa", "noise.background_photons", *Alignment.stamp_keys)
     products: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
         for path in paths:
@@ -181,14 +171,16 @@ def tables(
     """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
+        # A bound must be that of the telescope whose states are tabulated.
         bound_config = read_product(path, "alignment_bound", ()).config
-        require(path, bound_config, STAMP_KEYS, product.config, states)
+        require(path, bound_config, Alignment.stamp_keys, product.config, states)
     unit = product["unit"]
     # Measured errors, and those that unbiased estimates at the bound would have.
     rows_by_table: dict[Path, list[alignment_tables.Row]] = {errors: [], correlation: []}
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         if is_bound:
             rows_by_table[errors] += alignment_tables.bound_rows(key, values, unit)
+            # Predicted correlations are those of the bound with flux and position known.
             if key["method"] == "cramer_rao":
                 rows_by_table[correlation] += alignment_tables.predicted_correlations(key, values)
         else:
@@ -200,6 +192,7 @@ def tables(
     # Rows by test set, noise level, and the order in which methods are listed.
     method_order = list(ALIGNERS)
     for path, table_rows in rows_by_table.items():
+        # A stable sort keeps the order of the parameters.
         frame = pd.DataFrame(table_rows).sort_values(
             ["test_set", "noise_level", "method"],
             key=lambda c: c.map(method_order.index) if c.name == "method" else c,
@@ -234,9 +227,11 @@ def alignment_paper_tables(
     for level in sorted(published("alignment").noise_level.unique()):
         if not np.isclose(measured.noise_level, level).any():
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
+        # Mean and variance of the absolute errors, as in the paper.
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
         write(f"{level:g}", alignment_tables.paper_errors(measured, level), title, digits)
+    # Correlations of signed errors between pairs of parameters.
     table = alignment_tables.paper_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
@@ -258,10 +253,11 @@ def time_table(
     training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
     # Seconds and states of each method, over all test sets and noise levels.
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
+    # Seconds per state from sums, in which large sets have their weight.
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
     # An estimate's time, and that of the trainings on which it rests.
-    for method in ESTIMATORS:
+    for method in (a for a in ALIGNERS.values() if a.network):
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
         networks = [method.network, *(["dae"] if method.denoised else [])]
@@ -271,7 +267,7 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
+@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
@@ -279,10 +275,11 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     """
     # The DAE must be that of these stamps.
     product = read_states(states)
-    require_origin(dae, STAMP_KEYS, product)
+    require_origin(dae, Alignment.stamp_keys, product)
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
+        # Noise is drawn for the whole set, so that these two have that of the tables.
         noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:2]
         rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(dae, config, noisy))]
     titles = [
@@ -302,10 +299,13 @@ def predicted(
 ) -> None:
     """Draw estimates against the truth, for each method, number of a state and noise level."""
     # Estimated states of each method and noise level.
-    by_method: dict[str, dict[float, np.ndarray]] = {method: {} for method in FIGURE_METHODS}
+    by_method: dict[str, dict[float, np.ndarray]] = {
+        name: {} for name, aligner in ALIGNERS.items() if aligner.is_drawn
+    }
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
+    # All products have the same states, so that the last truth is that of all.
     write_png(alignment_figures.predicted_against_true(truth, by_method), out)
 
 
@@ -318,7 +318,9 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
-        if key["noise_level"] > 0 and key["method"] in (*FIGURE_METHODS, "cramer_rao"):
+        is_shown = ALIGNERS[key["method"]].is_drawn or key["method"] == "cramer_rao"
+        if key["noise_level"] > 0 and is_shown:
+            # A bound gives the variance: E|x| = σ √(2/π) for a normal error.
             error = expected_abs_error(values) if is_bound else np.abs(values - truth)
             curves[key["noise_level"]][key["method"]] = (
                 alignment_figures.size_of(truth),
@@ -331,7 +333,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 @command(
     "alignment figure twin",
     reads=("telescope", "prescription", "alignment", "optics", "noise"),
-    choice=CHOICE,
+    choice=Alignment.choice,
 )
 def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.
@@ -386,6 +388,7 @@ def _stamps_of_multiples(
     tracer = StateTracer(config.telescope, config.prescription, settings)
     operator = AlignmentStamps(config.telescope, config.optics, settings)
     model = fit_quadratic(design_states(), tracer(design_states()))
+    # A moderate misalignment inside the range, for which the twin is inside, too.
     tilt = np.array([(0.20, 0.25)])  # x, y in units of the range
     state = np.concatenate([coma_free_decentre(model, tilt), tilt], axis=1)[0]
     return state, operator(tracer(multiples[:, None] * state))[0]
@@ -400,7 +403,9 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
+        # Pairs that the paper does not print stay empty.
         matrix = np.full((4, 4), np.nan)
+        # A row has one pair of parameters; the matrix is symmetric.
         pairs = rows[rows.method == method.name]
         for pair, value in zip(pairs.pair, pairs.correlation, strict=True):
             a, b = (DEGREES_OF_FREEDOM.index(name) for name in pair.split("-"))

@@ -17,13 +17,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.files import (
-    ProductError,
-    read_product,
-    write_csv,
-    write_parquet,
-    write_product,
-)
+from psfdae.files import ProductError, read_product, write_csv, write_parquet, write_product
 from psfdae.methods import method
 from psfdae.model.star_sets import field_positions, training_set
 from psfdae.options import File
@@ -62,6 +56,7 @@ def bank(
             ("bank_position", config.bounds.position_stars),
         )
     ]
+    # Columns of both draws, one below the other; each has the same units.
     columns = {
         name: replace(column, values=np.concatenate([part[name].values for part in parts]))
         for name, column in parts[0].items()
@@ -93,7 +88,9 @@ def bounds(
     framed = read_product(templates, "templates", ("psf",))
     require(stars, product.config, STARS, config)
     require(templates, framed.config, STATIC, config)
+    # The static PSFs with all centring errors that a star may have.
     static = jittered_templates(framed["psf"], config.framing.jitter_px)
+    # Rows are collected in one place, whichever bounds a dataset has.
     bound = tables.Tables(dataset, bounded_stars(config, product))
     # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
@@ -101,10 +98,12 @@ def bounds(
     elif bank is None:
         raise ProductError(f"{stars}: the stars have random aberrations, a bank is needed")
     else:
+        # The floor: field and centring error are known, the random aberrations are not.
         tables.add_floor(config, product, bound)
         bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
         require(bank, bank_product.config, STARS, product.config, stars)
         settings = bank_product.config
+        # Points along a side of the field, and the largest centring error.
         sizes = (settings["grid"]["points"], settings["framing"]["jitter_px"])
         # Only the bound that is given the field uses the stars after the first `bank_stars`.
         large_bank = Bank.of(bank_product.arrays, *sizes)
@@ -140,6 +139,7 @@ def optics(
     bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
     require(bank, bank_product.config, STARS, product.config, stars)
     bounded = bounded_stars(config, product)
+    # Field position of each bounded star, which one of the methods is given.
     position = field_positions(product)[bounded.star]
     # Without, then with the position of the star in the field.
     summary, stars_table = [], []
@@ -150,9 +150,11 @@ def optics(
         first = method_class.with_bank(bank_product.arrays, config, next(iter(data.values())))
         estimators = {reference: replace(first, data=data[reference]) for reference in data}
         for level, noisy in bounded.noisy.items():
+            # Time for the log: the posterior is what takes long.
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)
             for reference, estimator in estimators.items():
+                # Each reference takes its own image from the same posterior.
                 estimate = estimator.estimate_from_posterior(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
                 stars_of_truth = MeasuredStars(bounded.star, bounded.field, position, truth)
@@ -202,14 +204,17 @@ def efficiency(
     tight = {*zip(tight_rows.dataset, tight_rows.reference, tight_rows.method, levels, strict=True)}
     # Errors of methods by star, in groups that are columns of the paper's tables. The posterior
     # mean over a bank is an estimator, too, and must respect the floor.
+    # Bounds are paired with errors star by star: scatter that both share cancels.
     bound_stars = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     columns = [*CELL, "method", "star", "field", "mse"]
     methods = pd.concat([pd.read_parquet(path, columns=columns) for path in parts])
     means = bound_stars[bound_stars.method.isin(tables.POSTERIOR_MEANS)][columns]
     methods = pd.concat([methods, means], ignore_index=True)
+    # A cell is a dataset, split, reference and noise level.
     by_cell = dict(list(methods.groupby(CELL, sort=False)))
     rows: list[dict[str, object]] = []
     for key, bounded in bound_stars.groupby(CELL, sort=False):
+        # A cell that was bounded must have been evaluated.
         errors = by_cell[key]
         if errors.method.isin(tables.POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
@@ -231,16 +236,19 @@ def paper_rows_table(
     possible error: an error below it proves nothing.
     """
     key = ["dataset", "noise_level"]
+    # The paper's errors under the names of the methods here.
     paper = published("psf").query("metric == 'mse'").replace({"method": paper_rows()})
     measured = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
     limits = read_table(bounds).query(
         "method == 'bayes' and reference == 'realisation' and metric == 'mse'"
     )
     table = paper[[*key, "method", "value"]].rename(columns={"value": "mse_paper"})
+    # Only rows that the paper and this run both have.
     table = table.merge(measured[[*key, "method", "mse"]], on=[*key, "method"])
     table = table.merge(
         limits[[*key, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}), on=key
     )
+    # Above zero, the paper's error respects the bound.
     difference = table.mse_paper - table.mse_bound
     values = zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
     comparisons = [Comparison(*row) for row in values]

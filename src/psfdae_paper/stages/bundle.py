@@ -18,7 +18,7 @@ from psfdae.files import Product
 from psfdae.method import CONFIG, Method
 from psfdae.methods import method
 from psfdae.model import packing
-from psfdae.model.bundle import SHIPPED, SUFFIX, Bundle, BundleError, read_bundle, write_bundle
+from psfdae.model.bundle import SUFFIX, Bundle, BundleError, read_bundle, shipped_path, write_bundle
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae.options import AboveZero, File, Folder
@@ -32,9 +32,6 @@ from psfdae_paper.stages.evaluate import Models
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
-
-MAX_SHIPPED_BYTES = 5_000_000
-"""Largest size of the bundle that comes with the package."""
 
 
 @command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
@@ -93,6 +90,7 @@ def _fit_config(
     for path in fits.own_files(method_class, place):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
+    # A fit is a folder or one file.
     path = place / CONFIG if place.is_dir() else place
     fit_config = method_class.described(place)
     # Its configuration says how it was trained: the groups of the method, and the split of the
@@ -123,8 +121,10 @@ def ship(
     # The candidate with the smallest error.
     product, errors = read_stars(stars), {}
     for path in bundle:
+        # Each candidate restores the same noisy stars.
         errors[path] = _validation_error(read_bundle(path), product, config)
         print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
+    # The smallest error wins; the others are not shipped.
     source = min(errors, key=errors.__getitem__)
     packed = read_bundle(source)
     # The stated half-widths must contain 68 ± 5 % of the errors at every noise level.
@@ -136,12 +136,14 @@ def ship(
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     # Its stars are simulated: it has the licence of the package.
-    info = packed.info.model_copy(update={"name": SHIPPED, "licence": "MIT"})
+    name = shipped_path().name
+    fields = {"name": name.removesuffix(SUFFIX), "licence": "MIT"}
+    info = packed.info.model_copy(update=fields)
     # The package must stay small: the bundle is in every installation.
-    size = source.stat().st_size
-    if size > MAX_SHIPPED_BYTES:
-        raise BundleError(f"{source}: {size} bytes, at most {MAX_SHIPPED_BYTES}")
-    shipped = out / f"{SHIPPED}{SUFFIX}"
+    size, largest_size = source.stat().st_size, 5_000_000
+    if size > largest_size:
+        raise BundleError(f"{source}: {size} bytes, at most {largest_size}")
+    shipped = out / name
     write_bundle(replace(packed, info=info), shipped)
     print(shipped)
 
@@ -149,10 +151,12 @@ def ship(
 def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     """Return the MSE of PSFs of flux 1, as a geometric mean over the noise levels."""
     method_class = method(bundle.info.method)
+    # Split and reference of the model that is shipped.
     data = training_set(config, method_class, stars, "random", "realisation")
     # A method that needs no validation stars was fitted to them, too: fit it without them.
     if not method_class.needs.validation:
         independent_fit = fit_apart(method_class, data, np.arange(len(data.images)), config)
+        # It may be as large as the bundle, so that it has as many fine axes.
         size = sum(array.nbytes for array in bundle.weights.values())
         info = bundle.info
         weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
@@ -163,8 +167,10 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     log_errors = []
     for level in data.levels:
         rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)
+        # Photon noise of star and sky.
         stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
         prediction = model.predict(stamps, gain=1.0)
+        # The prediction has the flux of the star.
         normalised_psf = prediction.psf / prediction.flux[:, None, None]
         log_errors.append(np.log(np.nanmean(np.square(normalised_psf - truth))))
     return float(np.exp(np.mean(log_errors)))

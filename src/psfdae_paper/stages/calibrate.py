@@ -52,6 +52,7 @@ def scan(
     only on image structure and dynamic range.
     """
     limit_threads(1)  # batches run in parallel
+    # Columns of the paper's tables with the noise as it was, before any method.
     rows = [row for row in original_noise_rows() if row.dataset == dataset]
     r0_values = [float("nan")]
     if isinstance(config.wavefront, VonKarman):
@@ -62,10 +63,17 @@ def scan(
     for r0 in r0_values:
         source = _source(config, r0)
         for scale in config.calibration.pixel_scales_arcsec:
-            images = _images(config, source, scale)
+            # Noise-free, framed, normalised stars at this pixel scale. The search for the brightest
+            # pixel covers the same angle as at the configured scale.
+            telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
+            search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
+            propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
+            images = normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
             for row in rows:
+                # Noise with the MSE that the paper prints for this column.
                 noisy = _at_published_mse(images, row, config)
                 ranges = config.calibration.data_ranges
+                # SSIM of each star at each dynamic range, shape (range, star).
                 similarity = np.atleast_2d(ssim(noisy, images, *ranges))
                 table += [
                     {
@@ -111,25 +119,16 @@ class _CachedWavefronts:
 def _source(config: Config, r0: float) -> WavefrontSource:
     """Return wavefronts of the scanned stars, or of all fields behind turbulence of this r0."""
     if not isinstance(config.wavefront, VonKarman):
+        # Scene 1: stars at random fields, with aberrations of their own.
         count, fields = config.calibration.stars, config.grid.points**2
         return star_wavefronts(
             config, assign_fields(count, fields, stream(config.seed, "scan", "field"))
         )
+    # Scene 2: one wavefront per field, behind turbulence of this strength.
     wavefront = config.wavefront.model_copy(update={"r0_m": r0})
     return _CachedWavefronts(
         template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
     )
-
-
-def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray:
-    """Return noise-free, framed, normalised stars at another pixel scale (arcsec).
-
-    The search for the brightest pixel covers the same angle as at the configured scale.
-    """
-    telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
-    search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
-    propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
-    return normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
 
 
 def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
@@ -138,6 +137,7 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
     The noise of λ = `row.noise_level` has the variance (κλ)² plus that of the star's photons.
     """
     level, background = row.noise_level, config.noise.background_photons
+    # The constant κ whose noise has the published MSE on these stars.
     kappa = kappa_of_mse(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
     return NoiseModel(kappa, background).draw(images, level, rng)
@@ -211,6 +211,7 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     for path in stars.values():
         product = read_product(path, "stars", ())
         config = product.config
+        # The first product of a scene is what others are compared with.
         first = scenes.setdefault(config["scene"]["experiment"], product)
         require(path, config, STATIC, first.config, first.path)
         values[config["scene"]["experiment"]] = config["telescope"]["pixel_scale_arcsec"]
@@ -226,6 +227,7 @@ def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]
     background = config.noise.background_photons
     rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")
     noise = NoiseModel(config.noise.kappa, background)
+    # With the configured κ, as in the evaluation.
     noisy = noise.draw(images, row.noise_level, rng)
     noisy_at_published_mse = _at_published_mse(images, row, config)
     data_range, error = config.evaluation.data_range, mse(noisy, images).mean()

@@ -100,6 +100,7 @@ def _tables(folder: Path) -> list[Path]:
 
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """Return the runs to compare with each other: folder of the network, table of its errors."""
+    # Folders of single networks.
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
     # Whole results: all networks that they have in common, one group for each.
@@ -111,6 +112,7 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
                 "tables/psf_metrics.csv in it, hence neither a trained network nor a folder of "
                 "results"
             )
+    # A network that only one of the results has cannot be compared.
     common = sorted(set.intersection(*networks))
     if not common:
         raise ComparisonError(f"{', '.join(map(str, folders))}: no network in common")
@@ -126,6 +128,7 @@ def errors_of(folder: Path) -> Path:
     table = folder / "evaluation.parquet"
     if table.is_file():
         return table
+    # Of the workflow: METHOD/DATASET/RUN and evaluation/DATASET/RUN.parquet.
     absolute = folder.resolve()
     if len(absolute.parents) < 3:
         raise ComparisonError(f"{folder}: no evaluation.parquet in it")
@@ -137,9 +140,11 @@ def read_run(folder: Path, errors: Path) -> Run:
     # Settings and training are beside the network, its errors in the evaluation.
     config = read_yaml(folder / CONFIG)
     columns = ("epoch", "train_mse", "validation_mse", "seconds")
+    # Some cells may be empty, hence text that is converted below.
     history = read_table(folder / HISTORY, *columns, dtype=str)
     try:
         table = pd.read_parquet(errors, page_checksum_verification=True)
+    # A network may be there before it is evaluated.
     except FileNotFoundError:
         raise ProductError(f"{errors}: no such file; evaluate the run first") from None
     except (OSError, ValueError) as error:
@@ -158,9 +163,12 @@ def describe(first: Run, second: Run) -> str:
         difference = f"{row.difference:+.3g} ± {row.stderr:.2g}{scatter}"
         rows.append((*row[:5], difference, row.sigmas, row.verdict))
     headers = ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"]
+    # What a training reached, and how long it took.
     curves = [comparison.training_summary(run.history) for run in (first, second)]
+    # Errors on the same noisy images are paired, which removes most of their scatter.
     paired = comparison.same_noisy_stars(first.errors, second.errors)
     pairing = "star by star on the same noisy images" if paired else "as independent samples"
+    # Errors to templates and to realisations have different truths.
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: their errors are not comparable.\n\n"
     return "\n\n".join(
@@ -197,6 +205,7 @@ def describe_tables(first: Path, second: Path) -> str:
     rows, order = comparison.compare_tables(
         first_errors, second_errors, comparison.seed_scatter(), negligible, ascending
     )
+    # The paper's methods by increasing error, as it names them.
     looks = [method(name).look for name in ascending]
     names = " < ".join(look.paper[1] for look in looks if look.paper)
     verdict_texts = {
@@ -213,6 +222,7 @@ def describe_tables(first: Path, second: Path) -> str:
     counts = f"A has {len(first_errors)}, B {len(second_errors)}"
     lines += [f"{len(rows)} mean errors are in both ({counts})."]
     for verdict, text in verdict_texts.items():
+        # A line for each verdict, also where it has no rows.
         verdict_rows = rows[rows.verdict == verdict]
         lines += [f"- {len(verdict_rows)} {text}"]
         if verdict in ("beyond", "not measured"):

@@ -36,8 +36,10 @@ def config(
             raise click.BadParameter(
                 f"{only!r} is not one of {', '.join(sorted(command_modules()))}"
             )
+        # Groups of the stage without options; a stage may read more with some of them.
         groups = Groups(reader.names({}), reader.choice)
         settings = load_stage(groups.names({}), groups.with_choice(overrides))
+    # In the order of the classes, which is that of the documentation.
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
 
 

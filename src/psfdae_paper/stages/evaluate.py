@@ -79,7 +79,9 @@ def evaluate(
     # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
+    # Methods that store a model are loaded; the others are fitted to the training stars.
     methods = estimators(config, product, vars(models), split, reference)
+    # Stars that no method has been fitted to.
     test = split_stars(product, split, config).test
     test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
@@ -93,6 +95,7 @@ def evaluate(
             rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)
             summary += rows
             stars_table.append(per_star_rows)
+    # Means with standard errors, and every star.
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
@@ -165,6 +168,7 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
 
     The scatter, where it was measured, is that of a repeated fit with other random numbers.
     """
+    # The standard error of a mean over stars does not hold the scatter between seeds.
     table = comparison.with_seed_stderr(
         read_tables(evaluations, MeasuredStars.columns), comparison.seed_scatter()
     )
@@ -181,6 +185,7 @@ def held_out(
     PER_STAR are the evaluations' Parquet files of both splits.
     """
     columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
+    # Errors in the same fields, as seen in training and as held out.
     parts = [pd.read_parquet(path, columns=columns) for path in per_star]
     write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 

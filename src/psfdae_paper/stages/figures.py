@@ -30,13 +30,7 @@ from psfdae_paper.evaluation.drawing import reference_title
 from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import published
-from psfdae_paper.stages.evaluate import (
-    READS,
-    Evaluations,
-    Metric,
-    Models,
-    estimators,
-)
+from psfdae_paper.stages.evaluate import READS, Evaluations, Metric, Models, estimators
 from psfdae_paper.stars.fields import square_grid
 
 Stars = Annotated[File, "Product of the stage stars."]
@@ -83,6 +77,7 @@ def figure_strip(
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
+    # Eight stars side by side fill the width of a page.
     strip_stars = drawn_stars(config, stars, models, reference, 8)
     # Field angles of the stars as titles of the columns.
     angle, unit = in_field_unit(strip_stars.field)
@@ -109,12 +104,14 @@ def figure_headline(
     strip_stars = drawn_stars(config, stars, models, "realisation", 5)
     # Rows of restored stars, one for each method, and below them the truth.
     truth, *restored = strip_stars.rows(config, [level])
+    # Labels and colours of the methods.
     looks = [estimator.look for estimator in strip_stars.methods.values()]
     rows = [
         replace(row, label=look.label if look.restores else f"{look.label} star")
         for row, look in zip(restored, looks, strict=True)
     ]
     rows.append(replace(truth, label="truth"))
+    # Errors of methods and bounds of the same dataset.
     errors, limits = (rows_of(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
@@ -155,9 +152,11 @@ class DrawnStars:
         `config` is that of the stage `evaluate`.
         """
         stars = self.test[self.selected]
+        # The truth of each star that is drawn, and its field position for methods that use it.
         truth, position = self.product[self.reference][stars], field_positions(self.product)[stars]
         rows = [StripRow("reference", truth)]
         if self.reference == "template":
+            # Against templates, even the star without noise has an error.
             noise_free = self.product["realisation"][stars]
             rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
         for level in levels:
@@ -191,6 +190,7 @@ def drawn_stars(
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    # Test stars of seen fields, in the order of the file.
     test = split_stars(product, "random", config).test
     # Field angles (x, y) of all field points, of which each star has one.
     grid = product.config["grid"]
@@ -227,6 +227,7 @@ def figure_errors(
     """Draw metrics against the noise level, with the paper's points."""
     metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
+        # An empty figure would hide that a table lacks the dataset.
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
@@ -235,6 +236,7 @@ def figure_errors(
 
 def without_margin(templates: Product) -> np.ndarray:
     """Return static PSFs as they are in stamps without centring error, shape (F, d, d)."""
+    # Templates have a margin on every side, from which a stamp is cut with any centring error.
     margin = templates.config["framing"]["jitter_px"]
     side = templates["psf"].shape[-1] - margin
     return templates["psf"][:, margin:side, margin:side]

@@ -50,6 +50,7 @@ def fit(
     settings give the same bytes, whether the fit was interrupted or not.
     """
     # Stars of the split with their noise; training state goes to a file beside the fit.
+    # The class of the method, and as many threads as its settings say.
     method_class = method(name)
     limit_threads(method_class.threads(config))
     product = read_stars(stars, fits.learnt(method_class, reference))
@@ -65,6 +66,7 @@ def fit(
         data = replace(data, start=method_class.load(start))
     # Fit, store with its configuration, and forget the state of the training.
     described = fits.described_by(method_class, config.model_dump(), split, reference)
+    # The same call as for an astronomer's own stars.
     fitted = method_class.fit(data, **method_class.settings(config))
     fits.store(fitted, out, described, product)
     checkpoint_path.unlink(missing_ok=True)

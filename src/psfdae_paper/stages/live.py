@@ -46,6 +46,7 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
 
     def log(row: Row) -> None:
         nonlocal is_shown, run_id, last_epoch
+        # Passed over from the start, or since MLflow has failed.
         if not is_shown:
             return
         # The history counts seconds from the start of the training, MLflow from 1970.
@@ -56,6 +57,7 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
                 if row["epoch"] <= last_epoch or not run_id:
                     # A training that starts anew, or goes on from its checkpoint, has a new run.
                     experiment = experiment_of(client, LIVE, uri, database)
+                    # A run of an earlier attempt would stay beside the new one.
                     delete_live(client, source)
                     tags = {"source": source, "preset": os.environ["PRESET"]}
                     run_id = client.create_run(experiment, start_ms, tags, source).info.run_id

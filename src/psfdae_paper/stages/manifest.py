@@ -24,6 +24,7 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
     # Lines as `sha256sum` prints them, in the order of the names.
     lines = []
     for path in sorted(results.glob("*/**/*")):
+        # Names relative to the run, so that it may be moved.
         place = path.relative_to(results)
         is_hidden = any(part.startswith(".") for part in place.parts)
         if path.is_file() and not is_hidden and place.parts[0] not in other_runs | no_products:

@@ -6,6 +6,8 @@ come the trained network and its errors of states, in units of their range.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -14,10 +16,9 @@ from psfdae.files import read_product, write_csv
 from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
-from psfdae_paper.configuration.aligners import WEIGHTS
-from psfdae_paper.configuration.alignment import STAMP_KEYS
+from psfdae_paper.configuration.aligners import Aligner
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import part
-from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.alignment_tables import Row, error_rows
 from psfdae_paper.stages.alignment_methods import (
     network_groups,
@@ -25,78 +26,64 @@ from psfdae_paper.stages.alignment_methods import (
     noisy_test_states,
     train_network,
 )
-from psfdae_paper.sweeps.measured import TABLES, Measured, Task, geometric_mean
+from psfdae_paper.sweeps.measured import Measured, Training, geometric_mean
 
 
-def files_of(name: str) -> tuple[str, ...]:
-    """Return the names of the files of a point's training."""
-    return (WEIGHTS, CONFIG, HISTORY)
+class StateNetworkTraining(Training):
+    """Training of a network of scene 3, as the stage `alignment train-network` makes it."""
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files of the training."""
+        return (Aligner.weights_file, CONFIG, HISTORY)
 
-def run(config: Config, task: Task, name: str) -> Measured:
-    """Train as the stage of the same network does, and measure.
+    def measure(self) -> Measured:
+        """Train the network, and measure it on the validation states and the uniform test states.
 
-    Parameters
-    ----------
-    config : Config
-        Stage configuration (seed, noise, cnn, perceptron, train_<name>, evaluation).
-    task : Task
-    name : str
-        Name of the network, original or noise_trained.
-
-    Raises
-    ------
-    TrainingError
-        If the training cannot continue.
-    ProductError
-        If the products are of different telescopes or stamps.
-    """
-    # All states must have stamps of one telescope.
-    trained_on = read_product(task.data["states"], "alignment_states", ())
-    for role in ("validation", "test"):
-        product = read_product(task.data[role], "alignment_states", ())
-        require(product.path, product.config, STAMP_KEYS, trained_on.config, trained_on.path)
-    # The training of the main workflow.
-    settings = part(network_groups(name), config)
-    train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
-    limit_threads(config.evaluation.threads)
-    # The test part is the uniform set, with the noise that it has in the main workflow.
-    metrics: dict[str, float] = {}
-    for role, test_set in (("validation", "validation"), ("test", "uniform")):
-        rows = _rows(config, task, role, test_set)
-        # Mean absolute error of all parameters in units of the range, at each noise level.
-        mae = {
-            f"{role}_mae_{level:g}": float(
-                np.mean(
-                    [
-                        row["mean_abs_error"]
-                        for row in rows
-                        if row["unit"] == "range" and row["noise_level"] == level
-                    ]
-                )
+        Raises
+        ------
+        ProductError
+            If the products are of different telescopes or stamps.
+        """
+        config, task, name = self.config, self.task, self.model
+        # All states must have stamps of one telescope.
+        trained_on = read_product(task.data["states"], "alignment_states", ())
+        expected = trained_on.config, trained_on.path
+        for role in ("validation", "test"):
+            product = read_product(task.data[role], "alignment_states", ())
+            require(product.path, product.config, Alignment.stamp_keys, *expected)
+        # The training of the main workflow.
+        settings = part(network_groups(name), config)
+        train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
+        limit_threads(config.evaluation.threads)
+        # The test part is the uniform set, with the noise that it has in the main workflow.
+        metrics: dict[str, float] = {}
+        for role, test_set in (("validation", "validation"), ("test", "uniform")):
+            product = read_product(
+                task.data[role], "alignment_states", ("states", "stamps", "unit")
             )
-            for level in task.levels
-        }
-        metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
-        write_csv(task.folder / TABLES[role], pd.DataFrame(rows))
-    described = read_yaml(task.folder / CONFIG)
-    history = read_table(task.folder / HISTORY)
-    return Measured(
-        metrics=metrics,
-        described={**trained_on.config, **described},
-        seconds=float(history["seconds"].iloc[-1]),
-        cpu_seconds=float("nan"),
-        epochs=int(history["epoch"].iloc[-1]),
-    )
-
-
-def _rows(config: Config, task: Task, role: str, test_set: str) -> list[Row]:
-    """Measure one network at all noise levels; return rows like those of the main workflow."""
-    product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
-    predict = network_predictor(task.folder, product, config)
-    rows: list[Row] = []
-    for level in task.levels:
-        stamps = noisy_test_states(config, product["stamps"], test_set, level)
-        key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
-        rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
-    return rows
+            predict = network_predictor(task.folder, product, config)
+            # Errors at all noise levels, as rows like those of the main workflow.
+            rows: list[Row] = []
+            for level in task.levels:
+                stamps = noisy_test_states(config, product["stamps"], test_set, level)
+                key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
+                rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
+            # Mean absolute error of all parameters in units of the range, at each noise level.
+            mae: dict[str, float] = {}
+            for level in task.levels:
+                at_level = [row for row in rows if row["noise_level"] == level]
+                errors: Any = [row["mean_abs_error"] for row in at_level if row["unit"] == "range"]
+                mae[f"{role}_mae_{level:g}"] = float(np.mean(errors))
+            metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
+            write_csv(task.folder / task.tables[role], pd.DataFrame(rows))
+        # Settings and cost, from the files of the training.
+        described = read_yaml(task.folder / CONFIG)
+        history = read_table(task.folder / HISTORY)
+        return Measured(
+            metrics=metrics,
+            described={**trained_on.config, **described},
+            seconds=float(history["seconds"].iloc[-1]),
+            cpu_seconds=float("nan"),
+            epochs=int(history["epoch"].iloc[-1]),
+        )

@@ -35,15 +35,6 @@ if TYPE_CHECKING:
 
     from psfdae_paper.configuration.schema import Config
 
-ON_REQUEST = "benchmarks_on_request"
-"""Folder with the cost of the targets that are not part of `make reproduce`."""
-
-RECORDED = re.compile(
-    r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
-    r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
-)
-"""Names of the products that belong to the record."""
-
 MAY_STAY = re.compile(
     r"(sweeps|paper|figures/benchmark)/.+"
     r"|tables/(benchmark_\w+|scaling_stages|predict_poppy\w*)\.csv"
@@ -74,6 +65,7 @@ def job_costs(results: Path) -> pd.DataFrame:
     """
     import pandas as pd
 
+    # A table of Snakemake for each job: RULE/WILDCARDS.tsv.
     folder = results / "benchmarks"
     rows = []
     for path in sorted(folder.rglob("*.tsv")):
@@ -146,6 +138,7 @@ def reference(
     for name, path in sources.items():
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
+        # Bytes only: dates of the files are not part of the record.
         shutil.copyfile(path, target)
     described = provenance(results, load()) | {"commit": commit, "kept": retained}
     text = json.dumps(described, indent=2, sort_keys=True)
@@ -170,6 +163,7 @@ def clean_commit() -> str:
         raise ProductError(
             f"the run of record belongs to a commit, and git fails: {error}"
         ) from None
+    # The last word of the status is the name of a file.
     if changed:
         raise ProductError(f"{changed.split()[-1]}: differs from commit {commit:.12}; commit first")
     return commit
@@ -207,7 +201,11 @@ def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
     # A record is of one commit, but for files that take too long to be made for each.
-    recorded = {name: plan for name, plan in plan_by_name.items() if RECORDED.fullmatch(name)}
+    in_record = re.compile(
+        r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
+        r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
+    )
+    recorded = {name: plan for name, plan in plan_by_name.items() if in_record.fullmatch(name)}
     outdated = {name for name, plan in recorded.items() if plan != "no update"}
     refused = sorted(name for name in outdated if not MAY_STAY.fullmatch(name))
     if refused:
@@ -227,10 +225,20 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
     # Jobs of `make reproduce`: the CPU time of all together and the largest memory of one.
     costs = job_costs(results)
     # Jobs of targets beyond `make reproduce`, such as the bounds.
-    on_request = sorted(path for path in (results / ON_REQUEST).glob("*") if path.is_dir())
+    on_request = sorted(
+        path for path in (results / "benchmarks_on_request").glob("*") if path.is_dir()
+    )
     # The last `make test` leaves its time in a report of JUnit's form.
     report = results / "tests.xml"
     tests = ElementTree.parse(report).getroot().find("testsuite") if report.is_file() else None
+    # Time and size of the environment that `make` created, from its files: venv writes pyvenv.cfg
+    # first, and make the other file last.
+    environment, installation = Path(sys.prefix), {}
+    start, end = environment / "pyvenv.cfg", environment / ".complete"
+    if start.is_file() and end.is_file():
+        seconds = end.stat().st_mtime - start.stat().st_mtime
+        installation["install_s"] = round(seconds, 1)
+        installation["environment_mb"] = round(_size_mb(environment), 1)
     # Packages whose versions can change a number.
     packages = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
     return {
@@ -247,7 +255,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         "matrix_product_gflops": round(matrix_product_speed(), 1),
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
         "on_request_s": {path.name: round(_busy_seconds(path), 1) for path in on_request},
-        **_installation(),
+        **installation,
         "results_mb": round(_size_mb(results), 1),
         "tests_s": None if tests is None else round(float(tests.get("time", "nan")), 1),
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
@@ -271,6 +279,7 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
 
     Run times of two machines are expected to be in the inverse ratio of these speeds.
     """
+    # Values do not matter for the speed.
     a = np.ones((size, size), dtype=np.float32)
     # A product takes 2 n³ operations.
     return 2.0 * size**3 / min(timeit.repeat(lambda: a @ a, repeat=repeats, number=1)) / 1e9
@@ -290,17 +299,6 @@ def _busy_seconds(benchmarks: Path) -> float:
         busy_seconds += max(0.0, end - max(start, covered_until))
         covered_until = max(covered_until, end)
     return busy_seconds
-
-
-def _installation() -> dict[str, float]:
-    """Return time and disk space of the environment that `make` created, from its files."""
-    # venv writes pyvenv.cfg first, and make the other file last.
-    environment = Path(sys.prefix)
-    start, end = environment / "pyvenv.cfg", environment / ".complete"
-    if not (start.is_file() and end.is_file()):
-        return {}
-    seconds = end.stat().st_mtime - start.stat().st_mtime
-    return {"install_s": round(seconds, 1), "environment_mb": round(_size_mb(environment), 1)}
 
 
 def _size_mb(folder: Path) -> float:

@@ -71,6 +71,7 @@ def simulate(
         templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
         warnings = stamp_warnings(config, fields, least_energy)
+    # The figure and the table of the same measurements.
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
     names = ["templates.h5", "psfs.png", "fields.csv"]
     if fits:
@@ -80,6 +81,7 @@ def simulate(
         image, catalogue = folder / "image.fits", folder / "stars.csv"
         write_image(config, fields, image_snr, seed, image, catalogue)
         names += ["image.fits", "stars.csv"]
+    # Warnings come last, where they are read.
     for line in warnings:
         print(f"psfdae: {line}", file=sys.stderr)
     telescope = config.telescope
@@ -158,8 +160,10 @@ def stamp_warnings(
         If a stamp contains less than `least_energy`.
     """
     warnings = []
+    # Light of each PSF inside its stamp.
     energy, side = fields.energy, config.framing.stamp_px
     if energy.min() < enough_light:
+        # The field with the least light decides which stamp suffices.
         worst_field = int(energy.argmin())
         x, y = np.rad2deg(fields.field[worst_field])
         # Stamps up to four times as wide are tried.
@@ -194,6 +198,7 @@ def _sufficient_stamp_px(
 
     None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
     """
+    # One propagation on the largest stamp; pixels of smaller ones are the same.
     framing = config.framing.model_copy(update={"stamp_px": max_px})
     source = template_wavefronts(config)
     try:
@@ -282,7 +287,9 @@ def write_image(
     sky = 1000.0  # photons per pixel
     flux = snr * np.sqrt(sky * noise_equivalent_px(stamps.mean(axis=0)))
     # Expected photons: sky, and the stars at the positions of their field points.
+    # 8 px of sky between stamps.
     pitch = stamps.shape[-1] + 8
+    # The detector has a place for each field of the square grid.
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
     expected = np.full((int(rows) * pitch, int(columns) * pitch), sky)
@@ -323,8 +330,10 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
     """
+    # Sizes and numbers of stars as asked for; all else as the recipe says.
     recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulate_field(recipe, seed)
+    # Positions of all stars, in pixels.
     x, y = field.centroid.T
     write_field(
         *(out, catalogue, field.image.astype(np.float32), x, y),

@@ -24,9 +24,6 @@ from psfdae_paper.stars.fields import assign_fields, square_grid
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 from psfdae_paper.stars.scenes import aberration_columns, star_wavefronts, template_wavefronts
 
-PEAK_MEANING = "brightest pixel (row, column) from the chief ray"
-"""Description of the column `peak` in products."""
-
 STARS_AT_A_TIME = 1024
 """Stars that are propagated before they are written; they limit the memory."""
 
@@ -44,18 +41,21 @@ def templates(
     limit_threads(1)  # batches run in parallel
     # PSFs have a margin, from which stamps with any centring error are cut.
     framing = config.framing
+    # Wavefront of each field, and its image around the brightest pixel.
     source = template_wavefronts(config)
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
     side = framing.stamp_px + 2 * framing.jitter_px
     psf, peak = propagation.framed(side)
+    # The stamp without the margin.
     stamp = slice(framing.jitter_px, side - framing.jitter_px)
+    # Field angles of a square grid, centred on the optical axis.
     index, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
     columns = {
         "psf": Column(
             psf.astype(np.float32), "1", "pixel flux as a fraction of the light, jitter margin"
         ),
         "energy": Column(psf[:, stamp, stamp].sum(axis=(1, 2)), "1", "light inside the stamp"),
-        "peak": Column(peak, "pixel", PEAK_MEANING),
+        "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
         "grid": Column(index, "1", "grid index (ix, iy) of the field"),
         "field": Column(np.deg2rad(angle_deg), "rad", "field angle (x, y)"),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
@@ -88,6 +88,7 @@ def stars(
     phase = np.zeros((count, 2))
     if framing.subpixel:
         phase = draw_phase(count, stream(config.seed, "phase", name))
+    # Stars of a set, each on a stamp of d × d pixels.
     shape = (count, framing.stamp_px, framing.stamp_px)
     columns: dict[str, Column | Empty] = {
         "template": Empty(shape, np.float32, "1", "static PSF, sum 1"),
@@ -95,6 +96,7 @@ def stars(
         "grid": Column(static["grid"], "1", "grid index (ix, iy) of every field"),
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
     }
+    # Fraction of the light that is inside the stamp, before it is normalised.
     energy = Empty((count,), np.float64, "1", "light inside the stamp")
     # Without random aberrations, realisations are the templates.
     propagation = None
@@ -107,7 +109,9 @@ def stars(
         columns |= {
             "realisation": Empty(shape, np.float32, "1", "noise-free image, sum 1"),
             "energy": energy,
-            "peak": Empty((count, 2), np.int64, "pixel", PEAK_MEANING),
+            "peak": Empty(
+                (count, 2), np.int64, "pixel", "brightest pixel (row, column) from the chief ray"
+            ),
             **aberration_columns(source),
             "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
         }
@@ -117,6 +121,7 @@ def stars(
         columns |= {"realisation": columns["template"], "energy": energy}
     with stream_product(out, "stars", columns, config.model_dump()) as data:
         for start in range(0, count, STARS_AT_A_TIME):
+            # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.
             framed = static["psf"][star_field[part]].astype(np.float64)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from types import ModuleType
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 import click
@@ -22,21 +22,23 @@ from psfdae.method import FitError
 from psfdae.options import File, Folder
 from psfdae.reading import read_json
 from psfdae.settings import parse_settings
-from psfdae_paper.configuration.aligners import SWEPT
+from psfdae_paper.configuration.aligners import swept_networks
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value
-from psfdae_paper.sweeps.measured import TABLES, Measured, Task
+from psfdae_paper.sweeps.measured import Measured, Task, Training
 from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, with_values
 
-ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
-"""Module of the adaptive search; it is imported only if it is used, because it needs Optuna."""
 
+def training_class(model: str) -> str:
+    """Return module and name of the class that trains and measures a model, as MODULE:NAME.
 
-def module_of(model: str) -> str:
-    """Return the name of the module that trains and measures a model."""
-    return f"psfdae_paper.stages.{'network' if model in SWEPT else 'method'}_point"
+    It is imported by this name: the code of a point does not include that of the other kind.
+    """
+    if model in swept_networks():
+        return "psfdae_paper.stages.network_point:StateNetworkTraining"
+    return "psfdae_paper.stages.method_point:MethodTraining"
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,18 @@ def sweep_point(
     """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
+    # A misspelt folder, or overrides other than those of the plan.
     if out.name not in plan.points:
         raise SweepError(f"{out}: sweep {name} has no point {out.name}")
     entry = plan.points[out.name]
     # Networks of scene 3 choose between epochs on states of their own; methods split their stars.
-    roles = {"states", "validation", "test"} if sweep.model in SWEPT else {"stars"}
+    roles = {"states", "validation", "test"} if sweep.model in swept_networks() else {"stars"}
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {sweep.model} needs {', '.join(sorted(roles))}")
+    # Networks of scene 3 have no dataset; tables have their name in its place.
     dataset = sweep.dataset or sweep.model
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
+    # An adaptive sweep proposes values for a trial when it runs.
     trial = None
     if entry.slot is not None:
         trial = Trial(
@@ -146,16 +151,18 @@ def point(
         earlier_results = [
             read_json(task.folder.parent / name / "result.json") for name in trial.earlier_points
         ]
-        adaptive = import_module(ADAPTIVE_MODULE)
+        # Optuna is needed for this alone; `sweep_source` of the workflow names the module, too.
+        adaptive = import_module("psfdae_paper.sweeps.adaptive")
         values = adaptive.ask(space, trial.search, trial.slot, earlier_results)
         trial_keys = changes(space, values)
         tree = with_values(config.model_dump(), trial_keys)
         config, keys = parse_settings(type(config), tree), {**keys, **trial_keys}
     # No file of an earlier training may stay beside the new ones.
-    module = import_module(module_of(model))
-    for name in (*module.files_of(model), *TABLES.values(), "cost.json", "result.json"):
+    training: Training = resolve_name(training_class(model))(config, task, model)
+    for name in (*training.files, *task.tables.values(), "cost.json", "result.json"):
         (task.folder / name).unlink(missing_ok=True)
-    outcome = _train(module, config, task, model)
+    outcome = _train(training)
+    # Metrics and settings only: what a point cost is in a file of its own.
     result = {
         "point": task.folder.name,
         "slot": trial.slot if trial else None,
@@ -170,38 +177,37 @@ def point(
     write_text(task.folder / "result.json", json.dumps(result, indent=1) + "\n")
 
 
-def _train(module: ModuleType, config: Config, task: Task, model: str) -> dict[str, object]:
-    """Train and measure a point with the module of its model, and write what it cost.
+def _train(training: Training) -> dict[str, object]:
+    """Train and measure a point, and write what it cost.
 
     Returns
     -------
     dict
         status, reason, epochs, attempt, metrics and config.
     """
+    task = training.task
+    # The duration of a training that fails is its cost, too.
     started, started_cpu = time.monotonic(), time.process_time()
-    outcome: dict[str, object]
+    status, reason = "finished", ""
     try:
-        measured: Measured = module.run(config, task, model)
+        measured = training.measure()
+        status = "stopped" if measured.stopped else "finished"
     except FitError as error:
         # A training that cannot go on is a result: the point has no metrics.
-        reason = str(error).splitlines()[0]
+        status, reason = "failed", str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
         task.checkpoint.unlink(missing_ok=True)
-        cost = (time.monotonic() - started, time.process_time() - started_cpu)
-        outcome = {"status": "failed", "reason": reason, "epochs": None, "attempt": None}
-        outcome |= {"metrics": {}, "config": config.model_dump()}
-    else:
-        cost = (measured.seconds, measured.cpu_seconds)
-        outcome = {
-            "status": "stopped" if measured.stopped else "finished",
-            "reason": "",
-            "epochs": measured.epochs,
-            "attempt": measured.attempt,
-            "metrics": measured.metrics,
-            "config": measured.described,
-        }
-    # The cost differs from run to run and has a file of its own.
-    seconds, cpu_seconds = (round(duration, 3) for duration in cost)
-    cost_text = json.dumps({"seconds": seconds, "cpu_seconds": cpu_seconds})
-    write_text(task.folder / "cost.json", cost_text + "\n")
-    return outcome
+        seconds, cpu_seconds = time.monotonic() - started, time.process_time() - started_cpu
+        config = training.config.model_dump()
+        measured = Measured({}, config, seconds, cpu_seconds, attempt=None)
+    # The cost differs from run to run and has a file of its own; times are to a millisecond.
+    cost = {key: round(getattr(measured, key), 3) for key in ("seconds", "cpu_seconds")}
+    write_text(task.folder / "cost.json", json.dumps(cost) + "\n")
+    return {
+        "status": status,
+        "reason": reason,
+        "epochs": measured.epochs,
+        "attempt": measured.attempt,
+        "metrics": measured.metrics,
+        "config": measured.described,
+    }

@@ -7,7 +7,7 @@ training cost, and two figures. Errors on the test part choose nothing.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,9 +24,6 @@ from psfdae_paper.evaluation import sweep_figures
 from psfdae_paper.sweeps.measured import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
 
-BEST_POINT = "best.yaml"
-"""File with the overrides of the best point of a sweep."""
-
 
 @command("sweep summary")
 def sweep_summary(
@@ -40,6 +37,7 @@ def sweep_summary(
     All points must be finished; one that failed has a row with the reason.
     """
     plan = plan_sweep(name, overrides)
+    # Points in the order of the plan, whatever the order in which they ended.
     files = [points / point / "result.json" for point in plan.points]
     summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
 
@@ -90,7 +88,14 @@ def summary(
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
     # Metrics are the same in every run of a point; what it cost is in a table of its own.
-    rows = [_row(result, definition["space"], result is best_result) for result in results]
+    rows = []
+    for result in results:
+        values = {name: result["values"][name] for name in definition["space"]}
+        # A value of an axis may be a list, which is one cell of the table as JSON.
+        values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
+        outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
+        outcome["best"] = "yes" if result is best_result else "no"
+        rows.append({"point": result["point"], **values, **outcome, **result["metrics"]})
     write_csv(out / "summary.csv", pd.DataFrame(rows))
     costs = [
         {"point": result["point"], **read_cost(path.parent)}
@@ -100,7 +105,22 @@ def summary(
     described = {"sweep": name, "given": list(overrides), **definition}
     # Unsorted: the order of the axes is that of the figures.
     write_text(out / "sweep.yaml", yaml.safe_dump(described, sort_keys=False))
-    write_text(out / BEST_POINT, _best_yaml(name, definition, overrides, best_result))
+    # The best point as overrides, those of the workflow before those of the point. The preset has a
+    # key of its own, because `make reproduce` takes it separately.
+    preset = "preset="
+    point_overrides = [word.removeprefix("++") for word in as_overrides(best_result["keys"])]
+    best_point = {
+        "sweep": name,
+        "point": best_result["point"],
+        "preset": next((w.removeprefix(preset) for w in overrides if w.startswith(preset)), ""),
+        "overrides": [*(w for w in overrides if not w.startswith(preset)), *point_overrides],
+        "dataset": definition.get("dataset") or definition["model"],
+        "split": best_result["split"],
+        "reference": best_result["reference"],
+        "metric": definition["metric"],
+        "metrics": {key: float(f"{v:.8g}") for key, v in best_result["metrics"].items()},
+    }
+    write_text(out / "best.yaml", as_yaml(best_point))
 
 
 def choose(
@@ -110,6 +130,7 @@ def choose(
 
     None if all points failed.
     """
+    # `min` returns the first of equals.
     sign = 1.0 if direction == "minimize" else -1.0
     with_metric = [result for result in results if metric in result["metrics"]]
     return min(with_metric, key=lambda result: sign * result["metrics"][metric], default=None)
@@ -130,43 +151,14 @@ def best_overrides(results: Path, name: str) -> list[str]:
     ProductError
         If the sweep has not been run.
     """
-    path = results / "sweeps" / name / BEST_POINT
+    path = results / "sweeps" / name / "best.yaml"
     if not path.is_file():
         raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
+    # A list of words for the command line.
     overrides = read_yaml(path).get("overrides")
     if not isinstance(overrides, list):
         raise ProductError(f"{path}: damaged (no overrides); delete it and run again")
     return [str(override) for override in overrides]
-
-
-def _row(result: Mapping[str, Any], axes: Iterable[str], is_best: bool) -> dict[str, object]:
-    """Return the row of a point in the summary; lists are JSON."""
-    values = {name: result["values"][name] for name in axes}
-    values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
-    outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
-    outcome["best"] = "yes" if is_best else "no"
-    return {"point": result["point"], **values, **outcome, **result["metrics"]}
-
-
-def _best_yaml(
-    name: str, definition: Mapping[str, Any], overrides: Sequence[str], result: Mapping[str, Any]
-) -> str:
-    """Return the best point as overrides, those of the workflow before those of the point."""
-    # The preset has a key of its own, because `make reproduce` takes it separately.
-    preset = "preset="
-    point_overrides = [word.removeprefix("++") for word in as_overrides(result["keys"])]
-    tree = {
-        "sweep": name,
-        "point": result["point"],
-        "preset": next((w.removeprefix(preset) for w in overrides if w.startswith(preset)), ""),
-        "overrides": [*(w for w in overrides if not w.startswith(preset)), *point_overrides],
-        "dataset": definition.get("dataset") or definition["model"],
-        "split": result["split"],
-        "reference": result["reference"],
-        "metric": definition["metric"],
-        "metrics": {key: float(f"{value:.8g}") for key, value in result["metrics"].items()},
-    }
-    return as_yaml(tree)
 
 
 @command("sweep figure")
@@ -181,6 +173,7 @@ def sweep_figure(
     # Axes as text: they may be numbers or names of options.
     table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))
     points = sweep_figures.SweepPoints(table_of_points, described)
+    # Both figures take the same points.
     draw = {
         "parallel": sweep_figures.parallel_coordinates,
         "response": sweep_figures.response_curves,

@@ -27,7 +27,6 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.registry import choose_best, forget, link, log_model, registered_name
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
-    MODEL,
     TrackedRun,
     epoch_metrics,
     runs_of_alignment,
@@ -46,9 +45,6 @@ SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 
 LIVE = "live"
 """Experiment of trainings that are under way; the import of the finished run deletes them."""
-
-PARENT = "mlflow.parentRunId"
-"""Tag by which MLflow shows a run as a part of another."""
 
 
 class TrackingError(Error, RuntimeError):
@@ -76,6 +72,7 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
+    # Methods, networks of scene 3 and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
@@ -102,6 +99,7 @@ def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt
         If the database cannot be used.
     """
     uri = server()
+    # Tags that tell with which program the runs were imported.
     import_tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
     # MLflow's id of each run, and what was done with it.
     outcomes: list[tuple[str, str]] = []
@@ -179,7 +177,8 @@ def _import(
             experiments[run.experiment] = experiment_of(client, run.experiment, uri, database)
         tags = {**import_tags, **tags_of(run)}
         if run.parent:
-            tags[PARENT] = imported[run.parent]
+            # MLflow shows a run with this tag as a part of another.
+            tags["mlflow.parentRunId"] = imported[run.parent]
         outcome = import_run(client, experiments[run.experiment], run, tags)
         imported[run.source] = outcome[0]
         yield outcome
@@ -217,6 +216,7 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
     # A server decides itself where artifacts go.
     is_served = uri.startswith(("http", "databricks"))
     location = None if is_served else (database.parent.resolve() / "mlartifacts" / name).as_uri()
+    # An experiment that was deleted keeps its name: it is restored.
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         return str(client.create_experiment(name, artifact_location=location))
@@ -268,7 +268,7 @@ def import_run(
     # A run that is there with the same files is left alone but for tags that others decide.
     if unchanged:
         run_id, action = str(unchanged[0].info.run_id), "unchanged"
-        for key in ("superseded", PARENT):
+        for key in ("superseded", "mlflow.parentRunId"):
             # A parent that has new files is another run.
             if key in tags and unchanged[0].data.tags.get(key) != tags[key]:
                 client.set_tag(run_id, key, tags[key])
@@ -318,7 +318,8 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
     # Files that are not part of the model: tables, figures and settings.
     with tempfile.TemporaryDirectory() as folder:
-        link({k: path for k, path in run.files.items() if not k.startswith(MODEL)}, Path(folder))
+        side_files = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
+        link(side_files, Path(folder))
         client.log_artifacts(run_id, folder)
     client.log_text(run_id, as_yaml(run.config), CONFIG)
     client.set_terminated(run_id, run.status, run.end_ms)
@@ -329,6 +330,7 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
 
 def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
     """Log metrics as far as they are finite; MLflow takes 1000 at once."""
+    # A training that diverged has infinite errors, which no database takes.
     finite = [metric for metric in metrics if math.isfinite(metric.value)]
     for i in range(0, len(finite), 1000):
         client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
@@ -339,15 +341,18 @@ def tags_of(run: TrackedRun) -> dict[str, str]:
 
     A run with other settings that takes the place of this one sets `superseded` to "true".
     """
+    # The preset is a tag of the whole import.
     slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
     return {**slot, **run.tags, "config_hash": run.config_hash, "superseded": "false"}
 
 
 def ours_to_explain(error: Exception) -> bool:
     """Return True if an error comes from the database, the server or the disk, not from a bug."""
+    # MLflow raises its own errors, those of its database and those of files.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
+    # Any other error is a mistake of this program, and is not hidden.
     return isinstance(error, MlflowException | SQLAlchemyError | OSError)
 
 

@@ -74,9 +74,20 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     angle = rng.uniform(0.0, 2.0 * np.pi, size=recipe.blended)
     separation = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     source_position = np.concatenate([position, position[kind == "blended"] + separation])
-    # Light of all stars in electrons; companions have a third of the flux.
     psf = star_images(recipe, source_position)
-    flux = _fluxes(recipe, kind, rng)
+    # Noise of the flux of a faint star on the axis: σ √A, A the noise-equivalent area.
+    axis_psf = star_images(recipe, np.full((1, 2), recipe.side_px / 2.0))[0]
+    flux_noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_equivalent_px(axis_psf))
+    # Signal to noise uniform in its logarithm between two limits.
+    draw = rng.uniform(size=kind.size)
+    is_faint = (kind == "faint")[:, None]
+    lowest_snr, highest_snr = np.where(is_faint, recipe.faint_snr, recipe.bright_snr).T
+    unsaturated_flux = flux_noise * lowest_snr * (highest_snr / lowest_snr) ** draw
+    # Saturated stars: two to four times the flux that fills the brightest pixel.
+    saturating_flux = recipe.saturation * recipe.gain / axis_psf.max()
+    saturated_flux = saturating_flux * (2.0 + 2.0 * draw)
+    flux = np.where(kind == "saturated", saturated_flux, unsaturated_flux)
+    # Light of all stars in electrons; companions have a third of the flux.
     starlight = np.zeros((recipe.side_px,) * 2)
     source_flux = np.concatenate([flux, flux[kind == "blended"] / 3.0])
     add_stamps(starlight, source_flux[:, None, None] * psf, *source_position.T)
@@ -129,9 +140,9 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
         sharp = propagate(source.opd(part, pupil, propagate.real_dtype))
         # Seeing and sub-pixel position are factors of the Fourier transform: a shift by (x, y)
         # multiplies it by exp(−2πi f_y y) exp(−2πi f_x x).
-        moved = shift[part] * oversampling
-        rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * moved[:, 1, None])
-        columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * moved[:, 0, None])
+        subpixels = shift[part] * oversampling
+        rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * subpixels[:, 1, None])
+        columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * subpixels[:, 0, None])
         phase = rows[:, :, None] * columns[:, None, :]
         blurred = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
         # Sum of the sub-pixels of each pixel, without ripples below 0, of flux 1.
@@ -139,23 +150,6 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
         pixels = np.clip(binned.sum(axis=(2, 4)), 0.0, None)
         stamps[part] = pixels / pixels.sum(axis=(1, 2), keepdims=True)
     return stamps
-
-
-def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw the flux of every star in electrons, shape (n,)."""
-    # Noise of the flux of a faint star on the axis: σ √A, A the noise-equivalent area.
-    axis_psf = star_images(recipe, np.full((1, 2), recipe.side_px / 2.0))[0]
-    flux_noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_equivalent_px(axis_psf))
-    # Signal to noise uniform in its logarithm between two limits.
-    draw = rng.uniform(size=kind.size)
-    is_faint = (kind == "faint")[:, None]
-    lowest_snr, highest_snr = np.where(is_faint, recipe.faint_snr, recipe.bright_snr).T
-    unsaturated_flux = flux_noise * lowest_snr * (highest_snr / lowest_snr) ** draw
-    # Saturated stars: two to four times the flux that fills the brightest pixel.
-    saturating_flux = recipe.saturation * recipe.gain / axis_psf.max()
-    saturated_flux = saturating_flux * (2.0 + 2.0 * draw)
-    flux: np.ndarray = np.where(kind == "saturated", saturated_flux, unsaturated_flux)
-    return flux
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
@@ -174,7 +168,10 @@ def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarr
 
 def write_cube(path: Path, stamps: np.ndarray, **cards: str | float) -> None:
     """Write an array, such as stamps, as a FITS image, float64 as float32, with header cards."""
-    _write_image(path, stamps, cards)
+    from astropy.io import fits
+
+    stamps = stamps.astype(np.float32) if stamps.dtype == np.float64 else stamps
+    write_fits(path, fits.HDUList([fits.PrimaryHDU(stamps, fits.Header(list(cards.items())))]))
 
 
 def write_field(
@@ -201,18 +198,11 @@ def write_field(
     wcs.wcs.crval = (150.0, 2.0)
     wcs.wcs.crpix = [(image.shape[1] + 1) / 2, (image.shape[0] + 1) / 2]
     wcs.wcs.cdelt = [-pixel_scale_arcsec / 3600.0, pixel_scale_arcsec / 3600.0]
-    _write_image(path, image, {**wcs.to_header(), **cards})
+    # A card of the caller replaces one of the coordinates.
+    write_cube(path, image, **{**wcs.to_header(), **cards})
     ra, dec = wcs.all_pix2world(x, y, 0)
     rows = {"id": np.arange(len(x)), "X_IMAGE": x + 1, "Y_IMAGE": y + 1, "ra": ra, "dec": dec}
     rows |= columns or {}
     with atomic_path(catalogue) as temporary:
         formats = {"X_IMAGE": "%.4f", "Y_IMAGE": "%.4f", "ra": "%.8f", "dec": "%.8f"}
         Table(rows).write(temporary, format="ascii.csv", formats=formats, overwrite=True)
-
-
-def _write_image(path: Path, pixels: np.ndarray, cards: Mapping[str, object]) -> None:
-    """Write pixels as the primary image of a FITS file, float64 as float32."""
-    from astropy.io import fits
-
-    pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels
-    write_fits(path, fits.HDUList([fits.PrimaryHDU(pixels, fits.Header(list(cards.items())))]))

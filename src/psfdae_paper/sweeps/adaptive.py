@@ -17,7 +17,6 @@ from psfdae_paper.sweeps.points import tidy
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
-    from optuna.trial import FrozenTrial
 
 
 def ask(
@@ -48,7 +47,9 @@ def ask(
         Value by axis. It does not depend on the order of the results.
     """
     import optuna
+    from optuna.trial import TrialState, create_trial
 
+    # A seed of its own for each trial: proposals do not repeat.
     seed = int(stream(search["seed"], "sweep", "trial", slot).integers(2**31))
     # Without this, Optuna writes a message for each trial.
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -60,7 +61,16 @@ def ask(
     )
     # Earlier trials in the order of their numbers, so that the study is always the same.
     for result in sorted(earlier_results, key=lambda result: result["slot"]):
-        study.add_trial(_trial(space, result, search))
+        # A trial that was stopped early has metrics like one that was trained to its end.
+        has_metrics = result["status"] in ("finished", "stopped")
+        values = result["values"]
+        trial = create_trial(
+            state=TrialState.COMPLETE if has_metrics else TrialState.FAIL,
+            value=float(result["metrics"][search["metric"]]) if has_metrics else None,
+            params={name: _stored_value(axis, values[name]) for name, axis in space.items()},
+            distributions=_distributions(space),
+        )
+        study.add_trial(trial)
     # Options come back as JSON, numbers of a range are rounded like random draws.
     parameters = study.ask(_distributions(space)).params
     return {
@@ -69,29 +79,9 @@ def ask(
     }
 
 
-def _trial(
-    space: Mapping[str, Axis], result: Mapping[str, Any], search: Mapping[str, Any]
-) -> FrozenTrial:
-    """Return an earlier trial as Optuna stores it; a failed one has no value."""
-    from optuna.trial import TrialState, create_trial
-
-    # A trial that was stopped early has metrics like one that was trained to its end.
-    has_metrics = result["status"] in ("finished", "stopped")
-    return create_trial(
-        state=TrialState.COMPLETE if has_metrics else TrialState.FAIL,
-        value=float(result["metrics"][search["metric"]]) if has_metrics else None,
-        params={name: _stored_value(axis, result["values"][name]) for name, axis in space.items()},
-        distributions=_distributions(space),
-    )
-
-
 def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
     """Return Optuna's distributions of the axes: categories, whole numbers, or a range."""
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     # Steps and logarithms of a range are those of the axis.
     distributions: dict[str, BaseDistribution] = {}
@@ -100,6 +90,7 @@ def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
             options = [_stored_value(axis, option) for option in axis.options]
             distributions[name] = CategoricalDistribution(options)
         elif axis.integer:
+            # Both ends belong to the range, as in `draws`.
             low, high = map(int, axis.ends)
             distributions[name] = IntDistribution(low, high, log=axis.log)
         else:

@@ -6,10 +6,11 @@ come, in the point's folder, its tables of errors and what it cost. `result.json
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -23,9 +24,6 @@ from psfdae.rng import stream
 from psfdae.settings import Reference, SplitKind
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import MeasuredStars
-
-TABLES = {"validation": "validation.csv", "test": "evaluation.csv"}
-"""Tables of a point's errors by part of the data; that of the test is the main workflow's."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,11 @@ class Task:
         Folder for all files of the point; its name is the point's.
     checkpoint : Path
         File from which an interrupted training resumes.
+    tables : dict of str
+        Names of the tables of errors by part of the data; that of the test is the main workflow's.
     """
+
+    tables: ClassVar = {"validation": "validation.csv", "test": "evaluation.csv"}
 
     dataset: str
     split: SplitKind
@@ -71,8 +73,8 @@ class Measured:
         Passes over the training data; None for methods without epochs.
     stopped : bool
         The training ended by early stopping.
-    attempt : int
-        New starts after a dead network.
+    attempt : int or None
+        New starts after a dead network; None for a training that failed.
     """
 
     metrics: dict[str, float]
@@ -81,7 +83,40 @@ class Measured:
     cpu_seconds: float
     epochs: int | None = None
     stopped: bool = False
-    attempt: int = 0
+    attempt: int | None = 0
+
+
+@dataclass(frozen=True)
+class Training(ABC):
+    """Training and measurement of one point; each kind of model has a class of its own.
+
+    Attributes
+    ----------
+    config : Config
+        Groups that a point of the model reads.
+    task : Task
+    model : str
+        Name of the method, or of the network of scene 3.
+    """
+
+    config: Config
+    task: Task
+    model: str
+
+    @property
+    @abstractmethod
+    def files(self) -> tuple[str, ...]:
+        """Names of the files of the trained model, in the folder of the point."""
+
+    @abstractmethod
+    def measure(self) -> Measured:
+        """Train as the main workflow does, and measure on validation and test data.
+
+        Raises
+        ------
+        FitError
+            If the training cannot continue.
+        """
 
 
 def geometric_mean(values: Sequence[float]) -> float:
@@ -97,6 +132,7 @@ def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
     # Name of the metric, and its mean over noise levels.
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
+        # One row of the table for each level and metric.
         by_level = {row["noise_level"]: row["value"] for row in rows if row["metric"] == metric}
         metrics[f"{part}_{metric}"] = mean(list(by_level.values()))
         metrics |= {f"{part}_{metric}_{level:g}": value for level, value in by_level.items()}
@@ -132,6 +168,7 @@ def measure_images(
     dict
         See `Measured.metrics`.
     """
+    # Stars and their split, as in the main workflow.
     product = read_stars(task.data["stars"], task.reference)
     parts = split_stars(product, task.split, config)
 
@@ -160,7 +197,8 @@ def measure_images(
             row = {**key, "method": method, "noise_level": level}
             rows += stars.errors(row, estimate, config.evaluation.data_range)[0]
         metrics |= image_metrics(part, rows)
-        write_csv(task.folder / TABLES[part], pd.DataFrame(rows))
+        # Written after all levels: a table is whole or absent.
+        write_csv(task.folder / task.tables[part], pd.DataFrame(rows))
     return metrics
 
 
@@ -168,6 +206,7 @@ def read_cost(folder: Path) -> dict[str, float]:
     """Read seconds and CPU seconds of a point's training; raises ProductError."""
     path = folder / "cost.json"
     tree = read_json(path)
+    # NaN where the training did not record it.
     return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration.alignment import STATE_GROUPS
+from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
@@ -55,23 +55,20 @@ def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, V
     Each axis has a stream of its own for each draw: more trials extend the list, and
     the order of axes does not matter.
     """
-    return [
-        {name: _draw(axis, stream(seed, "sweep", name, i)) for name, axis in space.items()}
-        for i in range(trials)
-    ]
-
-
-def _draw(axis: Axis, rng: np.random.Generator) -> Value:
-    """Draw a random value of an axis."""
-    if axis.options:
-        return axis.options[int(rng.integers(len(axis.options)))]
-    # Half a step beyond the ends makes all whole numbers equally likely.
-    margin = 0.5 if axis.integer else 0.0
-    low, high = axis.ends
-    ends = np.array([low - margin, high + margin])
-    # A logarithmic range is uniform in ln(value).
-    value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
-    return tidy(axis, float(value))
+    points: list[dict[str, Value]] = [{} for _ in range(trials)]
+    for i, values in enumerate(points):
+        for name, axis in space.items():
+            rng = stream(seed, "sweep", name, i)
+            if axis.options:
+                values[name] = axis.options[int(rng.integers(len(axis.options)))]
+                continue
+            # Half a step beyond the ends makes all whole numbers equally likely.
+            margin = 0.5 if axis.integer else 0.0
+            ends = np.array([axis.ends[0] - margin, axis.ends[1] + margin])
+            # A logarithmic range is uniform in ln(value).
+            value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
+            values[name] = tidy(axis, float(value))
+    return points
 
 
 def tidy(axis: Axis, value: float) -> int | float:
@@ -87,8 +84,10 @@ def tidy(axis: Axis, value: float) -> int | float:
 
 def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the configuration keys and their values at a point of the space."""
+    # An axis may stand for several keys.
     keys: dict[str, Value] = {}
     for name, axis in space.items():
+        # Later axes cannot change the same key (`Sweep.check_keys`).
         keys |= axis.changes(name, values[name])
     return keys
 
@@ -163,13 +162,18 @@ class Plan:
         """Points by name in the order of the sweep; equal ones are one point."""
         # Values of adaptive trials are proposed when they run: only their limits can be checked.
         if self.sweep.kind == "adaptive":
-            self._check_ends()
+            for name, axis in self.sweep.space.items():
+                ends = [] if axis.options else [int(e) if axis.integer else e for e in axis.ends]
+                for value in axis.options or ends:
+                    keys = {**self.sweep.overrides, **axis.changes(name, value)}
+                    self._point_config(keys, {name: value})
             points = [self._point({}, slot) for slot in range(self.sweep.trials or 0)]
         elif self.sweep.kind == "random":
             value_sets = draws(self.sweep.space, self.sweep.trials or 0, self.sweep.seed)
             points = [self._point(values) for values in value_sets]
         else:
             points = [self._point(values) for values in grid(self.sweep.space)]
+        # A later point of the same name is the same training.
         return {point.name: point for point in points}
 
     @property
@@ -180,6 +184,7 @@ class Plan:
     @property
     def search(self) -> dict[str, Any]:
         """Settings that decide the values which an adaptive sweep proposes."""
+        # All that Optuna gets, or that its results depend on.
         keys = ("space", "seed", "metric", "direction", "startup", "parallel", "overrides")
         return self.sweep.model_dump(include=set(keys), exclude_none=True)
 
@@ -204,7 +209,7 @@ class Plan:
             "split": self.sweep.split,
             "reference": self.sweep.reference,
             "levels": self.levels,
-            "data": self._data,
+            "data": self.data_config,
             "config": decisive_settings(config),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
@@ -226,18 +231,11 @@ class Plan:
         return stage_tree(self.sweep.reads, config)
 
     @cached_property
-    def _data(self) -> dict[str, Any]:
+    def data_config(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
+        # Axes do not change the images: all points are measured on the same.
         config = validate_tree(self.tree).model_dump()
-        return stage_tree(SIMULATION if self.sweep.dataset else STATE_GROUPS, config)
-
-    def _check_ends(self) -> None:
-        """Refuse a space with an option or an end of a range that the configuration refuses."""
-        for name, axis in self.sweep.space.items():
-            ends = [] if axis.options else [int(e) if axis.integer else e for e in axis.ends]
-            for value in axis.options or ends:
-                keys = {**self.sweep.overrides, **axis.changes(name, value)}
-                self._point_config(keys, {name: value})
+        return stage_tree(SIMULATION if self.sweep.dataset else Alignment.state_groups, config)
 
 
 def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
@@ -255,6 +253,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     ConfigError, SweepError
         If a file is wrong; the message names file and key.
     """
+    # What is varied, from the file of the sweep.
     sweep = load_sweep(name)
     # The configuration of the sweep's dataset, with those overrides that concern it.
     tree = compose((*sweep.choice, *overrides_for(overrides, sweep.choice)))
@@ -263,5 +262,6 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
 
 def hash_of(tree: object) -> str:
     """Return the SHA-256 of a tree as JSON with sorted keys and without spaces."""
+    # One text for one tree, whatever the order of its keys.
     canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
