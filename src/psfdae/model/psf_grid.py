@@ -97,7 +97,7 @@ class PsfGrid:
         # Stamps with at least one pixel within the PSF; all others stay 0.
         stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
         node, share = self._nodes(centre)
-        weights, slopes = cubic_splines(first - knot)
+        weights, slopes = knot_weights(first - knot)
         span = self.oversampling * (side_px - 1) + 1
         taps = [slice(t, t + span, self.oversampling) for t in range(4)]
         # Batches, for memory: a pixel needs some 20 coefficients.
@@ -160,7 +160,7 @@ class PsfGrid:
         return number.reshape(4, -1).T, share.reshape(4, -1).T
 
 
-def cubic_splines(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def knot_weights(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights (…, 4) of the cubic B-splines around a position, and their slopes.
 
     `phase` (…) is the fraction t of the way from a knot to the next one. The four B-splines that
