@@ -191,8 +191,8 @@ def test_command_leaves_a_model_and_a_report(training):
     assert info.pixel_scale_arcsec == pytest.approx(1.2)
     assert info.snr_min == pytest.approx(5, rel=1e-3)
     errors = dict(re.findall(r"(.+): MSE (\S+) on validation stars", training.output))
-    label = method(info.method).look.label
-    assert len(errors) == 2 and float(errors[label]) == min(map(float, errors.values()))
+    title = method(info.method).look.title
+    assert len(errors) == 2 and float(errors[title]) == min(map(float, errors.values()))
 
 
 def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):

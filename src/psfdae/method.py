@@ -181,6 +181,8 @@ class Look:
         Shown among restored stars.
     restores : bool
         False for the noisy image itself, which is drawn on its own scale.
+    title : str
+        Name in messages and reports on stars of an image, in full words; by default the label.
     """
 
     label: str
@@ -189,6 +191,7 @@ class Look:
     paper: tuple[str, str] | None = None
     drawn: bool = True
     restores: bool = True
+    title: str = ""
 
 
 @dataclass(frozen=True)
@@ -307,7 +310,8 @@ class Method:
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
         if "look" in vars(cls):
-            cls.look = replace(cls.look, label=f"{cls.look.label}{cls.needs}")
+            label, title = cls.look.label, cls.look.title or cls.look.label
+            cls.look = replace(cls.look, label=f"{label}{cls.needs}", title=title)
 
     @classmethod
     def settings(cls, config: Config) -> dict[str, Group]:

@@ -37,7 +37,7 @@ def description(bundle: Bundle) -> str:
         kernels, widths = (" ".join(map(str, v)) for v in (info.dae.kernels, info.dae.widths))
         method_facts = {"Network": f"kernels {kernels}; widths {widths}; {number_count} weights"}
     else:
-        method_facts = {"Method": f"{method(info.method).look.label}; {number_count} numbers"}
+        method_facts = {"Method": f"{method(info.method).look.title}; {number_count} numbers"}
         method_facts |= estimator(bundle).facts()
     star_kind = {"simulated": "simulated stars", "stars": "stars of an image"}[info.source]
     # All facts by their names, in the order in which they are printed.

@@ -361,12 +361,12 @@ def write_model(
         best_name, errors = choose_method(stars, {m.name: fitted[m.name] for m in tried_methods})
         model_method = method(best_name)
         for name, error in errors.items():
-            print(f"{method(name).look.label}: MSE {error:.3g} on validation stars")
+            print(f"{method(name).look.title}: MSE {error:.3g} on validation stars")
     # The fit with all that predictions need: photometry, and errors from stars held out.
-    print(f"packing {model_method.look.label}")
+    print(f"measuring the errors of the {model_method.look.title} on stars held out")
     model = pack_model(stars, fitted[model_method.name], files.name, licence)
     for fact in fitted[model_method.name].facts().values():
-        print(f"{model_method.look.label}: {fact}")
+        print(f"{model_method.look.title}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
     # The bundle gets its name when the stack is left, after all others: a bundle that exists
@@ -400,7 +400,7 @@ def fit_methods(
     """Fit methods to the training stars, write each fit to its file, and return them by name."""
     fitted: dict[str, Method] = {}
     for method_class in methods:
-        print(f"fitting {method_class.look.label}")
+        print(f"fitting the {method_class.look.title}")
         place = files.fit(method_class)
         # A network keeps its state here while it trains, for the case that it is killed.
         checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")

@@ -49,7 +49,7 @@ class Dae(Method):
         Course of the training.
     """
 
-    look = Look("DAE", "#0072b2", "D", paper=("dae", "DAE"))
+    look = Look("DAE", "#0072b2", "D", paper=("dae", "DAE"), title="denoising autoencoder")
     needs = Needs(validation=True, memory_mb=1800, minutes=60)
     storage = Storage(
         files=(WEIGHTS, CONFIG),

@@ -53,7 +53,7 @@ class FieldMixture(FieldLaw, Method):
     uncertainty: FieldUncertainty = field(default_factory=FieldUncertainty)
     measures_flux: bool = False
 
-    look = Look("field", "#117733", "D")
+    look = Look("field", "#117733", "D", title="field model")
     needs = Needs(level=True, position=True)
     storage = Storage(
         arrays={

@@ -63,7 +63,7 @@ class GaussianMixture(MixtureLaw, Method):
 
     outlier_coordinates: int = 40
 
-    look = Look("GMM", "#cc79a7", "P")
+    look = Look("GMM", "#cc79a7", "P", title="Gaussian mixture")
     needs = Needs(level=True, memory_mb=1200)
     storage = Storage(
         arrays={

@@ -271,7 +271,7 @@ def best_on_validation(
     last = [f"K = {k}"] * (len(sizes) > 1 and 1 < k == max(sizes))
     last += [f"ν = {nu:g}"] * (len(shrinkages) > 1 and nu in (min(shrinkages), max(shrinkages)))
     print(
-        f"{method_class.look.label}: K = {k} clusters, ν = {nu:g}"
+        f"{method_class.look.title}: K = {k} clusters, ν = {nu:g}"
         + (", without positions" if given_position > used else "")
         + (f"; {', '.join(last)}: last that were tried" if last else ""),
         flush=True,

@@ -55,7 +55,8 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     model.field_range()  # refuses a model without positions
     info, field = model.info, model.method
     if not isinstance(field, FieldMixture):
-        raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
+        title = field.look.title
+        raise PredictionError(f"the model {model.name!r}: a {title}, expected a field model")
     # How much an exposure may change is judged from the field of the training.
     if info.adapted:
         raise PredictionError(

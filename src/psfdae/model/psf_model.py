@@ -277,7 +277,7 @@ class PsfModel(WholeImages, FieldPsfs):
         field = self.method
         if not field.knows_field:
             raise PredictionError(
-                f"the model {self.name!r}: {field.look.label}: knows the PSF of a star alone, "
+                f"the model {self.name!r}: {field.look.title}: knows the PSF of a star alone, "
                 "not that of a place; psfdae from-stars --method field makes one that does"
             )
         return field

@@ -106,12 +106,11 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     # The S/N nearest to 10 stands for faint stars, for which models differ most.
     mean, linear = (mse_ratios(errors, method, name) for name in (MEAN_PSF, "lmmse"))
     snr = nearest_snr(mean)
-    mean_label = method_labels(errors)[MEAN_PSF]
-    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of {mean_label}"
+    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of one mean PSF"
     if linear and method != "lmmse":
         sentence += f", {linear[snr]:.2f} times that of linear MMSE"
     levels = ", ".join(f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1)
-    verdict = f"no better than the mean PSF at S/N {levels}" if levels else "better at each"
+    verdict = f"no better than the mean PSF at S/N {levels}" if levels else "better at each S/N"
     return f"{sentence}; {verdict} ({errors['stars'][0]} stars held out)"
 
 
@@ -143,8 +142,7 @@ def method_labels(errors: Table) -> dict[str, str]:
         Label for legends by name of the method; one mean PSF has the name `MEAN_PSF`.
     """
     names = dict.fromkeys(errors["method"])
-    mean_label = "one mean PSF, its centre fitted"
-    return {n: mean_label if n == MEAN_PSF else method_of(n).look.label for n in names}
+    return {n: "one mean PSF" if n == MEAN_PSF else method_of(n).look.title for n in names}
 
 
 def check_held_out(
