@@ -66,6 +66,12 @@ def test_the_lines_of_the_pages_run(training, tmp_path, monkeypatch):
     with few_draws():
         exec(compile(body, "README.md", "exec"), {})
     assert psfdae.load_model("image.psf.safetensors").info.method == "field"
+    # The calls for a whole image, with this model.
+    (whole_image,) = [b for b in blocks(read("docs/python.md"), "python") if "predict_image" in b]
+    names = {}
+    exec(compile(whole_image, "docs/python.md", "exec"), names)
+    assert len(names["prediction"]) == len(names["detected"]) <= len(names["fluxes"])
+    assert names["tonight"].info.adapted
     assert "<img" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
