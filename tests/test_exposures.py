@@ -264,4 +264,5 @@ def test_wings_of_several_images_are_one_profile():
     assert Wings.joined([one, vague]).profile == pytest.approx(one.profile, rel=1e-3)
     wider = Wings(radius, 2 * one.profile, 4e-12 * eye, 0.04)
     light = np.array([0.03])
-    assert Wings.joined([one, wider]).total(light)[0] == pytest.approx(one.total(light)[0])
+    joined = Wings.joined([one, wider]).total_over_flux(light)[0]
+    assert joined == pytest.approx(one.total_over_flux(light)[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,6 +16,7 @@ from docs_pages import blocks, read
 from image_training import FIELD, MIXTURE, SIZES, few_draws
 from psfdae.methods import method
 from psfdae.model.calibration import COVERAGE
+from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import DATASET_CHOICE, from_words, of_config, settings_model
 from psfdae_paper.configuration.compose import load_stage
 
@@ -90,6 +92,22 @@ def test_errors_of_held_out_stars_are_as_large_as_said(training):
         assert (off > -doubt - 0.04).all(), name
         # Errors of centres are too large at S/N 50 where 38 stars are learnt from: 84 % are within.
         assert (off < doubt + (0.16 if name == "centre" else 0.04)).all(), name
+
+
+def test_a_model_of_another_image_is_told_the_noise_of_these_stars(training, stars, monkeypatch):
+    """Its noise level λ has another κ, and its typical star another size."""
+    info = training.model.info
+    changed = {"kappa": 2 * info.kappa, "noise_equivalent_px": 1.5 * info.noise_equivalent_px}
+    bundle = training.model.bundle
+    model = PsfModel(replace(bundle, info=info.model_copy(update=changed)))
+    report = psfdae.validate(model, stars)
+    assert sorted(report.restored_by_snr) == sorted(set(report.table["snr"]))
+    # The figure is of the S/N nearest to 10; the noise in units of κ is what the model is told.
+    told, kind = [], type(model.method)
+    monkeypatch.setattr(kind, "restore", lambda self, noisy, *given: told.append(given[0]) or noisy)
+    report.strip()
+    shown = min(report.table, key=lambda row: abs(np.log(row["snr"] / 10.0)))
+    assert told == [pytest.approx(shown["noise"] / model.info.kappa)]
 
 
 @pytest.mark.parametrize(

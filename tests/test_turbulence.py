@@ -14,7 +14,7 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.fields import square_grid
 from psfdae_paper.stars.scenes import template_wavefronts
 from psfdae_paper.stars.turbulence import (
-    SPECTRUM,
+    SPECTRUM_FACTOR,
     Footprints,
     draw_waves,
     fitted_planes,
@@ -76,7 +76,7 @@ def disc(axis):
 
 def test_limits_of_the_structure_function():
     """Kolmogorov's law far below the outer scale, twice the variance far above it."""
-    constants = np.array([2 * HALF_FRIED, SPECTRUM])
+    constants = np.array([2 * HALF_FRIED, SPECTRUM_FACTOR])
     assert constants == pytest.approx([6.88, 0.0229], rel=2e-3)
     separation = np.array([0.005, 1.0])
     ratio = structure_function(separation, R0, L0) / (6.88 * (separation / R0) ** (5 / 3))
@@ -84,14 +84,14 @@ def test_limits_of_the_structure_function():
     # The approach to Kolmogorov's law is slow: 1 − 1.485 (r/L0)^(1/3).
     slow = 1 - 1.485 * (0.2 / 1e6) ** (1 / 3)
     assert structure_function(0.2, R0, 1e6) == pytest.approx(6.88 * slow, rel=1e-3)
-    variance = 2 * np.pi * SPECTRUM * 0.6 * (L0 / R0) ** (5 / 3)
+    variance = 2 * np.pi * SPECTRUM_FACTOR * 0.6 * (L0 / R0) ** (5 / 3)
     ends = structure_function(np.array([0.0, 20 * L0]), R0, L0)
     assert ends == pytest.approx([0, 2 * variance], rel=1e-6)
 
 
 def test_structure_function_is_the_transform_of_the_spectrum():
     f = np.geomspace(1e-5, 1e4, 400_001)
-    spectrum = SPECTRUM * R0 ** (-5 / 3) * (f**2 + 1 / L0**2) ** (-11 / 6)
+    spectrum = SPECTRUM_FACTOR * R0 ** (-5 / 3) * (f**2 + 1 / L0**2) ** (-11 / 6)
     for r in (0.03, 1.0):
         integrand = 4 * np.pi * f**2 * spectrum * (1 - jv(0, 2 * np.pi * f * r))
         expected = np.trapezoid(integrand, np.log(f))

@@ -28,9 +28,7 @@ class _Described(BaseModel):
 class Architecture(_Described):
     """Shape of the network: kernel sizes of its layers, and channels between them."""
 
-    kernels: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=31)], ...], Field(min_length=2, max_length=100)
-    ]
+    kernels: Annotated[tuple[Kernel, ...], Field(min_length=2, max_length=100)]
     widths: Annotated[tuple[Width, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -56,9 +54,9 @@ class BundleInfo(_Described):
     """Description of a bundle: what its model was trained on, and how well it restores stars.
 
     Noise is the RMS of the sky noise in a pixel divided by the flux of the star
-    inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
-    that of a filter matched to the star, 1 / (noise · √A), with the noise-equivalent
-    area A (King 1983, PASP 95, 163) of the typical star of the training.
+    inside its stamp, κλ in the words of the simulation. The S/N, for flux 1, is that
+    of a filter matched to the star, 1 / (noise · √A), with the noise-equivalent area
+    A (King 1983, PASP 95, 163) of the typical star of the training.
     """
 
     psfdae_version: str
@@ -67,38 +65,53 @@ class BundleInfo(_Described):
     created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
     stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)]
     pixel_scale_arcsec: Positive
-    pixel_lambda_d: Positive | None = Field(description="None where the optics are unknown")
+    pixel_lambda_d: Positive | None = Field(
+        description="side of a pixel over wavelength / aperture diameter; "
+        "None where the optics are unknown"
+    )
     image_scale: Positive | None = Field(
-        None, description="factor from normalised stamps to the network's"
+        None,
+        description="factor by which stamps of flux 1 are multiplied before they enter the network",
     )
     jitter_px: Annotated[int, Field(ge=0)] = Field(
         description="the brightest pixel is within this of (d/2, d/2), row and column from 0"
     )
-    subpixel: bool = Field(description="stars lay anywhere in their pixels")
+    subpixel: bool = Field(
+        description="centres of the training stars lay anywhere in their pixels, "
+        "not only in the middle"
+    )
     kappa: Positive = Field(description="noise at the noise level λ = 1 of the training")
-    noise_min: Positive
-    noise_max: Positive
-    snr_min: Positive
-    snr_max: Positive
+    noise_min: Positive = Field(description="least noise of the training")
+    noise_max: Positive = Field(description="greatest noise of the training")
+    snr_min: Positive = Field(description="S/N of the typical star at the greatest noise")
+    snr_max: Positive = Field(description="S/N of the typical star at the least noise")
     noise_equivalent_px: Positive = Field(description="A = 1 / ΣPSF² of the typical star")
     components: Annotated[int, Field(ge=1, le=1024)] = Field(
-        description="leading eigenvectors: stored, and in the distance"
+        description="number of leading eigenvectors of the training stars that are stored, "
+        "and in which the distance of a star from them is measured"
     )
     training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     training_stars: Count
     source: Literal["simulated", "stars"]
-    dae: Architecture | None = None
+    dae: Architecture | None = Field(
+        None, description="shape of the denoising autoencoder; None for other methods"
+    )
     method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
     reference: Literal["realisation", "template"] = Field(description="what is restored")
     misfit: Annotated[float, Field(ge=0)] = Field(
-        0.0, description="what the method takes for noise besides where it finds the flux"
+        0.0,
+        description="noise that stands for the method's error of the PSF: added in quadrature to "
+        "that of a star while its flux is found, but not while it is restored",
     )
-    config: dict[str, Any] = Field(description="resolved configuration of all stages; wings")
+    config: dict[str, Any] = Field(
+        description="resolved configuration of all stages, and the wings as Wings.plain gives them"
+    )
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
 
     @model_validator(mode="after")
     def _is_network_or_not(self) -> BundleInfo:
         """Refuse a network without its shape and scale, and another method with one of them."""
+        # Both are there for a network, and neither for another method.
         is_network = self.method == "dae"
         if {self.dae is not None, self.image_scale is not None} != {is_network}:
             raise ValueError("a network, and no other method, has dae and image_scale")
@@ -106,7 +119,10 @@ class BundleInfo(_Described):
 
     @property
     def adapted(self) -> str | None:
-        """Exposure to which the model was adapted after its training, and number of stars used."""
+        """Text: the exposure to which the model was adapted, and by how many stars.
+
+        None if it was not.
+        """
         try:
             stars = self.config["stars"]
             return f"{stars['image']}, by {int(stars['adapted']['stars'])} of its stars"

@@ -2,7 +2,7 @@
 
 A path and perhaps an extension go in. `find_image` returns an `ImageFile`, which describes one
 image without its pixels; `open_pixels` reads these. Files that are compressed as a whole (.gz,
-.bz2, .xz, .zip) are unpacked to a temporary file first; astropy reads images of tiles (.fz).
+.bz2, .xz, .zip) are unpacked to a temporary file first; astropy reads tile-compressed images (.fz).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ BLOCK_BYTES = 2880
 """Bytes of a block, of which FITS files consist."""
 
 SCIENCE = ("SCI", "IMAGE")
-"""Names of the image of the sky; where one extension of a file has such a name, it is meant."""
+"""Usual names of the science image; if exactly one image has such a name, it is taken."""
 
 Card = tuple[str, str | float | None, str]
-"""Key, value and comment of a header."""
+"""Key, value and comment of a header card."""
 
 
 # Files.
@@ -94,7 +94,7 @@ class PlainFile:
 
 
 def plain_file(path: Path) -> PlainFile:
-    """Return a FITS file that astropy can read at random, unpacked if need be.
+    """Return a FITS file that allows random access, unpacked if need be.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def plain_file(path: Path) -> PlainFile:
     Raises
     ------
     ObservationError
-        If there is no such file, or it is none of FITS.
+        If there is no such file, or it is not a FITS file.
     """
     with reading(path), path.open("rb") as file:
         # The first bytes tell how the file is compressed, if it is.
@@ -134,7 +134,7 @@ def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
     plain, process = PlainFile(name, Path(copy.name), is_copy=True), os.getpid()
 
     def remove(path: Path) -> None:
-        # A process that was forked from this one has the object, but not the file.
+        # A forked process has this object too, but must not delete the file.
         if os.getpid() == process:
             path.unlink(missing_ok=True)
 
@@ -143,13 +143,16 @@ def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
 
 
 def open_hdus(file: PlainFile, as_stored: bool = False, **options: Any) -> HDUList:
-    """Open a file with astropy, inside `reading`.
+    """Open a file with astropy.
+
+    Call it inside `reading`, which turns errors into `ObservationError`.
 
     Parameters
     ----------
     file : PlainFile
     as_stored : bool
-        Leave pixels as they are stored, for `ImageFile.physical`: neither scaled nor blank.
+        Leave pixels as they are stored, for `ImageFile.physical`: neither scaled nor with blank
+        pixels as NaN.
     **options
         Those of `astropy.io.fits.open`.
     """
@@ -173,13 +176,13 @@ class ImageFile:
     index : int
         Number of the extension.
     shape : tuple of int
-        Without the leading axes of length 1.
+        (h, w) or (n, h, w), without the `leading` axes of length 1 before these.
     leading : int
         Number of these axes.
     bscale, bzero, blank : float, float, int or None
         Values are bscale·stored + bzero, and NaN where `blank` is stored.
     headers : tuple of Header
-        Its own and the primary one.
+        Its own, then the primary one if it is another; none for an array.
     wcs : WCS or None
         Celestial WCS.
     values : ndarray or None
@@ -199,7 +202,7 @@ class ImageFile:
 
     @property
     def path(self) -> Path:
-        """The file's own name, for messages."""
+        """What messages call the file (`file.name`); not the path that is opened."""
         return self.file.name
 
     @property
@@ -223,12 +226,12 @@ class ImageFile:
     def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return physical values of stored ones, in native byte order, same shape.
 
-        They are of double precision where all are below 1e-15.
+        If all are below 1e-15, but not all 0, they are float64 instead of float32.
 
         Parameters
         ----------
         stored : ndarray
-            Pixels as the file has them: neither scaled nor blank.
+            Pixels as the file has them: neither scaled nor with blank pixels as NaN.
         dtype : dtype
             Type of the values.
         """
@@ -247,7 +250,7 @@ class ImageFile:
         return values
 
     def one_plane(self) -> ImageFile:
-        """The only plane of an image with NAXIS3 = 1."""
+        """Return the image without its first axis, which has length 1 (NAXIS3 = 1)."""
         return replace(self, shape=self.shape[1:], leading=self.leading + 1)
 
     def provenance(self) -> list[Card]:
@@ -281,10 +284,16 @@ def card_value(header: Header, key: str) -> Any:
 def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
     """Return an array (h, w), or a cube of stamps (n, s, s), as an image without a header.
 
+    Parameters
+    ----------
+    values : ndarray
+    name : str
+        What messages call it.
+
     Raises
     ------
     ObservationError
-        If the array does not hold numbers, or has not two or three axes.
+        If the array does not hold numbers, has not two or three axes, or is empty.
     """
     # A plane, or stamps along the first axis, of any type of numbers.
     values, path = np.asarray(values), Path(name)
@@ -313,7 +322,9 @@ def find_image(
     Raises
     ------
     ObservationError
-        If the file cannot be read or is truncated, or if no image, or several, may be meant.
+        If the file cannot be read or is truncated, or if no image, or several, may be meant; or if
+        its axes are not two or three, or its tiles are compressed in a way that is not safe to
+        read.
     """
     from astropy.io import fits
 
@@ -327,8 +338,8 @@ def find_image(
         index, header = hdus.index(hdu), hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
         shape = tuple(int(n) for n in hdu.shape)
-        # Pixels are in the file as shape and type say; tiles are a table, to which astropy has no
-        # public way.
+        # The size in the file follows from shape and type; a tile-compressed image is stored as a
+        # table, for which astropy has no public attribute.
         stored = hdu._bintable if isinstance(hdu, fits.CompImageHDU) else hdu
         # The decoders of two codings (astropy 8.0) take lengths and sizes from the tiles: a wrong
         # byte makes them write outside of their memory.
@@ -342,7 +353,7 @@ def find_image(
         bscale, bzero, blank = (card_value(header, key) for key in ("BSCALE", "BZERO", "BLANK"))
         bscale, bzero = float(1.0 if bscale is None else bscale), float(bzero or 0.0)
         wcs = celestial_wcs(header, hdus)
-    # Axes of one element in front of those of an image or a cube are no axes.
+    # Leading axes of length 1 are dropped while more than three remain.
     leading = 0
     while len(shape) > 3 and shape[0] == 1:
         shape, leading = shape[1:], leading + 1
@@ -355,8 +366,8 @@ def find_image(
 def science_images(path: Path) -> dict[str, int]:
     """Return the numbers of all images of a file but masks, errors and the like, by their names.
 
-    A name, which files get, is the extension's own; or its number where it has none, or one that
-    another extension has, too, or that looks like the number of another.
+    The name is meant for file names: the extension's own, or its number where it has none, or one
+    that another extension has, too, that looks like a number, or that has other characters.
 
     Parameters
     ----------
@@ -372,7 +383,7 @@ def science_images(path: Path) -> dict[str, int]:
     images = {k: name for k, name in images.items() if is_science(name)}
     if not images:
         raise ObservationError(path, "no image")
-    # Names of letters and digits, but no number, that no other image has.
+    # Names that are unique, of letters, digits, _, + and - only, and not just a number.
     names = list(images.values())
     suits_files = re.compile("(?![0-9]+$)[A-Za-z0-9_+-]+")
     return {
@@ -389,7 +400,7 @@ def map_kind_by_name(name: str) -> str | None:
     names_by_kind = {
         "mask": "DQ|MASK|BPM|FLAGS?",
         "error": "(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?",
-        "variance": "(VAR|VARIANCE)(_.*)?",  # VAR_POISSON, a part of it
+        "variance": "(VAR|VARIANCE)(_.*)?",  # also VAR_POISSON, a part of the variance
         "weight": "IVAR|WEIGHT|WHT|WGT",
     }
     name = name.strip().upper()
@@ -397,7 +408,7 @@ def map_kind_by_name(name: str) -> str | None:
 
 
 def is_science(name: str) -> bool:
-    """Return False for an extension that goes with an image, such as DQ, by its name."""
+    """Return True unless the name is that of a map which goes with an image, such as DQ."""
     # Sky, context and exposure maps, samples up the ramp, and distortions of the WCS.
     other_names = (
         "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR"
@@ -463,14 +474,16 @@ def has_pixels(hdu: Any) -> bool:
     from astropy.io import fits
 
     is_image = isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
-    # An array without axes has a product of 1.
+    # Without axes, or with an axis of length 0, there are no pixels.
     return (
         is_image and not isinstance(hdu, fits.GroupsHDU) and bool(hdu.shape) and 0 not in hdu.shape
     )
 
 
 def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
-    """Return the celestial WCS of an image; None without a stated scale, or if it is damaged.
+    """Return the celestial WCS of an image; None without a stated scale or celestial axes.
+
+    None as well if the WCS is damaged.
 
     Parameters
     ----------
@@ -481,7 +494,7 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     """
     from astropy.wcs import WCS
 
-    # Without a scale, the pixels would be degrees.
+    # Without a scale, astropy would take a pixel for 1 degree.
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
         return None
     try:
@@ -514,6 +527,7 @@ class Pixels:
     def __getitem__(self, key: Any) -> np.ndarray:
         key = key if isinstance(key, tuple) else (key,)
         with reading(self.image.path):
+            # Index 0 along each leading axis.
             stored = np.asarray(self.stored[(0,) * self.image.leading + key])
             return self.image.physical(stored, self.dtype)
 
@@ -528,8 +542,8 @@ def open_pixels(
     ----------
     image : ImageFile
     in_pieces : bool
-        For slices `[start:stop]` along the first axis, of which only what is asked for is read.
-        Otherwise for access at random: a file is mapped into memory, tiles are unpacked there.
+        True: each slice `[start:stop]` of the first axis is read when asked for. False: for random
+        access, the file is mapped into memory, or its tiles unpacked there.
     dtype : dtype
         Type of the values.
 

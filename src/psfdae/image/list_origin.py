@@ -1,4 +1,4 @@
-"""Origin of a list's pixels, 0 or 1, by the stars themselves.
+"""Whether a star list counts pixels from 0 or from 1, found from the stars of the image.
 
 In: an image without its sky and the positions of a list. Out: the origin, if the stars say it.
 """
@@ -12,23 +12,25 @@ from psfdae.image.stamps import central_pixel, cut_image
 from psfdae.moments import robust_scatter, windowed_centres
 
 TOLERANCE_PX = 0.1
-"""Greatest difference of a median offset from that of an origin, per axis."""
+"""Largest difference, per axis, of the median offset from 0 (origin 0) or −1 (origin 1); standard
+errors must be below half of it."""
 
 
 def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.ndarray, int] | None:
     """Return whether positions count from 0 or 1, where the stars of an image say it clearly.
 
-    The centroids of the brighter stars lie at the positions of the list, less its origin; both
-    axes must agree within 0.1 px, and so must their standard errors.
+    The centroids of the brighter stars lie at the positions of the list, less its origin. Both
+    axes must agree within 0.1 px, with standard errors below 0.05 px. None if too few stars can be
+    used, or neither origin fits.
 
     Parameters
     ----------
     sky : Sky
-        The image without its sky.
+        Image less its sky (`flat`), noise per pixel (`noise`) and bad pixels (`bad`).
     listed : ndarray, shape (n, 2)
-        Positions x, y as the list has them.
+        Positions x, y in px as the list has them, from 0 or from 1.
     fewest : int
-        Number of stars that are needed.
+        Smallest number of usable stars.
 
     Returns
     -------
@@ -36,18 +38,20 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     offset : ndarray, shape (2,)
         Median of centroid − listed position, x and y in px.
     count : int
-        Stars that say it.
+        Number of stars in the median.
     """
-    # Stamps of 13 × 13 px, halfway between both origins, so that neither is nearer to the start.
+    # Stamps of 13 × 13 px about the position for an origin of 0.5: the centroids start midway,
+    # which favours neither origin. Stars whose stamp crosses the image's edge are left out.
     shape = sky.flat.shape
     x, y = (listed - 0.5).T
-    is_cut = cut_image(sky.bad, shape, x, y, 13, 0)[2]
-    listed = listed[~is_cut]
+    crosses_edge = cut_image(sky.bad, shape, x, y, stamp_px=13, margin=0)[2]
+    listed = listed[~crosses_edge]
     if len(listed) < fewest:
         return None
     x, y = (listed - 0.5).T
     stamps, noise, bad = (
-        cut_image(layer, shape, x, y, 13, 0)[0] for layer in (sky.flat, sky.noise, sky.bad)
+        cut_image(layer, shape, x, y, stamp_px=13, margin=0)[0]
+        for layer in (sky.flat, sky.noise, sky.bad)
     )
     # Stars whose inner 5 × 5 pixels are good and stand 20 σ above the sky, the brightest 500.
     core = np.s_[:, 4:9, 4:9]
@@ -56,10 +60,11 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     star = star[np.argsort(-snr[star])][:500]
     if len(star) < fewest:
         return None
-    # Centroids less positions, of stars that did not run to the end of their reach.
-    # A Gaussian window of σ = 1.5 px, within 2 px of the middle.
-    window_px = np.full(len(star), 1.5)
-    centre = windowed_centres(stamps[star], np.zeros((len(star), 2)), window_px, 10, 2.0)[:, ::-1]
+    # Centroids (from y, x to x, y) less positions. Gaussian window of σ = 1.5 px, from the middle,
+    # 10 iterations, at most 2 px away along each axis; stars that end at that limit found no
+    # centre.
+    start, window_px = np.zeros((len(star), 2)), np.full(len(star), 1.5)
+    centre = windowed_centres(stamps[star], start, window_px, rounds=10, reach_px=2.0)[:, ::-1]
     offset = central_pixel(listed[star] - 0.5) + centre - listed[star]
     offset = offset[(np.abs(centre) < 1.9).all(axis=1)]
     if len(offset) < fewest:

@@ -124,8 +124,9 @@ def star_posterior(law: FieldLaw, stars: FieldStamps) -> StarPosterior:
     # Step 1: the matched filter.
     flux, is_nearby, root_area = matched_fluxes(law, stars)
     # Stars of an S/N below 10 are looked at in every second node along both axes if more than
-    # four of these are probable: over twice a step of an eighth of the FWHM, what is not linear
-    # is 1 % of a star's peak, and the noise is 20 % of it. Such a node counts for four.
+    # four of these are probable; such a node counts for four. Between nodes two steps (at most a
+    # quarter of the FWHM) apart, a star departs from linear by 1 % of its peak; its noise is 20 %
+    # of the peak or more.
     is_coarse = is_nearby & (np.rint(law.places / law.step_px) % 2 == 0).all(axis=1)
     is_faint = (flux < 10.0 * stars.noise * root_area) & (is_coarse.sum(axis=1) > 4)
     is_nearby = np.where(is_faint[:, None], is_coarse, is_nearby)
@@ -140,6 +141,7 @@ def star_posterior(law: FieldLaw, stars: FieldStamps) -> StarPosterior:
     # The noise over the flux, s, depends on the flux: two rounds of fits with a guessed flux.
     for _ in range(2):
         # Step 3: the fit in each node.
+        # unit: the guess of F, by which the stamps are divided (eq. 6).
         unit = np.where(stars.flux_known(), stars.flux, np.maximum(flux, least_flux))
         stars = stars._replace(unit=unit)
         fit = fit_pairs(law, stars, pairs)
@@ -152,7 +154,8 @@ def star_posterior(law: FieldLaw, stars: FieldStamps) -> StarPosterior:
         # Nodes of a weight of 0 are not fitted again.
         used = weight > 0
         pairs, weight, fit = pairs.select(used), weight[used], fit.select(used)
-    # Density of the stamp in its own unit: (2π)^(−P/2) F^(−P) times that of x/F (eq. 12).
+    # From the density of x/F to that of x: times F^(−P); and (2π)^(−P/2), which log_likelihood
+    # leaves out (eq. 12).
     evidence -= stars.images.shape[1] * np.log(np.sqrt(2 * np.pi) * unit)
     # Step 5: the moments of the mixture (eq. 13 to 17). Flux and sky were in units of the guess.
     posterior = mixed_posterior(law, stars, pairs, weight, fit)
@@ -186,7 +189,7 @@ def matched_fluxes(law: FieldLaw, stars: FieldStamps) -> tuple[np.ndarray, np.nd
     is_known = np.isfinite(stars.flux)[:, None]
     flux = np.where(is_known, stars.flux[:, None], np.maximum(product / square, 0.0))
     gain = flux * product - 0.5 * flux**2 * square
-    # Score of a node: its likelihood ratio times its prior.
+    # Score of a node: ln of its likelihood ratio, plus ln of its prior.
     variance = stars.noise[:, None] ** 2
     score = gain / variance + stars.log_prior
     rows, best = np.arange(len(flux)), score.argmax(axis=1)
@@ -209,8 +212,8 @@ def photon_covariance(
     """Return what photons add to the covariance (n, 4, 4) of flux, sky, row and column.
 
     In the likelihood, a star's photons are spread evenly over its stamp; they are where its
-    light is. The errors of an estimate W x, W = (J G⁻¹ Jᵀ)⁻¹ J G⁻¹, have W (V − s) Wᵀ more if
-    the variance of the noise is V (eq. 17).
+    light is. The covariance of an estimate W x, W = (J G⁻¹ Jᵀ)⁻¹ J G⁻¹, grows by W (V − s) Wᵀ
+    if the variance of the noise is V, not s (eq. 17).
     """
     count, pixels = stars.images.shape
     covariance = np.zeros((count, 4, 4))
@@ -221,7 +224,8 @@ def photon_covariance(
     is_best &= (stars.unit_per_electron > 0)[pairs.star]
     if not is_best.any():
         return covariance
-    # Quantities that are known have a prior that no data move.
+    # For known quantities, J G⁻¹ Jᵀ has their prior precision added, so that no data move them
+    # (eq. 17).
     flux_precision = stars.flux_precision()
     flux_precision = np.where(flux_precision > FLUX_SIGMA**-2.0, flux_precision, 0.0)
     nuisance_precision = np.where(stars.prior_sigma() > 0, 0.0, 1e30)
@@ -238,7 +242,7 @@ def photon_covariance(
         weighted = inverse[..., -1:] * change + along @ axes.basis[3:]
         information = weighted @ change.transpose(0, 2, 1) + prior[star, :, None] * np.eye(4)
         influence = np.linalg.solve(information, weighted)
-        # V − s of a star of flux F in units of F²: g (m − mean of m) / F.
+        # V − s in units of F² (eq. 17): (m − mean of m)/(g F); unit_per_electron is 1/g, unit is F.
         excess = (mean - mean.mean(axis=1, keepdims=True)) / stars.unit[star, None]
         excess *= stars.unit_per_electron[star, None]
         covariance[star] = (influence * excess[:, None]) @ influence.transpose(0, 2, 1)
@@ -258,7 +262,8 @@ def mixed_posterior(
     nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
     psf, square, flux, mahalanobis2 = _mixed_pixels(law, stars, pairs, weight, fit)
     # Flux, sky and centre of each pair, and the moments of these over the nodes. Where the sky is
-    # free, a star has the flux a: what is flat in the rest is sky.
+    # free, the star gets the constant (a − Σstar)/P in each pixel, so that its flux is a; the sky
+    # loses it.
     sky_free = ~stars.sky_known[star]
     sky = nuisance[:, 0] - np.where(sky_free, fit.factor - flux, 0.0) / pixels
     flux = np.where(sky_free, fit.factor, flux)
@@ -271,7 +276,7 @@ def mixed_posterior(
         for values in (measured, moments, flux, mahalanobis2)
     )
     # A faint star's flux differs between nodes, and so does what it would be divided by: the
-    # mixture is divided by its sum in the end. The error of its flux is in its pixels.
+    # mixture is divided by its sum in the end. psf_sigma therefore includes the error of the flux.
     psf_sigma = np.sqrt(np.maximum(square - psf**2, 0.0)) / np.abs(total[:, None])
     return StarPosterior(
         log_evidence=np.zeros(count),
@@ -295,9 +300,9 @@ def _mixed_pixels(
     Returns
     -------
     first, second : ndarray, shape (n, P)
-        Weighted sums of the pixels over the nodes, and of their second moments (eq. 15).
+        Sums over the nodes, weighted, of star_k and of Var_k + star_k² (eq. 15).
     flux : ndarray, shape (N,)
-        Sum of the pixels of each pair.
+        Sum of the pixels of each pair, before the constant for a free sky; N: number of pairs.
     mahalanobis2 : ndarray, shape (N,)
         Squared Mahalanobis distance along the leading axes (eq. 16).
     """
@@ -317,46 +322,49 @@ def _mixed_pixels(
     nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
     flux, mahalanobis2 = np.empty((2, len(star)))
     gradient, precision = np.empty((len(star), 3)), fit.precision
-    # If every flux is known, nothing has to be differentiated with respect to a.
-    derivatives_needed = 2 - (stars.flux > 0).all()
+    # 2: the star and its change with a; 1 if every flux is known: the star alone.
+    row_sets = 2 - (stars.flux > 0).all()
     for k, part in pairs.by_node():
-        axes, rows = law.node_axes(k, stars.position_known), star[part]
-        beyond, along = axes.noise_fractions(s[rows])
-        w, sky_share = weight[part, None], sky_free[part, None] / pixels
+        axes, stars_here = law.node_axes(k, stars.position_known), star[part]
+        # s G⁻¹ beyond the axes, and how much it differs along each.
+        beyond, along_less_beyond = axes.noise_fractions(s[stars_here])
+        # 1/P where the sky is free, else 0: the part of a difference in flux that each pixel gets.
+        w, flat_share = weight[part, None], sky_free[part, None] / pixels
         image, mean = pairs.along[part].transpose(1, 0, 2)
         # Residual r = x − a m − Lᵀ t along the axes, and its score along the leading ones.
-        residual = image / stars.unit[rows, None] - factor[part] * mean
+        residual = image / stars.unit[stars_here, None] - factor[part] * mean
         residual = residual - nuisance[part] @ axes.derivatives
         mahalanobis2[part], gradient[part], leading = axes.leading_terms(
-            residual, s[rows], sigma[part], law.limits.outlier_axes
+            residual, s[stars_here], sigma[part], law.limits.outlier_axes
         )
+        # From here on Λ − Λ₁₂ (eq. 16); overwrites fit.precision, which is not used again.
         precision[part] -= leading
         # The star without noise and sky, x − t_sky − s G⁻¹ r (eq. 13), and its change with a.
         # Both are sums over the rows of the basis: derivatives, then axes.
-        derivative_rows = np.stack([nuisance[part], nuisance_slope[part]])[:derivatives_needed]
-        residual_slope = along * (mean + nuisance_slope[part] @ axes.derivatives)
-        axis_rows = [-along * residual, residual_slope][:derivatives_needed]
+        derivative_rows = np.stack([nuisance[part], nuisance_slope[part]])[:row_sets]
+        residual_slope = along_less_beyond * (mean + nuisance_slope[part] @ axes.derivatives)
+        axis_rows = [-along_less_beyond * residual, residual_slope][:row_sets]
         combined = np.concatenate([beyond * derivative_rows, axis_rows], axis=2)
         combined[..., 0] -= derivative_rows[..., 0]
         restored, *slopes = combined @ axes.basis
-        mean = beyond * stars.psfs(law, k, rows)
-        restored += (1.0 - beyond) * images[rows] + factor[part] * mean
+        mean_beyond = beyond * stars.psfs(law, k, stars_here)
+        restored += (1.0 - beyond) * images[stars_here] + factor[part] * mean_beyond
         flux[part] = restored.sum(axis=1)
-        # Where the sky is free, a star has the flux a: what is flat in the rest is sky.
-        restored += sky_share * (factor[part] - flux[part, None])
+        # (a − Σstar)/P is added to each pixel; mixed_posterior takes it from the sky.
+        restored += flat_share * (factor[part] - flux[part, None])
         # Variance of its pixels (eq. 14): inside the node, and by the variance of a.
-        used, index = np.unique(noise_class[rows], return_inverse=True)
+        used, index = np.unique(noise_class[stars_here], return_inverse=True)
         second_moment = axes.pixel_variance(class_variance[used], class_sigma[used])[index]
         second_moment += restored**2
         for slope in slopes:
-            change = slope + mean
-            change += sky_share * (1.0 - change.sum(axis=1, keepdims=True))
+            change = slope + mean_beyond
+            change += flat_share * (1.0 - change.sum(axis=1, keepdims=True))
             second_moment += fit.variance[part, None] * change**2
         # Moments of the mixture (eq. 15).
-        first[rows] += w * restored
-        second[rows] += w * second_moment
-    # Squared Mahalanobis distance along the leading axes, with what the other axes leave open
-    # of the nuisance parameters (eq. 16).
+        first[stars_here] += w * restored
+        second[stars_here] += w * second_moment
+    # D² = rᵀG⁻¹r + γᵀ(Λ − Λ₁₂)⁻¹γ (eq. 16): (Λ − Λ₁₂)⁻¹ is the covariance of t/σ that the axes
+    # beyond the leading ones leave.
     mahalanobis2 += (gradient * np.linalg.solve(precision, gradient[..., None])[..., 0]).sum(axis=1)
     return first, second, flux, mahalanobis2
 

@@ -141,7 +141,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     wings_used = wings if wings is not None and wings.is_measured else model.wings
     total: np.ndarray | float = 1.0
     if wings_used is not None:
-        total, _ = wings_used.total(outer_shares(model.on_pixels, fit.place))
+        total, _ = wings_used.total_over_flux(outer_shares(model.on_pixels, fit.place))
     stars = fit.table(total, 2.4 * fwhm)
     # The error of the PSF is no noise, and is as large a part of each flux, whatever its χ²:
     # σ² = σ_noise² + (σ_model F)².

@@ -23,7 +23,7 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
     Parameters
     ----------
     errors : Table
-        Columns of `report.csv`.
+        `Report.table`, with the columns snr, method, mse, mse_stderr and truth_mse.
     model_method : str
         Name of the method with the thick line.
     """
@@ -39,38 +39,39 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
             color=color, lw=width,
         )  # fmt: skip
     # No method can be seen to be better than the noise of the bright images allows.
-    axes.axhline(errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
+    axes.axhline(errors["truth_mse"][0], color="grey", ls=":", label="noise of bright images")
     axes.grid(True, which="both")
     figure.legend(loc="outside right upper")
     return figure
 
 
 @styled
-def error_maps(degraded: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
+def error_maps(restored: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """Draw mean and RMS, over held-out stars, of restored minus bright image.
 
-    `degraded` has images by S/N, as of `check_held_out`; those of the S/N nearest to 10 are shown.
+    Those of the S/N nearest to 10 are shown.
 
     Parameters
     ----------
-    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
-        Held-out stars by S/N: `truth`, and as `model` and one mean PSF restore them.
+    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Held-out stars by S/N: bright (`truth`), and as the model (`model`) and one mean PSF
+        (`MEAN_PSF`) restore them from degraded images.
     """
-    # Faint stars, for which models differ most.
-    snr = nearest_snr(degraded)
-    images = degraded[snr]
-    # In per cent of the mean peak; both means share one scale of colours, symmetric about 0.
+    # S/N nearest to 10: models differ most for faint stars.
+    snr = nearest_snr(restored)
+    images = restored[snr]
+    # In per cent of the mean peak; each mean has its own colours, symmetric about 0.
     peak = images["truth"].max(axis=(1, 2)).mean()
     figure = new_figure(2.4, layout="constrained")
     grid: Any = figure.subplots(1, 4, subplot_kw={"xticks": [], "yticks": []})
-    for columns, name, label in ((grid[:2], "model", "model"), (grid[2:], MEAN_PSF, "mean PSF")):
+    for panels, name, label in ((grid[:2], "model", "model"), (grid[2:], MEAN_PSF, "mean PSF")):
         error = 100 * (images[name] - images["truth"]) / peak
         # Mean error of each pixel over the stars, and its RMS.
         mean, rms = error.mean(axis=0), np.sqrt(np.square(error).mean(axis=0))
         limit = max(np.abs(mean).max(), 1e-9)
         for axes, image, statistic, look in (
-            (columns[0], mean, "mean", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
-            (columns[1], rms, "RMS", {"cmap": "magma", "vmin": 0}),
+            (panels[0], mean, "mean", {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}),
+            (panels[1], rms, "RMS", {"cmap": "magma", "vmin": 0}),
         ):
             artist = axes.imshow(image, origin="lower", interpolation="nearest", **look)
             axes.set_title(f"{label}, {statistic}", fontsize=8)
@@ -93,7 +94,7 @@ def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
     figure = new_figure(2.6, layout="constrained")
     grid: Any = figure.subplots(2, len(residuals), squeeze=False)
     for (above, below), stamp, residual in zip(grid.T, stamps, residuals, strict=True):
-        # A square root shows core and wings in one picture.
+        # A square root shows core and outskirts in one picture.
         above.imshow(np.sqrt(np.clip(stamp / np.nanmax(stamp), 0, 1)), origin="lower", cmap="magma")
         artist = below.imshow(residual, origin="lower", cmap="RdBu_r", vmin=-5, vmax=5)
     # Pixels of stamps need no ticks.
@@ -107,29 +108,28 @@ def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
 def shapes_figure(
     stars: Mapping[str, np.ndarray],
     degraded_rows: np.ndarray,
-    degraded: Mapping[float, Mapping[str, np.ndarray]],
+    restored: Mapping[float, Mapping[str, np.ndarray]],
 ) -> Figure:
     """Draw FWHM and ellipticity against magnitude, x and y.
 
     Upper panels: all usable stars, with held-out stars in colour. Lower panels: errors of the
-    held-out stars after they were degraded to the S/N nearest to 10. Parameters are those of
-    `quality_page`, with the images by S/N.
+    held-out stars after they were degraded to the S/N nearest to 10.
 
     Parameters
     ----------
     stars : mapping of str to ndarray, shape (N,)
         Columns flux, x, y, fwhm_px, ellipticity, flags and part of all stars.
     degraded_rows : ndarray of int, shape (n,)
-        Star of each held-out image.
-    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Row in `stars` of each held-out image.
+    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Held-out images by S/N, as of `error_maps`.
     """
-    snr = nearest_snr(degraded)
+    snr = nearest_snr(restored)
     # Shapes of flagged stars mean nothing.
     usable = has_shape(stars["flags"]) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
     # Errors of degraded stars: restored against bright image.
-    size_error, ellipticity_error = size_errors(degraded[snr])
+    size_error, ellipticity_error = size_errors(restored[snr])
     figure = new_figure(7.6, layout="constrained")
     grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
     rows = (
@@ -141,9 +141,10 @@ def shapes_figure(
     coordinates = {"−2.5 log₁₀ flux": magnitude, "x (px)": stars["x"], "y (px)": stars["y"]}
     for column, (axis_label, place) in enumerate(coordinates.items()):
         for row, (label, name, error, error_label) in enumerate(rows):
-            # All stars above, errors of the held-out ones below.
+            # All usable stars above, errors of the held-out ones below.
             above, below = grid[2 * row : 2 * row + 2, column]
-            above.plot(place[usable], stars[name][usable], ".", ms=2, color="#888888", label="all")
+            above.plot(place[usable], stars[name][usable], ".", ms=2, color="#888888",
+                       label="usable")  # fmt: skip
             above.plot(place[held_out], stars[name][held_out], ".", color=SERIES_COLORS[5],
                        label="held out")  # fmt: skip
             below.axhline(0.0, color="black", lw=0.8)
@@ -174,8 +175,8 @@ def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="χ² per pixel")
     for selected, color, label in (
         (positive & flagged, "#aaaaaa", "flagged"),
-        (positive & ~flagged & learnt, SERIES_COLORS[5], "no flag, learnt from"),
-        (positive & ~flagged & ~learnt, SERIES_COLORS[0], "no flag"),
+        (positive & ~flagged & learnt, SERIES_COLORS[5], "no flag, training"),
+        (positive & ~flagged & ~learnt, SERIES_COLORS[0], "no flag, other"),
     ):
         axes.plot(
             stars["snr"][selected], stars["chi2"][selected], ".", ms=3, color=color, label=label

@@ -397,7 +397,7 @@ class Restorer:
         place = np.stack([stars.x, stars.y], axis=1)
         # A wider PSF has more light beyond its stamp.
         outer_part = outer_shares(self.method.psf_at, place)
-        factor, factor_error = self.wings.total(outer_part)
+        factor, factor_error = self.wings.total_over_flux(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
         # Light of wings that is even in the stamp is in the sky of a star whose sky is not known.

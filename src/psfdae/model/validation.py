@@ -55,7 +55,8 @@ def validate(
 ) -> Report:
     """Measure a model on the stars held out, degraded to the noise levels of their settings.
 
-    It is compared with the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
+    It is compared with the noisy images, one mean PSF whose centre is fitted, and the linear
+    estimator of minimum mean square error (linear MMSE).
 
     Parameters
     ----------
@@ -68,7 +69,8 @@ def validate(
     Raises
     ------
     Error
-        If the model may have seen the stars that are held out, or their pixels differ.
+        If the model may have seen the held-out stars, or their pixels or stamps differ from its
+        own.
 
     Examples
     --------
@@ -112,7 +114,8 @@ def _require_unseen(model: PsfModel, stars: Stars) -> None:
             f"{path}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
             f"takes {info.stamp_px} px"
         )
-    # A model of another image has learnt from none of these stars. Several images are one text.
+    # A model of another image has learnt from none of these stars. Hashes of several images are
+    # one text, joined by commas.
     hashes = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
     if not {*", ".join(hashes).split(", ")} & {*product.config["image_sha256"].split(", ")}:
         return
@@ -145,14 +148,13 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
     rows, mean_rows, per_star, restored = [], [], [], {}
     for level in steps("stars held out", settings.noise.levels):
         noisy = noisy_test_images(settings, product, test, level)
-        # A pixel more than the jitter of the stamps: noise moves the brightest pixel.
-        mean = fit_mean_psf(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
+        # The centre is fitted up to a pixel beyond the jitter: noise moves the brightest pixel.
+        by_mean_psf = fit_mean_psf(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
-        mean_rows += summarised(row, all_metrics(mean, truth, data_range), star)
+        mean_rows += summarised(row, all_metrics(by_mean_psf, truth, data_range), star)
         for name, method in methods.items():
             is_model = name == model.info.method
-            # The model may be of another image, whose noise level λ has another κ.
-            scale = settings.noise.kappa / model.info.kappa if is_model else 1.0
+            scale = _level_scale(model, stars) if is_model else 1.0
             estimate = method.estimate(noisy, scale * level, position)
             # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
@@ -160,8 +162,8 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
             rows += summarised(row, metrics, star)
             per_star.append({**row, "star": test, "field": star, **metrics})
             if is_model:
-                images = {"noisy": noisy, "truth": truth, "model": estimate.psf, MEAN_PSF: mean}
-                restored[level] = images
+                images = {"noisy": noisy, "truth": truth, "model": estimate.psf}
+                restored[level] = images | {MEAN_PSF: by_mean_psf}
     return Report(
         model,
         stars,
@@ -172,6 +174,14 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         measure_photometry(model, stars, restored),
         restored,
     )
+
+
+def _level_scale(model: PsfModel, stars: Stars) -> float:
+    """Return the factor from noise levels λ of stars to those of a model.
+
+    The model may be of another image, whose noise level λ has another κ.
+    """
+    return stars.settings.noise.kappa / model.info.kappa
 
 
 def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
@@ -186,7 +196,7 @@ def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
     """
     from astropy.table import Table
 
-    # Methods differ in their metrics: columns stand in the order in which they first appear.
+    # Methods differ in their metrics.
     names = dict.fromkeys(name for block in blocks for name in block)
     columns = {
         name: [np.broadcast_to(block.get(name, np.nan), block["star"].shape) for block in blocks]
@@ -220,6 +230,7 @@ def _error_table(
     for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
         noise = settings.noise.kappa * level
         for name in (*methods, MEAN_PSF):
+            # SSIM with the range of each bright image.
             mse_cell = cells[level, name, "mse"]
             rows.append(
                 {
@@ -248,19 +259,22 @@ class Report:
     methods : dict of str to Method
         All that were measured, the model's own included.
     table : Table
-        MSE with its standard error and SSIM by S/N and method.
+        MSE with its standard error and SSIM by S/N and method, for stars of flux 1; `truth_mse` is
+        the noise of the bright images in the MSE.
     evaluation : Table
-        Every metric of every method at every noise level.
+        Every metric of every method at every noise level: `metric`, its mean `value`, `stderr` and
+        number of images `n`.
     per_star : Table
-        Every metric of every image.
+        Every metric of every image; `star` is the number of the image, `field` that of its star.
     photometry : Table
         Photometry by S/N: what `predict` makes of the held-out images where no flux, sky, noise
-        and centre is given. Bias of the flux over the flux, its pull (what 68.27 % of |error| over
-        `flux_error` are below: 1 if errors hold), RMS of the centre, and the parts of fluxes,
-        centres and pixels that are within their stated errors, with standard errors clustered by
-        star.
+        and centre is given. Part of the stars without a usable flux (`lost`), relative bias of the
+        flux, its pull (what 68.27 % of |error| over the standard error are below: 1 if errors
+        hold), RMS error of the centre in px, and coverage of fluxes, centres and pixels: the parts
+        that are within their stated errors, with standard errors clustered by star.
     restored : dict
-        By noise level λ the held-out images (n, d, d): `noisy`, `truth`, `model`, and `mean_psf`.
+        By noise level λ the held-out images (n, d, d): degraded (`noisy`), bright (`truth`), and
+        restored by the model (`model`) and by one mean PSF (`mean_psf`).
 
     Examples
     --------
@@ -296,9 +310,10 @@ class Report:
         Returns
         -------
         list of Check
-            They compare errors with those of the simplest models, sizes of stars, stated errors.
+            They are of errors against the simplest models, of sizes of stars, and of stated
+            errors.
         """
-        # Coverage was measured when the model was made, at S/N of its own.
+        # Coverage was measured when the model was made: that of another image has other S/N.
         rows = self.model.info.metrics
         coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
         method = self.model.info.method
@@ -312,12 +327,14 @@ class Report:
 
     @property
     def restored_by_snr(self) -> dict[float, dict[str, np.ndarray]]:
-        """Restored images by S/N."""
-        info = self.model.info
-        return {
-            signal_to_noise(info.kappa * level, info.noise_equivalent_px): images
-            for level, images in self.restored.items()
-        }
+        """Restored images by S/N, as in `table`."""
+        return {snr: self.restored[level] for snr, level in self._levels().items()}
+
+    def _levels(self) -> dict[float, float]:
+        """Return the noise levels λ by their S/N, for stars of the typical size."""
+        kappa = self.stars.settings.noise.kappa
+        area = star_area(self.stars.product, self.stars.split.train)
+        return {signal_to_noise(kappa * level, area): level for level in self.restored}
 
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other.
@@ -330,19 +347,17 @@ class Report:
         write_text(path, self.page())
 
     def strip(self) -> Figure:
-        """Draw held-out stars degraded to S/N 10, as each method restores them.
+        """Draw held-out stars degraded to the S/N nearest to 10, as each method restores them.
 
         Returns
         -------
         Figure
-            Six stars, evenly over the field: the bright star, then a row for each method.
+            Six stars, evenly over the field: the bright star, then a row for each method that
+            figures show.
         """
         product, test = self.stars.product, self.stars.split.test
-        # S/N of each noise level, for stars of the typical size.
-        kappa = self.stars.settings.noise.kappa
-        area = star_area(product, self.stars.split.train)
         # The noise level whose S/N is the nearest to 10.
-        levels = {signal_to_noise(kappa * level, area): level for level in self.restored}
+        levels = self._levels()
         snr = nearest_snr(levels)
         # Six stars that lie evenly over the field, one image of each.
         star, place = product["field_index"][test], field_positions(product)[test]
@@ -352,10 +367,12 @@ class Report:
         noisy, truth = images["noisy"][shown], images["truth"][shown]
         # A row of the bright stars, then one for each method that figures show.
         rows = [StripRow("bright\nstar", truth)]
-        for method in self.methods.values():
+        for name, method in self.methods.items():
             look = method.look
             if look.drawn:
-                stamps = method.restore(noisy, levels[snr], place[shown])
+                is_model = name == self.model.info.method
+                scale = _level_scale(self.model, self.stars) if is_model else 1.0
+                stamps = method.restore(noisy, scale * levels[snr], place[shown])
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
@@ -431,7 +448,6 @@ def _predict_all(
         model.stream(image.observation.with_margin(model.margin_px), threads=1)
         for image in stars.images
     )
-    # Batches of a stream: columns and PSFs are joined, residuals are kept for few stars only.
     for _, prediction in itertools.chain.from_iterable(streams):
         for name, values in prediction.columns.items():
             columns.setdefault(name, []).append(values)
@@ -441,4 +457,5 @@ def _predict_all(
         count += len(prediction)
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     joined["flags"] = joined["flags"].astype(int)
+    # Residuals came in the order of the stars: back to that of `shown`.
     return joined, np.concatenate(psfs), np.concatenate(residuals)[np.argsort(np.argsort(shown))]

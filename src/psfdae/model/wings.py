@@ -1,16 +1,16 @@
 """Light of stars beyond the stamps of a model, and the sky that is left without it.
 
-The model knows the light of a star in its stamp, above what is there in a ring around it. The rest
-is one profile for all stars: a star of flux F has
+The model knows the light of a star within its stamp, over that of a ring around it, taken for sky.
+The rest is one profile for all stars: a star of flux F has
 
     F s (p_0 h_0 + Σ_k p_k h_k(r))
 
 more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere, tents h_k in ln r times a power of r
 outside of the stamp, r the distance from its centre, and s the light of the model's PSF in the
 outer part of its stamp over the mean of all stars: where the PSF is wider, it has more wings.
-All pixels of the image together give p by weighted least squares, beside what is expected of p
-before: that the light falls on outside of the stamp about as that of other telescopes does. Bright
-stars say more than that, and few faint ones hardly anything.
+All pixels of the image together give p by weighted least squares, with a prior: that the light
+falls off outside of the stamp about as that of other telescopes does. Bright stars outweigh the
+prior; few faint ones hardly change it.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ class Wings:
     Attributes
     ----------
     radius_px : ndarray, shape (K,)
-        Tops of the tents h_1 …, the first one at half the side of the stamp; at the last radius
-        there is no light any more.
+        r_1 … r_K: tops of the K − 1 tents, r_1 half the side of the stamp; from r_K on there is no
+        light.
     profile : ndarray, shape (K,)
-        p_k, per pixel.
+        p_0 … p_{K−1}, part of the flux per pixel: p_0 in the stamp, p_k (r_k/r_1)^-3 at r_k.
     covariance : ndarray, shape (K, K)
         Of p_k.
     outer_share : float
         Mean of the stars' `outer_shares`, for which s = 1.
-    outer_radius : float
-        Inner radius of the outer part of a stamp, over half its side.
+    outer_part_from : float
+        Radius at which the outer part of a stamp begins, over half its side.
     steepness : float
         Power of 1/r in the tents: that of light that mirrors and air scatter.
     """
 
-    outer_radius: ClassVar[float] = 0.7
+    outer_part_from: ClassVar[float] = 0.7
     steepness: ClassVar[float] = 3.0
 
     radius_px: np.ndarray
@@ -63,12 +63,12 @@ class Wings:
 
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> Self:
-        """Inverse of `plain`.
+        """Return wings from the lists and numbers of `plain`.
 
         Raises
         ------
         ValueError
-            If it is damaged.
+            If one is missing, they do not fit together, or their light is no part of a star's.
         """
         # A number of another type, or one that is missing, is as wrong as one that does not fit.
         names = ("radius_px", "profile", "covariance")
@@ -100,10 +100,10 @@ class Wings:
         # A factor of three in either direction is no PSF of the same telescope.
         return np.asarray(np.clip(ratio, 0.3, 3.0))
 
-    def total(self, outer_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the whole flux of stars over that of their model, and its error, (n,) both.
+    def total_over_flux(self, outer_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return flux_total over flux of stars with these `outer_shares` (n,), and its error.
 
-        How the wings change with the PSF is known to half of the change.
+        Both have the shape (n,). Half of the change of wings with the PSF counts as its error.
         """
         # 1 + s L, with the errors s σ_L and (s − 1) L / 2.
         scale = self.scale(outer_share)
@@ -111,7 +111,10 @@ class Wings:
         return 1.0 + scale * light, np.hypot(scale * error, 0.5 * (scale - 1.0) * light)
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
-        """Part of the flux within a radius, where s = 1, and its standard error."""
+        """Return the light that the model lacks within a radius in px, and its standard error.
+
+        Both are over the star's flux, where s = 1.
+        """
         # ∫ 2π r (h_0 p_0 + Σ h_k p_k) dr.
         half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
@@ -122,10 +125,10 @@ class Wings:
         return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
 
     def cards(self) -> list[Card]:
-        """Return cards for a FITS header: radius of all light, and part of it in the stamp."""
+        """Return cards for a FITS header: radius of all light, and part of it in the model."""
         return [
             ("FLUXRAD", float(self.radius_px[-1]), "[pix] all light of a star is within it"),
-            ("INMODEL", 1.0 / (1.0 + self.light()[0]), "part of it in the stamp, usual star"),
+            ("INMODEL", 1.0 / (1.0 + self.light()[0]), "part of it in the model, usual star"),
         ]
 
     def __str__(self) -> str:
@@ -143,12 +146,11 @@ class Wings:
 
     @classmethod
     def joined(cls, several: Sequence[Wings]) -> Wings:
-        """Average the wings of several images with one model, by the variance of their light."""
-        # Weights 1/σ² of the light of each image.
+        """Average the wings of several images with one model, weighted by 1/σ² of their light."""
         weight = np.array([wings.light()[1] ** -2.0 for wings in several])
         weight /= weight.sum()
-        # Profiles for one outer share, that of the average: p grows with it. The images are
-        # independent, C = Σ w² C_i.
+        # First each profile is rescaled to the mean outer share, with which p grows. The images are
+        # independent: C = Σ w² C_i.
         outer_share = float(weight @ [wings.outer_share for wings in several])
         weight *= [outer_share / wings.outer_share for wings in several]
         profile = np.tensordot(weight, [wings.profile for wings in several], 1)
@@ -157,8 +159,7 @@ class Wings:
 
     @property
     def is_measured(self) -> bool:
-        """True if the pixels of the image say something of the light, more than is expected."""
-        # The error of the light, beside that of what is expected before any pixel is seen.
+        """True if the pixels of the image made the error of the light smaller than the prior's."""
         sigma = expected_profile(self.radius_px, self.outer_share)[1]
         return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
@@ -166,7 +167,7 @@ class Wings:
 def aperture_correction(
     model: FieldPsfs, wings: Wings | None, x: float, y: float, radius_px: float
 ) -> float:
-    """Flux of a star at a place over what an aperture of a radius about it gets.
+    """Return the whole flux of a star at (x, y), in px from 0, over that in an aperture about it.
 
     The aperture has parts of the pixels at its edge, as photutils' `CircularAperture`.
 
@@ -193,22 +194,23 @@ def aperture_correction(
 
 
 def outer_shares(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
-    """Return the part of a star's flux in the outer part of its stamp, at places (n, 2), (n,).
+    """Return the part of a star's flux in the outer part of its stamp, (n,), at places (n, 2).
 
     Pixels between 0.7 times half the side of the stamp and half the side count. `draw` makes PSFs
-    (m, d, d) at m places, which are finite. NaN where a place, x and y, is not known.
+    (m, d, d) at m places, which are finite. NaN where a place, x and y in px, is not known.
     """
     shares = np.full(len(place), np.nan)
     located = np.flatnonzero(np.isfinite(place).all(axis=1))
     # Some at a time, so that their PSFs take little memory.
     for first in range(0, len(located), 2048):
         part = located[first : first + 2048]
+        # At whole pixels, so that phases do not change the share.
         psf = draw(np.rint(place[part]))
         side = psf.shape[-1]
         # Pixels by their distance from the middle of the stamp.
         axis = np.arange(side) - side // 2
         radius = np.hypot(axis[:, None], axis)
-        ring = (radius >= Wings.outer_radius * side / 2) & (radius < side / 2)
+        ring = (radius >= Wings.outer_part_from * side / 2) & (radius < side / 2)
         shares[part] = psf[:, ring].sum(axis=1)
     return shares
 
@@ -232,11 +234,12 @@ class StarFluxes(NamedTuple):
     Attributes
     ----------
     place : ndarray, shape (n, 2)
-        x and y; NaN where unknown.
+        x and y in px; NaN where unknown.
     flux : ndarray, shape (n,)
-        Stars whose flux is NaN or not above 0 have no wings.
+        In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 have no
+        wings.
     outer_share : ndarray, shape (n,)
-        Part of the light in the outer part of the stamp, as `outer_shares` gives it.
+        Part of the light in the outer part of the stamp, as `outer_shares` gives it; NaN: no wings.
     """
 
     place: np.ndarray
@@ -250,15 +253,19 @@ def star_tents(
     stars: StarFluxes,
     wings: Wings,
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
+    """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
+
+    A window is of rows, counted from `rows.start`, and columns; the image is `width` px wide.
+    """
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
-    light = stars.flux * wings.scale(stars.outer_share)
-    light = np.where(np.isfinite(stars.outer_share), light, np.nan)
-    has_light = np.isfinite(light) & (light > 0) & np.isfinite(stars.place).all(axis=1)
+    scaled_flux = stars.flux * wings.scale(stars.outer_share)
+    # Unlike in `scale`, stars of unknown outer share are left out.
+    scaled_flux = np.where(np.isfinite(stars.outer_share), scaled_flux, np.nan)
+    is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.place).all(axis=1)
     # In a crowded image, the thousand brightest stars have most of the light of all wings.
-    lit_stars = np.flatnonzero(has_light)
-    brightest = lit_stars[np.argsort(-light[lit_stars])[:1000]]
+    lit_stars = np.flatnonzero(is_lit)
+    brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
     # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
     middle = np.rint(stars.place[brightest]).astype(int)
     first = np.maximum(middle - reach, [0, rows.start])
@@ -281,7 +288,8 @@ def star_tents(
             slice(first_row - rows.start, end_row - rows.start),
             slice(first_column, end_column),
         )
-        yield window, float(light[star]) * np.concatenate([in_stamp[None], tents_outside])
+        star_flux = float(scaled_flux[star])
+        yield window, star_flux * np.concatenate([in_stamp[None], tents_outside])
 
 
 def tented_light(
@@ -295,8 +303,8 @@ def tented_light(
     for top in range(0, height, 128):
         rows = slice(top, min(top + 128, height))
         tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
-        for window, light in star_tents(rows, width, stars, wings):
-            tented[:, *window] += light
+        for window, tented_star in star_tents(rows, width, stars, wings):
+            tented[:, *window] += tented_star
         yield rows, tented
 
 
@@ -309,25 +317,26 @@ def wing_light(
     # One map, to which each star adds the light in its window.
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
-        for window, light in star_tents(rows, shape[1], stars, wings):
-            image[window] += np.tensordot(wings.profile, light, 1)
+        for window, tented_star in star_tents(rows, shape[1], stars, wings):
+            image[window] += np.tensordot(wings.profile, tented_star, 1)
     return image
 
 
 def expected_profile(radius_px: np.ndarray, outer_share: float) -> tuple[np.ndarray, np.ndarray]:
     """Return what is expected of p before any pixel outside of stamps is seen, and its σ, (K,).
 
-    Outside of a stamp of the half side h, the light falls on as a (r/h)^-5, the mean slope of
+    Outside of a stamp of the half side h, the light falls off as a (r/h)^-5, the mean slope of
     Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the `outer_share` of the
-    light, between 0.7 h and h. It may be more by half of what falls as r^-3, as light that mirrors
-    and air scatter does (King 1971, PASP 83, 199), or less, and has an error of 0.1 % of the star
-    at least.
+    light, between 0.7 h and h. Its σ is half of a at h and falls as r^-3, as light that mirrors and
+    air scatter does (King 1971, PASP 83, 199), with 0.1 % of the star in quadrature.
     """
     half = radius_px[0]
     # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
-    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (Wings.outer_radius**-3.0 - 1.0))
-    # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
+    outer_integral = Wings.outer_part_from**-3.0 - 1.0
+    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * outer_integral)
+    # The ring, at 1.5 h, was taken for sky: every pixel of the stamp lacks its light.
     expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0))
+    # ∫ 2π r (r/h)^-3 dr from h on is 2π h².
     sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
     # The model may have 1.5 % too much or too little light in its stamp.
     sigma[0] = 0.015 / (2.0 * half) ** 2
@@ -345,7 +354,7 @@ def wings_of(
     """Fit the wings of stars to what is left of an image without sky and models of its stars.
 
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
-    are far from the wings of an `earlier` turn.
+    are more than 4 σ from the wings of an `earlier` fit.
 
     Parameters
     ----------
@@ -378,13 +387,15 @@ def wings_of(
     unfitted = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
+    # So σ² is averaged over a stamp.
     unit_sigma = float(sigma.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
     variance = np.square(sigma / unit_sigma)
-    even_variance = uniform_filter(variance, stamp_px, mode="nearest")
+    smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
     # A mean is not below the least value, but for the rounding of running sums.
-    even_sigma = unit_sigma * np.sqrt(np.maximum(even_variance, variance.min()))
+    smooth_sigma = unit_sigma * np.sqrt(np.maximum(smooth_variance, variance.min()))
     # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
-    # of A is (F s h_k, 1)/σ of a pixel and d its residual over σ; the same in blocks of a stamp.
+    # of A is (F s h_k, mean σ)/σ of a pixel, so that the even light is in units of the mean σ, and
+    # d its residual over σ; the same in blocks of a stamp.
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
     square, pixels, blocks = 0.0, 0, []
     for band, tented in tented_light(residual.shape, stars, unfitted):
@@ -393,7 +404,7 @@ def wings_of(
             deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
             # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
             is_used &= np.abs(deviation) < 4.0 * sigma[band]
-        weight = np.where(is_used, 1.0 / even_sigma[band].astype(np.float64), 0.0)
+        weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
         design = np.concatenate([tented, np.full((1, *weight.shape), unit_sigma)]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
         normal, projection = normal + flat @ flat.T, projection + flat @ data
@@ -403,21 +414,23 @@ def wings_of(
     if not normal[-1, -1] > 0:
         return None
     *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
-    # Generalised least squares of p and of the even light, of which nothing is expected, in units
-    # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² at least 1 and that of the pixels, or
-    # of sums over blocks of a stamp: a sky that is not even, and stars and galaxies that nobody
-    # sees, are residuals that neighbouring pixels share, and wings are as wide as these.
+    # Least squares of p with its prior, and of the even light without one, in units of the prior's
+    # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, that
+    # of the pixels and that of sums over blocks: an uneven sky and undetected sources leave
+    # residuals that neighbours share, as wide as wings.
     expected, prior_sigma = expected_profile(radius, mean_share)
     unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
     normal, projection = normal * unit * unit[:, None], projection * unit
     prior = np.diag(np.append(np.ones(count), 0.0))
     prior_projection = np.append(expected / prior_sigma, 0.0)
+    # χ² depends on x: three rounds.
     chi2 = 1.0
     for _ in range(3):
         inverse = np.linalg.inv(normal / chi2 + prior)
         parameters = inverse @ (projection / chi2 + prior_projection)
         residual_square = square - 2.0 * parameters @ projection + parameters @ normal @ parameters
         chi2_of_pixels = residual_square / max(pixels, 1)
+        # The square of a sum of n independent residuals is n on average.
         block_residual = block_light - (parameters * unit) @ np.array(block_design)
         chi2_of_blocks = float(block_residual @ block_residual) / max(block_pixels.sum(), 1.0)
         chi2 = max(chi2_of_pixels, chi2_of_blocks, 1.0)
@@ -426,7 +439,7 @@ def wings_of(
 
 
 def error_beside_models(error: np.ndarray, star_light: np.ndarray) -> np.ndarray:
-    """Return σ (h, w) of what models of stars leave, to 3 % of whose light in a pixel they hold."""
+    """Return σ (h, w) of an image without its stars: its noise, and 3 % of their models' light."""
     return np.asarray(np.hypot(error, 0.03 * star_light))
 
 
@@ -449,14 +462,14 @@ def around_stars(
     stamp_px: int,
     earlier: Wings | None = None,
 ) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
-    """Return wings and sky of an image (h, w), found by turns beside the models of its stars.
+    """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
-    A map of the sky takes wings that are wider than its meshes for sky, until these are known.
+    A sky map takes wide wings for sky until the wings are known.
 
     Parameters
     ----------
     image, error, star_light : ndarray, shape (h, w)
-        Sky included, σ of its pixels, and light of the stars.
+        Image with its sky, σ of its pixels, and light of the models of its stars.
     sky : Sky
         As it is known so far; its `bad` pixels do not count.
     stars : StarFluxes
@@ -466,6 +479,7 @@ def around_stars(
     Returns
     -------
     sky : Sky
+        Sky without wings; its `flat` is what is left without sky, stars and wings.
     light_of_wings : ndarray, shape (h, w)
     wings : Wings or None
     sigma : ndarray, shape (h, w)
@@ -479,8 +493,8 @@ def around_stars(
     # The sky without them, with its noise map if it has one.
     has_noise_map = np.isfinite(sky.noise_scale)
     sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if has_noise_map else None)
-    # The map has the most frequent value of the pixels, which is below the mean where noise is that
-    # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
+    # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
+    # are under stars, too: the mean deviation is added to the level.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
     clipped = sky.bad | (np.abs(deviation) > 4.0)
     # Mean deviation Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
@@ -507,9 +521,9 @@ def _wings_beside(
     from scipy.ndimage import uniform_filter
 
     wings, all_stars = earlier, stars
-    # Galaxies, blends and saturated stars say nothing of the wings of stars: in 5 × 5 px about a
-    # star, most pixels are good, and their residuals are within twice σ, which has what the PSF may
-    # be off by.
+    # Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if most
+    # of the 5 × 5 px about it are good, and their RMS residual is below 2 σ, which includes errors
+    # of the PSF.
     residual, bad = without_stars - sky.level, sky.bad
     squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
     mean_square = uniform_filter(squares, 5, mode="constant")
@@ -522,17 +536,17 @@ def _wings_beside(
     stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
     for turn in range(8):
-        latest = wings
+        previous = wings
         if turn:
-            without_light = without_stars - wing_light(bad.shape, all_stars, latest)
-            without_light[bad] = 0.0
-            residual = without_stars - sky_level(without_light, bad, sky.steps).level
-        wings = wings_of(residual, sigma, bad, stars, stamp_px, latest)
+            without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
+            without_wings[bad] = 0.0
+            residual = without_stars - sky_level(without_wings, bad, sky.steps).level
+        wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break
         # Until their light changes by less than a tenth of its error.
         light, light_sigma = wings.light()
-        if latest is not None and abs(light - latest.light()[0]) < 0.1 * light_sigma:
+        if previous is not None and abs(light - previous.light()[0]) < 0.1 * light_sigma:
             break
     return wings
 
@@ -540,7 +554,7 @@ def _wings_beside(
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     """Return the wings of stars that are restored one by one; None if there is no light at all.
 
-    In a crowded image, where stars restored alone lack light, they come out too large.
+    In a crowded image, where stars restored alone lack light, the wings come out too large.
 
     Raises
     ------
@@ -555,6 +569,7 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     for stamps, prediction in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
         shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
+        # First pixel (x, y) of each stamp in the map with its margin.
         corner = np.floor(np.nan_to_num(place) + 0.5).astype(int) + shift + side - side // 2
         is_restored = np.isfinite(place).all(axis=1) & np.isfinite(prediction.psf).all(axis=(1, 2))
         for x, y, psf in zip(*corner[is_restored].T, prediction.psf[is_restored], strict=True):
@@ -562,12 +577,13 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
             if min(x, y) >= 0 and star_light[stamp].shape == psf.shape:
                 star_light[stamp] += psf
         shares.append(outer_shares(model.on_pixels, place))
-        # Wings begin where the stamps end: they are those about the middles of the stamps.
+        # Tents are centred on stamps, not on stars, so that they begin where the stamps end.
         middles.append(np.where(is_restored[:, None], corner - side + 0.5 * (side - 1), np.nan))
         fluxes.append(np.where(is_restored, prediction.flux, np.nan))
     core = np.s_[side:-side, side:-side]
-    light = star_light[core]
+    light_of_models = star_light[core]
     stars = StarFluxes(*map(np.concatenate, (middles, fluxes, shares)))
-    sigma = error_beside_models(pixel_error(sky.noise, light, observation.gain), light)
-    without_stars = sky.flat + sky.level - light
+    error = pixel_error(sky.noise, light_of_models, observation.gain)
+    sigma = error_beside_models(error, light_of_models)
+    without_stars = sky.flat + sky.level - light_of_models
     return _wings_beside(without_stars, sky, sigma, stars, side)

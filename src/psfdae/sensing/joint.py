@@ -1,4 +1,4 @@
-"""Joint fit of the state of a telescope to all stars of an image.
+"""Joint fit of the numbers of a telescope to the stars of an image.
 
 The aberrations of all stars follow from a few numbers of the telescope
 (`psfdae.telescope.field.TelescopeModel`); each star has its own place, flux and sky besides.
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Joint:
-    """Fitted state of a telescope.
+    """Fitted numbers of a telescope, with their errors.
 
     Attributes
     ----------
@@ -42,14 +42,16 @@ class Joint:
     value, error : ndarray, shape (Q,)
         Numbers of the telescope in the units of the model.
     correlation : ndarray, shape (Q, Q)
+        Correlation of the errors.
     probability : float
-        Probability of this state against its twin, whose even aberrations have the other sign.
+        Probability of these numbers against their twin, whose even aberrations have the other
+        sign.
     twin : ndarray or None, shape (Q,)
         Numbers of the twin, if there is one.
     star : ndarray of int, shape (m,)
-        Stars that took part.
+        Indices of the stars that took part, in the order of the search.
     disagrees : ndarray of bool, shape (m,)
-        True for stars whose deviance is above the limit: the state does not explain them.
+        True for stars whose deviance is above the limit: the numbers do not explain them.
     """
 
     model: TelescopeModel
@@ -85,26 +87,31 @@ class Joint:
 class TelescopePosterior:
     """Posterior of the numbers of a telescope, and of the places, fluxes and skies of its stars.
 
-    Its parameters are Q standardised numbers t of the telescope, normal with σ = 1, and then the
-    place (x, y), flux and sky of each star in turn. If the FWHM of the seeing is one of the
-    numbers, stamps are linear in it about the seeing of `optics`.
+    Its parameters are the Q standardised numbers t of the telescope, (number − prior mean)/prior σ,
+    whose prior is normal with σ = 1, then four for each star: place (x, y) of its centre in px off
+    the middle of the stamp, flux in units of `search.flux`, and sky above its level in units of its
+    noise. If the FWHM of the seeing is one of the numbers, stamps are linear in it about the seeing
+    of `optics`.
 
     Attributes
     ----------
     search : WavefrontSearch
+        Search that has the counts and fluxes of all stars.
     model : TelescopeModel
-    stars : ndarray of int, shape (m,)
-        Stars that take part.
+    star : ndarray of int, shape (m,)
+        Indices of the stars that take part, in the order of the search.
     optics : StarOptics
+        Optics with the seeing about which stamps are linear; those of `search` keep the first
+        seeing.
     """
 
     search: WavefrontSearch
     model: TelescopeModel
-    stars: np.ndarray
+    star: np.ndarray
     optics: StarOptics
     max_seeing_change: ClassVar[float] = 0.5
-    """Largest relative change of the FWHM of the seeing: downwards in a round, and from the FWHM
-    that the telescope's file states."""
+    """Largest relative change of the FWHM of the seeing from its prior mean; also the largest
+    decrease from one round of `fit_telescope` to the next."""
 
     @property
     def number_count(self) -> int:
@@ -113,12 +120,12 @@ class TelescopePosterior:
 
     @cached_property
     def broadening(self) -> SampledStamps:
-        """Propagation to derivatives of the stamps by the logarithm of the FWHM of the seeing."""
+        """What computes the derivatives of stamps by the logarithm of the FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
     def seeing(self) -> Seeing:
-        """Seeing of the optics; a model with a seeing has one."""
+        """Seeing of `optics`; only for a model that has the FWHM of the seeing as a number."""
         assert self.optics.telescope.seeing is not None
         return self.optics.telescope.seeing
 
@@ -138,28 +145,28 @@ class TelescopePosterior:
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
         """Return the coefficients of the stars (m, K) in waves at standardised numbers t (Q,)."""
-        return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.stars])
+        return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.star])
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
         """Return the derivatives of the coefficients of the stars by t, (m, Q, K)."""
         # ∂c/∂t = σ ∂c/∂number, from [number, star, coefficient] to [star, number, coefficient].
         jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
-        return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.stars])
+        return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.star])
 
     def evaluate(self, _: np.ndarray, parameters: np.ndarray) -> Evaluation:
-        """Evaluate the posterior as `psfdae.sensing.climbing.Evaluate` does.
+        """Evaluate the posterior in the form in which `climb` calls it.
 
-        A telescope through which no rays pass, or whose wavefronts no grid can sample, is
-        impossible.
+        The first argument, the numbers of the starts, is not used. A telescope through which no
+        rays pass, or whose wavefronts no grid can sample, has a height of −∞.
 
         Parameters
         ----------
-        parameters : ndarray, shape (a, K)
-            K = Q + 4 m: the numbers of the telescope, then four for each star.
+        parameters : ndarray, shape (a, N)
+            N = Q + 4 m: the numbers of the telescope, then four for each star.
 
         Returns
         -------
-        height, score, information : ndarray, shapes (a,), (a, K) and (a, K, K)
+        height, score, information : ndarray, shapes (a,), (a, N) and (a, N, N)
             Logarithm of the posterior, its slope, and the expected information with that of the
             prior.
         """
@@ -171,48 +178,62 @@ class TelescopePosterior:
             with suppress(RayTracingError, SamplingError):
                 deviance, star_score, star_information = self.evaluate_stars(values)
                 height[row] = -0.5 * (deviance.sum() + (values[:q] ** 2).sum())
+                # Sum over the stars of what concerns the numbers; the four of each star have rows
+                # of their own.
                 (score[row],), (information[row],) = combine_images(
                     star_score[None], star_information[None], q
                 )
-                # Normal prior of the numbers, and a trace of information on places, fluxes and
-                # skies, so that no matrix is singular.
+                # Normal prior of the numbers, and a tiny information on places, fluxes and skies,
+                # so that no matrix is singular.
                 score[row, :q] -= values[:q]
                 information[row, range(q), range(q)] += 1.0
                 information[row, range(q, size), range(q, size)] += 1e-9
         return height, score, information
 
     def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
-        """Return deviance (m,), score (m, Q + 4) and information of every star by itself.
+        """Evaluate every star by itself at `parameters` (Q + 4 m,), without any prior.
 
-        They are derivatives by the Q numbers of the telescope and the four of the star.
+        Returns
+        -------
+        deviance, score, information : ndarray, shapes (m,), (m, Q + 4), (m, Q + 4, Q + 4)
+            Derivatives are by the Q numbers of the telescope and the four of the star.
         """
         q, optics = self.number_count, self.optics
-        t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.stars), 4)
+        t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.star), 4)
         place = star_parameters[:, :2]
-        # Images of all stars, and derivatives by t, along the modes, and by the place.
-        modes = optics.mode_coefficients(self.stars, self.coefficients(t), place)
-        directions = self.slopes(t) @ optics.terms.to_modes[self.stars]
+        # Stamps (m, d²) and their derivatives (m, Q + 2, d²): by t, through the pupil modes (a
+        # basis, not `StarModes`), and by the place.
+        modes = optics.mode_coefficients(self.star, self.coefficients(t), place)
+        directions = self.slopes(t) @ optics.terms.to_modes[self.star]
         stamps, slopes = optics.derivatives(modes, directions)
         if self.model.has_seeing:
             # p(w) = p(1) + (w − 1) ∂p/∂ln w about w = 1, the relative FWHM of the seeing.
-            broadened = self.broadening.stamps(modes).reshape(len(self.stars), -1)
+            broadened = self.broadening.stamps(modes).reshape(len(self.star), -1)
             broadened = broadened.astype(np.float64)
             stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
             slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadened
-        expected = self.search.expected_counts(self.stars, stamps, slopes, star_parameters)
-        return poisson_information(self.search.photons.counts[self.stars], *expected)
+        expected = self.search.expected_counts(self.star, stamps, slopes, star_parameters)
+        return poisson_information(self.search.photons.counts[self.star], *expected)
 
 
 def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeModel) -> Joint:
-    """Fit the numbers of a telescope to the stamps of all its stars.
+    """Fit the numbers of a telescope to the stamps of its stars.
+
+    These are the 500 with most light over the sky's noise that a mode explains, or all such stars.
 
     Parameters
     ----------
     search : WavefrontSearch
+        Search that has the counts and fluxes of all stars.
     modes : StarModes
         Modes of the single stars; stars that no mode explains take no part.
     model : TelescopeModel
         Model of all stars of the search.
+
+    Returns
+    -------
+    Joint
+        Numbers of the most probable peak of the posterior.
 
     Raises
     ------
@@ -226,6 +247,7 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     optics, best_modes = search.optics, modes.best_modes
     best_modes = best_modes.take(np.flatnonzero(search.is_explained(best_modes)))
     stars = best_modes.star
+    # Flux is the last but one parameter of a mode, in units of `search.flux`.
     light = search.flux[stars] * best_modes.parameters[:, -2]
     light = light / np.sqrt(search.photons.sky_counts[stars])
     stars = np.sort(stars[np.argsort(-light, kind="stable")[:500]])
@@ -236,7 +258,8 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
         )
     modes = modes.of_stars(stars)
     posterior = TelescopePosterior(search, model, stars, optics)
-    # Two starts: near the prior's mean, and near the twin of that, unless no telescope is there.
+    # Two starts: near the prior's mean, and near the twin of that, unless no rays pass that
+    # telescope.
     q = posterior.number_count
     starts = [start_near(posterior, modes, np.zeros(q))]
     with suppress(RayTracingError):
@@ -261,7 +284,7 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
 
 
 def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
-    """Return the most probable state with its errors, and its twin if there is another peak.
+    """Return the most probable numbers with their errors, and their twin if there is another peak.
 
     Parameters
     ----------
@@ -269,26 +292,26 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     peaks : Peaks
         Where the climbs from both starts have come to; they may be the same place.
     """
-    model, stars = posterior.model, posterior.stars
+    model, star = posterior.model, posterior.star
     t = peaks.parameters[:, : posterior.number_count]
-    covariance, evidence = peaks.laplace()
-    best_peak = int(evidence.argmax())
-    state_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
-    sigma = np.sqrt(np.diagonal(state_covariance))
+    covariance, log_evidence = peaks.laplace()
+    best_peak = int(log_evidence.argmax())
+    number_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
+    sigma = np.sqrt(np.diagonal(number_covariance))
     # Peaks that are more than a standard deviation from the best one share the probability.
     twins = np.flatnonzero(np.abs((t - t[best_peak]) / sigma).max(axis=1) > 1)
     # Masses relative to that of the best peak.
-    mass = np.exp(evidence - evidence[best_peak])
+    mass = np.exp(log_evidence - log_evidence[best_peak])
     deviance = posterior.evaluate_stars(peaks.parameters[best_peak])[0]
     return Joint(
         model,
         value=model.mean + model.sd * t[best_peak],
         error=model.sd * sigma,
-        correlation=state_covariance / sigma / sigma[:, None],
+        correlation=number_covariance / sigma / sigma[:, None],
         probability=float(1.0 / (1.0 + mass[twins].sum())),
         twin=model.mean + model.sd * t[twins[0]] if twins.size else None,
-        star=stars,
-        disagrees=deviance > posterior.search.photons.deviance_limit[stars],
+        star=star,
+        disagrees=deviance > posterior.search.photons.deviance_limit[star],
     )
 
 
@@ -309,7 +332,8 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
     Returns
     -------
     ndarray, shape (Q + 4 m,)
-        Numbers of the telescope, then place, flux and sky of the chosen mode of each star.
+        Standardised numbers of the telescope, then place, flux and sky of the chosen mode of each
+        star.
     """
     # Coefficients of all modes in waves, with their covariance; a little is added to it, for
     # coefficients that the prior fixes.
@@ -318,14 +342,15 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
     measured = optics.coefficients(modes.star, modes.parameters[:, :count])
     covariance = sd[:, :, None] * modes.covariance[:, :count, :count] * sd[:, None]
     covariance = covariance + 1e-6 * np.eye(count)
-    row = np.searchsorted(posterior.stars, modes.star)
+    # Which star of the posterior each mode belongs to.
+    row = np.searchsorted(posterior.star, modes.star)
     # Four rounds: a star may choose another mode as the numbers move.
     for _ in range(4):
         # Squared Mahalanobis distance of each mode; the first of each star in this order is the
         # nearest.
         gap = measured - posterior.coefficients(t)[row]
-        precise = np.linalg.solve(covariance, gap[:, :, None])[:, :, 0]
-        order = np.lexsort((np.einsum("mk,mk->m", gap, precise), modes.star))
+        weighted_gap = np.linalg.solve(covariance, gap[:, :, None])[:, :, 0]
+        order = np.lexsort((np.einsum("mk,mk->m", gap, weighted_gap), modes.star))
         nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
         # Gauss–Newton step of the numbers, with their prior.
         slopes = posterior.slopes(t)
@@ -337,17 +362,18 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
 
 
 def twin_numbers(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
-    """Return standardised numbers whose stars have the even coefficients of t (Q,) negated.
+    """Return standardised numbers whose coefficients are those of t (Q,), the even ones negated.
 
-    A least-squares solution by Gauss–Newton steps: often no telescope has exactly these.
+    Even terms are equal at opposite points of the pupil. A least-squares solution by Gauss–Newton
+    steps: often no telescope has exactly these coefficients.
     """
     is_even = posterior.search.optics.terms.is_even
     # Coefficients that the twin should have; those of odd terms stay.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
     # Few steps do: coefficients are linear in the numbers, or nearly so.
     for _ in range(4):
-        # All coefficients of all stars are equations for the numbers; singular values below 1e-9
-        # are combinations of numbers that no coefficient shows.
+        # All coefficients of all stars are equations for the numbers; singular values below 1e-9 of
+        # the largest are combinations of numbers that no coefficient shows.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)
         gap = (target - posterior.coefficients(t)).ravel()
         t = np.clip(t + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0], -MAX_Z, MAX_Z)

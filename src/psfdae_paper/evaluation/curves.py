@@ -27,8 +27,8 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
     Parameters
     ----------
     histories : mapping
-        Table by label, with the columns step, train_mse and validation_mse (NaN where it was not
-        measured); errors are per pixel of stamps with sum 1.
+        Table of each network by its label in the legend, with the columns step, train_mse and
+        validation_mse (NaN where it was not measured); errors are per pixel of stamps with sum 1.
     title : str
     """
     # One panel; errors of all networks of the dataset are on the same scale.
@@ -39,14 +39,14 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
     for i, (label, history) in enumerate(histories.items()):
         color = SERIES_COLORS[i % len(SERIES_COLORS)]
         axes.plot(history["step"], history["train_mse"], color=color, lw=1.0, ls=":")
+        # The validation error is measured at few steps.
         validated = history.dropna(subset=["validation_mse"])
-        # Validation has fewer points, of which the best decides the network.
         step, mse = validated["step"], validated["validation_mse"]
         axes.plot(step, mse, color=color, lw=1.6, marker="o", ms=3.5)
         # The network of the smallest validation error is the result of the training.
         lowest = mse.argmin()
-        star: Style = {"marker": "*", "ms": 13, "mfc": color, "mec": "black", "ls": ""}
-        axes.plot(step.iloc[lowest], mse.iloc[lowest], **star)
+        kept_marker: Style = {"marker": "*", "ms": 13, "mfc": color, "mec": "black", "ls": ""}
+        axes.plot(step.iloc[lowest], mse.iloc[lowest], **kept_marker)
         entries.append(drawing.legend_entry(label, color=color, lw=1.6))
     # Below the networks the legend explains lines and markers.
     entries += [
@@ -69,12 +69,15 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
 def error_against_noise(
     metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric: str
 ) -> Figure:
-    """Draw a metric of every method against the noise level, one panel per reference.
+    """Draw a metric of every method against the noise level.
+
+    There is one panel per reference, realisation or template.
 
     Parameters
     ----------
     metrics : DataFrame
-        Rows of the stage `evaluate`; those of other datasets are not drawn.
+        Rows of the stage `evaluate`, with the columns dataset, split, reference, method,
+        noise_level, metric, value and stderr. Other datasets are not drawn.
     paper : DataFrame
         `psfdae_paper.evaluation.paper.published("psf")`, drawn where it has the dataset.
     dataset : str
@@ -84,12 +87,13 @@ def error_against_noise(
     measured = metrics[(metrics.dataset == dataset) & (metrics.metric == metric)]
     published = paper[(paper.dataset == dataset) & (paper.metric == metric)]
     published = published.assign(method=published["method"].map(paper_rows()))
-    # Test stars of all fields, and of fields that have no training star.
+    # Test stars of all field positions, and of those that have no training star.
     split_lines = {"random": "-", "held_out": "--"}
     figure, panels = drawing.reference_panels(measured)
     levels = np.unique(measured["noise_level"])
     for axes, _, reference_rows in panels:
-        # Lines with standard errors, dashed for held-out fields; the paper's values as markers.
+        # Lines with standard errors, dashed for held-out field positions; the paper's values as
+        # markers.
         for method_class, rows in drawing.by_method(reference_rows):
             for split, part in rows.groupby("split"):
                 line = part.sort_values("noise_level")
@@ -110,8 +114,11 @@ def error_against_noise(
             drawing.legend_entry(split_labels[split], ls=line, lw=1.4)
             for split, line in split_lines.items()
         ]
-    # An MSE spans decades over the noise levels; an SSIM lies between 0 and 1.
     title = f"{metric.upper()} of {dataset} against the noise level"
     label = drawing.METRIC_LABELS[metric]
-    drawing.finish_panels(figure, panels, title, handles, 4, label, logarithmic=metric == "mse")
+    # An MSE spans decades over the noise levels; an SSIM does not, and has a linear axis.
+    is_mse = metric == "mse"
+    drawing.finish_panels(
+        figure, panels, title, handles, columns=4, label=label, logarithmic=is_mse
+    )
     return figure

@@ -25,7 +25,7 @@ from psfdae.telescope.settings import OwnTelescope, Telescope
 from psfdae_paper.configuration.schema import Config, Grid
 from psfdae_paper.configuration.wavefront import VonKarman
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
-from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, Removal, draw_waves, layer_r0
+from psfdae_paper.stars.turbulence import SPECTRUM_FACTOR, Footprints, Removal, draw_waves, layer_r0
 
 
 class TurbulentWavefronts:
@@ -200,7 +200,7 @@ def turbulent_wavefronts(
     # a tenth of the light.
     highest_cycles = TurbulentWavefronts.highest_cycles
     cycles = wavefront.r0_m * highest_cycles / telescope.diameter_m
-    omitted_variance = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
+    omitted_variance = 1.2 * np.pi * SPECTRUM_FACTOR * cycles ** (-5.0 / 3.0)
     if omitted_variance > 0.1:
         raise SamplingError(
             f"wavefront.r0_m = {wavefront.r0_m:g}, telescope.diameter_m = "

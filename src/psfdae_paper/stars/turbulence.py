@@ -3,12 +3,12 @@
 Each layer is a sum of plane waves with random frequencies (sparse spectrum,
 Charnotskii 2013, JOSA A 30, 479 and JOSA A 30, 2455), so no screen is
 needed: the waves are known everywhere, and footprints tens of metres apart cost
-no more than one. A plane wave is separable, exp(iκ_x x) exp(iκ_y y), hence the
+no more than neighbouring ones. A plane wave is separable, exp(iκ_x x) exp(iκ_y y), hence the
 phase on the pupil grid of a direction is one matrix product.
 
-Lengths are in metres, spatial frequencies f in cycles per metre, phases in
-radians at the wavelength at which r0 is given, OPDs in waves of it. The spectrum
-is 0.0229 r0^(−5/3) (f² + 1/L0²)^(−11/6) rad² m².
+Lengths are in metres, spatial frequencies f in cycles per metre, wave vectors κ = 2πf
+(not the κ of the noise), phases in radians at the wavelength at which r0 is given,
+OPDs in waves of it, not metres. The spectrum is 0.0229 r0^(−5/3) (f² + 1/L0²)^(−11/6) rad² m².
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scipy.special import gamma, jv
 Removal = Literal["none", "piston", "tilt"]
 """Modes that can be taken out of wavefronts; "tilt" includes the piston."""
 
-SPECTRUM = gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
+SPECTRUM_FACTOR = gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
 """Factor 0.0229 of the phase spectrum.
 
 Its last factor is half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/r0)^(5/3).
@@ -108,7 +108,7 @@ def draw_waves(
     # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6), with f0 = 1/L0.
     integral = (edges**2 + outer_frequency**2) ** (-5.0 / 6.0)
     ring_integral = integral[:-1] - integral[1:]
-    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / per_ring
+    power = 2.0 * np.pi * SPECTRUM_FACTOR * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / per_ring
     # Radii by inversion of that integral; a wave's angle lies in its own part of the half-turn.
     radius_draw, angle_draw, phase_draw = rng.random((3, rings, per_ring))
     drawn_integral = integral[:-1, None] - radius_draw * ring_integral[:, None]
@@ -174,6 +174,15 @@ class Footprints:
         Linear obscuration of the pupil over which planes are fitted.
     remove : "none", "piston" or "tilt"
         What is taken out of every direction; "tilt" includes the piston.
+
+    Attributes
+    ----------
+    wavevector : ndarray, shape (K, 2)
+        Wave vectors κ of the waves of all layers, in radians per pupil radius.
+    coefficients : ndarray, shape (B, K)
+        Complex OPD of each wave in waves, in the middle of each footprint.
+    planes : ndarray, shape (B, 3)
+        Piston and tilts to subtract, in waves and in waves per pupil radius.
     """
 
     def __init__(
@@ -193,11 +202,13 @@ class Footprints:
         self.wavevector = np.pi * diameter * frequency  # radians per pupil radius
         # OPD in waves is the phase over 2π.
         self.coefficients = amplitude / (2.0 * np.pi) * np.exp(2j * np.pi * turns)
-        # Piston and tilts to subtract from each direction, shape (B, 3); the others are 0.
+        # Piston and tilts to subtract from each direction, shape (B, 3); terms that are not removed
+        # are 0 here.
         self.planes = (self.coefficients @ fitted_planes(self.wavevector, obscuration)).real
         removed_terms = {"none": 0, "piston": 1, "tilt": 3}[remove]
         self.planes[:, removed_terms:] = 0.0
-        # All directions look through the same part of a layer at height 0.
+        # Waves above the ground shift with the direction (moving); those at height 0 are common to
+        # all.
         self._moving = np.flatnonzero(height != 0.0)
         self._common = np.flatnonzero(height == 0.0)
         self._cache: dict[tuple[bytes, str], tuple[np.ndarray, ...]] = {}
@@ -233,8 +244,8 @@ class Footprints:
             rows = _real_rows(coefficients[part, None, :] * waves_y)
             opd[start : start + 4] = (rows @ waves_x).reshape(part.size, axis.size, -1)
         piston, tilt_x, tilt_y = self.planes[directions].T[:, :, None]
-        # The planes carry the tilts of thousands of waves: formed in float64, cast once.
         opd += common_opd
+        # The planes carry the tilts of thousands of waves: formed in float64, cast once.
         opd -= (piston + tilt_y * axis).astype(dtype)[:, :, None]
         opd -= (tilt_x * axis).astype(dtype)[:, None, :]
         # No copy if the directions are in ascending order and no one is named twice.
@@ -246,9 +257,9 @@ class Footprints:
 
         Returns
         -------
-        waves_y : ndarray, shape (M, K), complex
-            exp(iκ_y y) of the waves above the ground.
-        waves_x : ndarray, shape (2K, M), real
+        waves_y : ndarray, shape (M, K'), complex
+            exp(iκ_y y) of the K' waves above the ground.
+        waves_x : ndarray, shape (2K', M), real
             Real and imaginary parts of exp(−iκ_x x), interleaved.
         common_opd : ndarray, shape (M, M)
             OPD in waves of the layers at the ground, the same for all directions.
