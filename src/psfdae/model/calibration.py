@@ -20,7 +20,6 @@ from psfdae.bright_stars import BrightStars
 from psfdae.files import Product
 from psfdae.image.stamps import StarFlag
 from psfdae.method import Method
-from psfdae.methods import method
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import (
     ErrorModel,
@@ -439,13 +438,15 @@ def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
     return replace(bundle, errors=replace(bundle.errors, measured=measured))
 
 
-def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+def with_misfit(
+    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
+) -> Bundle:
     """Return the bundle with the noise over the flux with which bright stars are measured best.
 
     What the method does not know of a star's shape would pass for flux, if there is little noise
     beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
     """
-    if not method(bundle.info.method).finds_flux:
+    if not fitted.finds_flux:
         return bundle
     info, nodes = bundle.info, bundle.errors.noise
     test_stars = replace(stars, images=stars.images[: stars.min_images])
@@ -456,7 +457,8 @@ def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     misfits = (0.0, *nodes)
     for misfit in misfits:
         # The same stars with another idea of the noise of the flux's estimate.
-        model = PsfModel(replace(bundle, info=info.model_copy(update={"misfit": misfit})))
+        tried_info = info.model_copy(update={"misfit": misfit})
+        model = PsfModel(replace(bundle, info=tried_info), fitted)
         logs = []
         for images, star in noisy:
             prediction = model.predict(images)

@@ -81,6 +81,8 @@ def model_of(
         fitted, stars, reference, config, trained, name, licence, largest_mb
     )
     unpacked = estimator(bundle)  # errors are those of the fit as it is packed
+    rng = stream(config.seed, "noise", "calibration", "misfit")
+    bundle = with_misfit(bundle, unpacked, held_out, rng)
     if fitted.knows_field:
         bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
     # Errors on test stars; in an image, limits of outliers by its training stars, too.
@@ -119,7 +121,7 @@ def uncalibrated(
     Returns
     -------
     bundle : Bundle
-        Its errors are 0, but it has the noise that measures bright stars best (`with_misfit`).
+        Its errors are 0, and fluxes are measured as if the method knew every shape.
     stars : HeldOutStars
         Test stars, by which the errors are to be calibrated.
     """
@@ -164,8 +166,7 @@ def uncalibrated(
     nodes = noise_nodes(band)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     bundle = Bundle(info, arrays, flux_model, ErrorModel.uncalibrated(nodes, blank))
-    rng = stream(config.seed, "noise", "calibration", "misfit")
-    return with_misfit(bundle, held_out, rng), held_out
+    return bundle, held_out
 
 
 def _stamp_fields(product: Product) -> dict[str, Any]:
