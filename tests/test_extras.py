@@ -14,7 +14,7 @@ from psfdae import errors, load_model
 from psfdae.cli import refusal
 from psfdae.errors import MissingExtraError
 from psfdae.model.bundle import write_bundle
-from workflow_runs import ROOT
+from workflow_runs import ROOT, captured
 
 
 @pytest.fixture(autouse=True)
@@ -87,3 +87,12 @@ def test_an_extra_is_installed_from_where_psfdae_was(monkeypatch, tmp_path, note
     installed = SimpleNamespace(read_text=lambda name: text)
     monkeypatch.setattr(errors, "distribution", lambda name: installed)
     assert errors.install_line("dae").startswith(line.format(folder=tmp_path))
+
+
+def test_the_example_field_needs_no_extra():
+    """Its stage is the paper's, but pages on own images begin with it."""
+    absent = ("pandas", "hydra", "omegaconf", "mlflow", "torch", "snakemake")
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({absent})\nimport psfdae_paper.stages.simulate"
+    )
+    assert captured([sys.executable, "-c", code]).returncode == 0

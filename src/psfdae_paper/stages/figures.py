@@ -32,6 +32,7 @@ from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import published
 from psfdae_paper.stages.evaluate import READS, Evaluations, Metric, Models, estimators
 from psfdae_paper.stars.fields import square_grid
+from psfdae_paper.stars.framing import without_margin
 
 Stars = Annotated[File, "Product of the stage stars."]
 Templates = Annotated[File, "Product of the stage templates."]
@@ -232,14 +233,6 @@ def figure_errors(
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
         write_png(curves.error_against_noise(metrics, published("psf"), dataset, metric), path)
-
-
-def without_margin(templates: Product) -> np.ndarray:
-    """Return static PSFs as they are in stamps without centring error, shape (F, d, d)."""
-    # Templates have a margin on every side, from which a stamp is cut with any centring error.
-    margin = templates.config["framing"]["jitter_px"]
-    side = templates["psf"].shape[-1] - margin
-    return templates["psf"][:, margin:side, margin:side]
 
 
 @command("figure bounds")

@@ -13,11 +13,17 @@ from typing import Annotated
 
 import click
 import numpy as np
-import pandas as pd
 
 from psfdae.errors import Error
 from psfdae.figures import write_png
-from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
+from psfdae.files import (
+    Product,
+    atomic_path,
+    check_outputs,
+    read_product,
+    write_columns,
+    write_fits,
+)
 from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
 from psfdae.optics.pupil import SamplingError
@@ -29,11 +35,10 @@ from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
-from psfdae_paper.stages.figures import without_margin
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
 from psfdae_paper.stars.example import example_field as simulate_field
-from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux
+from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux, without_margin
 from psfdae_paper.stars.scenes import template_wavefronts
 
 
@@ -117,7 +122,7 @@ def figure_telescope(
         "position_angle_deg": fields.position_angle_deg,
         "pupil_samples": product["pupil_samples"],
     }
-    write_csv(table, pd.DataFrame(columns), 6)
+    write_columns(table, columns, digits=6)
     write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
 
 

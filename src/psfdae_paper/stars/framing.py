@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psfdae.errors import Error
+from psfdae.files import Product
 from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import (
     Pupil,
@@ -402,3 +403,11 @@ class Propagation:
         if self._blur is not None:
             return BlurredPropagator(*geometry, self._blur, precision)
         return StampPropagator(*geometry, extra, precision, self.optics.backend)
+
+
+def without_margin(templates: Product) -> np.ndarray:
+    """Return static PSFs as they are in stamps without centring error, shape (F, d, d)."""
+    # Templates have a margin on every side, from which a stamp is cut with any centring error.
+    margin = templates.config["framing"]["jitter_px"]
+    side = templates["psf"].shape[-1] - margin
+    return templates["psf"][:, margin:side, margin:side]
