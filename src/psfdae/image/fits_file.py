@@ -202,7 +202,7 @@ class ImageFile:
 
     @property
     def path(self) -> Path:
-        """What messages call the file (`file.name`); not the path that is opened."""
+        """Name of the file in messages (`file.name`); not the path that is opened."""
         return self.file.name
 
     @property

@@ -120,7 +120,7 @@ class TelescopePosterior:
 
     @cached_property
     def broadening(self) -> SampledStamps:
-        """What computes the derivatives of stamps by the logarithm of the FWHM of the seeing."""
+        """Propagation of the derivatives of stamps by the logarithm of the FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
