@@ -26,7 +26,8 @@ def source_hash(*names: str) -> str:
     These are the modules that they import, the modules that those import, and so on. Docstrings,
     comments and formatting do not count, nor do imports that only annotations or decorators use.
     Modules that are imported by a computed name, such as that of the method that is fitted, cannot
-    be recognised; name them, too.
+    be recognised, nor are imports that a module does not use itself, such as re-exports, relative
+    ones or those of all names; name these modules, too.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def _path(module: str) -> Path | None:
 def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
     """Yield the modules of the packages that a module imports, and files beside a program."""
     # Nodes below annotations of arguments and variables, return types and decorators: names that
-    # only these use decide no result.
+    # only these use are taken not to decide a result.
     ignored_nodes = set()
     for node in ast.walk(tree):
         parts = [getattr(node, name, None) for name in ("annotation", "returns")]
@@ -128,7 +129,8 @@ def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[
 def git_commit() -> str:
     """Return the commit of the source tree.
 
-    It ends in "-dirty" if files differ from the commit, and is "unknown" outside git.
+    It ends in "-dirty" if tracked files differ from the commit. It is "unknown" if the source tree
+    is not itself the root of a git repository, or git fails.
     """
     try:
         # A package that is installed into an environment inside another repository does not
@@ -142,7 +144,7 @@ def git_commit() -> str:
 
 
 def git(*arguments: str) -> str:
-    """Return the output of git in the folder of the package.
+    """Return the stripped output of git, run in the root of the repository.
 
     Raises
     ------

@@ -61,7 +61,9 @@ def description(bundle: Bundle) -> str:
     # Names are padded to the longest one, so that all facts begin in the same column.
     width = max(len(name) for name in facts)
     lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
-    return "\n".join([*lines, "", "Errors of the test stars:", _error_table(info)])
+    # A model that has met no test stars, such as a registered one, has no table.
+    table = _error_table(info)
+    return "\n".join([*lines, *(["", "Errors of the test stars:", table] if table else [])])
 
 
 def _error_table(info: BundleInfo) -> str:

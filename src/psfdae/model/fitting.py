@@ -41,8 +41,8 @@ def fit(
     ----------
     stars : Stars
     method : str, optional
-        "gmm", "field" or "dae"; by default the one of the first two with the smaller error on
-        validation stars.
+        "gmm", "field" or "dae"; by default, of the methods in the settings, the one with the
+        smallest error on validation stars, or "field" where stars are few.
     name : str, optional
         Name of the model; by default the image's.
     licence : str
@@ -58,7 +58,8 @@ def fit(
     Raises
     ------
     Error
-        If the method makes no model of an image, or a setting is wrong.
+        If the method's fits cannot be saved as a model, a package is missing, or a setting is
+        wrong.
 
     Examples
     --------
@@ -81,10 +82,10 @@ def fit(
 
 
 def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
-    """Return the methods that may become the model: for few stars, the field alone.
+    """Return the methods that may become the model: for few stars, "field" alone.
 
-    Too few stars are left to choose a method by validation, and only the field falls back to one
-    PSF for all.
+    Too few stars are left to choose a method by validation, and only the method "field" falls back
+    to one PSF for all stars.
     """
     # Without the field among them, all are tried, however few the stars are.
     field = [kind for kind in kinds if kind.name == "field"]
@@ -132,7 +133,7 @@ def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
 
 
 def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
-    """Choose the method with the smallest error on validation stars, which no fit has seen.
+    """Choose the method with the smallest error on validation stars, unseen by what is judged.
 
     Parameters
     ----------
@@ -156,12 +157,13 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
         judged, kind = fitted, type(fitted)
         data = stars.training_set(kind)
         with fixed_threads(kind.threads(settings)):
-            # A method that learns from the validation stars as well is fitted without them.
+            # A method without a need of validation stars has learnt from them as well: what is
+            # judged is a fit without them. One that needs them, to stop, has not.
             if not kind.needs.validation:
                 judged = fit_apart(kind, data, product["field_index"], settings)
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
-            # Stars of the model's use have an unknown flux.
+            # Stars to which the model will be applied have an unknown flux: it is free here.
             restorer = judged.free_flux()
             # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
@@ -174,7 +176,9 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
 
 
 def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
-    """Return the model of a fit, with its errors on held-out stars, and the wings of stars.
+    """Return the model of a fit with its errors on held-out stars, and with wings.
+
+    Wings are there if the method knows the field, and an image shows any.
 
     Parameters
     ----------
@@ -193,7 +197,8 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
         )
         if not fitted.knows_field or stars.observation.shape is None:
             return model
-        # Light beyond the stamps, by all stars of each image; neighbours may have measured it.
+        # Light beyond the stamps, by all stars of each image; where neighbours were subtracted,
+        # it has been measured for that.
         measured = (
             image.wings or wings_of_stars(model, image.observation.with_margin(model.margin_px))
             for image in stars.images

@@ -1,16 +1,17 @@
 """Fraunhofer propagation from a pupil to the pixels of a stamp.
 
-The field at the image angle u (in λ/D) of a pupil with transmission A(x) and
-OPD W(x) in waves, x in pupil radii, is
+The field at the image angle u (in λ/D) of a pupil with amplitude transmission A(x)
+and OPD W(x) in waves, x in pupil radii, is
 
     E(u) = Σ A(x) exp(2πi W(x)) exp(−πi u·x),
 
 two matrix products per stamp (a matrix DFT, Soummer et al. 2007, Opt. Express
-15, 15935). Only the points that are needed are computed; there is no padded grid. Pupil
-and points are symmetric about the chief ray. With s and t the even and odd part
-of the phase 2πW over y, two rows of the pupil together are
+15, 15935). Only the points that are needed are computed; there is no padded grid. The
+pupil is the same at +y and −y, and the points are symmetric about the chief ray. With s
+and t the even and odd part of the phase 2πW over y, the rows of the pupil at +y and −y
+together are
 
-    exp(is) cos(t − πu y) = exp(is) (cos t cos πuy + sin t sin πuy),
+    2 A exp(is) cos(t − πu_y y) = 2 A exp(is) (cos t cos πu_y y + sin t sin πu_y y),
 
 so one half of the pupil and of the points suffices, and all products are real.
 
@@ -80,10 +81,12 @@ def image_points(
     points : ndarray, shape (m,)
         In λ/D from the chief ray, ascending.
     even_weights, odd_weights : ndarray, shape (m, ⌈d/2⌉)
-        An intensity that is the same on both sides has eᵀI on the pixels from the chief
-        ray on; one that changes its sign has oᵀI.
+        For the intensity I (m,) at the points, even_weights.T @ I is its integral over each
+        pixel from the chief ray outward if I is even about the chief ray, odd_weights.T @ I if
+        I is odd.
     """
-    # Half of the points. Two per λ/D resolve the highest frequency, half the pupil's width in λ/D;
+    # Half of the points. Two per λ/D resolve the highest frequency, in cycles per λ/D the pupil's
+    # width in D, which is half of that in radii;
     # `extra` more are for the accuracy.
     edge = 0.5 * stamp_px * pixel
     highest = 0.5 * (pupil.axis.size - 1) * pupil.spacing
@@ -233,7 +236,8 @@ class StampPropagator:
         """Return the even and odd parts of |E|² over x and over y, (2, 2, B, m, m).
 
         Those that are odd in x are halved. `field` holds [cosine or sine in x, in y, real or
-        imaginary]. At ±x and ±y the field is (C ± S)_cos ∓ i (C ± S)_sin.
+        imaginary]. With C and S the cosine and sine parts in y, the field at (a x, b y), a and b
+        each ±1, is (C + b S)_cos − i a (C + b S)_sin; the subscript is the part in x.
         """
         xp, shape = self._xp, tuple(field.shape[3:])
         product = self._buffer("product", 2, 2, 2, *shape)
@@ -261,8 +265,8 @@ class StampPropagator:
         parts = np.asarray(self._xp.matmul(self._to_y[:, None], along_x))
         d, half = self.stamp_px, (self.stamp_px + 1) // 2
         above, below = slice(d // 2, None), slice(half - 1, None, -1)
-        # Pixels at ±x and ±y are even ± odd parts. The middle pixel of an odd stamp is written by
-        # both sides, which agree.
+        # Pixels at ±x and ±y are even ± odd parts; those odd in x were halved, hence the factor 2.
+        # The middle pixel of an odd stamp is written by both sides, which agree.
         stamp = np.empty((len(parts[0, 0]), d, d), self.real_dtype)
         for sign, columns in ((2.0, above), (-2.0, below)):
             even_rows, odd_rows = parts[0] + sign * parts[1]
@@ -297,14 +301,14 @@ def in_batches(
     Parameters
     ----------
     samples : ndarray of int, shape (B,)
-        Pupil samples N of every wavefront.
+        Samples N along a side of the pupil grid of every wavefront.
     size : int
         Largest number of wavefronts in a batch.
     threads : int
         Batches at once; linear algebra should be on one thread meanwhile.
     prepare : callable
-        Function of N that returns the work on a batch: a function of its wavefronts' numbers,
-        shape (b,).
+        Function of N that returns the work on one batch: a function of the indices into
+        `samples`, shape (b,), which stores its own results.
     """
     # One grid after the other, from the coarsest on.
     for count in np.unique(samples):
