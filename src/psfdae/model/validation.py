@@ -295,7 +295,7 @@ class Report:
 
     def __str__(self) -> str:
         method_class = type(self.model.method)
-        return comparison_sentence(self.table, method_class.name, method_class.look.label)
+        return comparison_sentence(self.table, method_class.name, method_class.look.title)
 
     def __repr__(self) -> str:
         return f"Report({self.model.name!r}, {self})"
@@ -374,7 +374,7 @@ class Report:
                 scale = _level_scale(self.model, self.stars) if is_model else 1.0
                 stamps = method.restore(noisy, scale * levels[snr], place[shown])
                 error = mse(stamps, truth)
-                rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
+                rows.append(StripRow(look.title, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
         title = f"Bright stars that no training saw, degraded to S/N {snr:.3g}"
         return restoration_strip(rows, columns, title)
