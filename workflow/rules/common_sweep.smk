@@ -54,7 +54,9 @@ def sweep_source(name):
     sweep = sweep_plan(name).sweep
     search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
     own = [] if sweep.model in swept_networks() else [method(sweep.model).__module__]
-    return source_hash("sweep point", training_class(sweep.model).partition(":")[0], *own, *search)
+    return source_hash(
+        "sweep point", training_class(sweep.model).partition(":")[0], *own, *search
+    )
 
 
 def sweep_results(w):
