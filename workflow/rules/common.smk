@@ -2,6 +2,7 @@ import os
 import shlex
 import sys
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from inspect import getdoc
@@ -25,7 +26,6 @@ from psfdae_paper.configuration.compose import (
 from psfdae.method import HISTORY
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
-from psfdae.errors import did_you_mean
 from psfdae.files import ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError

@@ -45,10 +45,10 @@ def phase_of(place: np.ndarray, phases: np.ndarray, side: int) -> tuple[int, np.
     window : ndarray of int, shape (side²,)
         Pixels of the frame, which has a star in its middle pixel, that are the stamp.
     """
-    # A star `whole` pixels off the middle is seen by a window that is moved the other way.
-    whole = np.floor(np.round(place, 9) + 0.5)
-    row, column = np.abs((place - whole)[:, None] - phases).argmin(axis=1)
-    rows, columns = (np.arange(side) + MARGIN_PX - w for w in whole.astype(int))
+    # A star whose nearest pixel is off the middle is seen by a window that is moved the other way.
+    nearest_pixel = np.floor(np.round(place, 9) + 0.5)
+    row, column = np.abs((place - nearest_pixel)[:, None] - phases).argmin(axis=1)
+    rows, columns = (np.arange(side) + MARGIN_PX - w for w in nearest_pixel.astype(int))
     window = (rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel()
     return int(row * len(phases) + column), np.asarray(window)
 

@@ -120,11 +120,13 @@ def predict_stars(
         If the image or its list cannot be used, or the positions of the list are far off.
     """
     observation = open_for_model(model, source, fixed)
-    stamps, predictions = zip(*model.stream(observation, threads, fixed), strict=True)
+    # Of the stamps, only the offsets of the stars from their list stay in memory.
+    predictions, offsets = [], []
+    for stamps, prediction in model.stream(observation, threads, fixed):
+        predictions.append(prediction)
+        offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
     # The stars are near the listed positions, or the list is refused.
-    pairs = zip(stamps, predictions, strict=True)
-    offsets = np.concatenate([offsets_from_list(*pair, model.margin_px) for pair in pairs])
-    offset_note = list_offset(observation.catalogue, offsets, source.accept_offset)
+    offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     notes = [observation.summary(), offset_note if observation.shape else None]
     notes += notes_on_model(model, observation)
     return replace(Prediction.joined(predictions), notes=tuple(filter(None, notes)))
