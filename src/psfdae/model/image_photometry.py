@@ -61,8 +61,7 @@ class ImagePhotometry:
         """Image without its sky and stars, in the unit of the image."""
         from astropy.nddata import CCDData
 
-        unit = self.table["flux"].unit
-        return CCDData(self.measured.residual.astype(np.float32), unit=unit)
+        return CCDData(self.measured.residual.astype(np.float32), unit=self.table["flux"].unit)
 
 
 class ImageFluxes:
