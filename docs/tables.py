@@ -1,7 +1,7 @@
 """Numbers of README and docs, from the run of record and the configuration.
 
-A page has a number between two comments, `<!--n:KEY-->…<!--/-->`; `docs/numbers.yaml` says where the
-number of each key comes from, and in which form it is written.
+A page has a number between two comments, `<!--n:KEY-->…<!--/-->`; `docs/numbers.yaml` says where
+the number of each key comes from, and in which form it is written.
 
 Numbers of an earlier record (`kept` in its provenance) or of a study (its columns `date` and
 `commit`) get their date and commit beside them: a line below a table; words behind the first
