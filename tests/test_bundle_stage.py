@@ -70,10 +70,10 @@ def folder(tmp_path_factory):
 
 
 def pack(folder, out, overrides=(), **options):
-    chosen = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
-    chosen["models"] = Models(dae=options.pop("dae", folder / "dae"))
+    inputs = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
+    inputs["models"] = Models(dae=options.pop("dae", folder / "dae"))
     config = load_stage(stage.bundle.stage.settings.reads, [*TINY, *overrides])
-    stage.bundle(config, out=out, **(chosen | options))
+    stage.bundle(config, out=out, **(inputs | options))
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +101,12 @@ def test_info_says_what_the_stars_and_the_training_were(tiny):
 
 
 def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
-    own = {"telescope": {"pixel_scale_arcsec": 2.0}, "framing": {"jitter_px": 0}, "source": "stars"}
-    stars = write_stars(tmp_path / "own.h5", own)
+    optics = {
+        "telescope": {"pixel_scale_arcsec": 2.0},
+        "framing": {"jitter_px": 0},
+        "source": "stars",
+    }
+    stars = write_stars(tmp_path / "own.h5", optics)
     with pytest.raises(ProductError, match=r"pixel_scale_arcsec = 0\.1, but .*own\.h5 has 2\.0"):
         pack(folder, tmp_path / "own", stars=stars)
     shutil.copytree(folder / "dae", tmp_path / "dae")
@@ -143,8 +147,8 @@ def test_half_width_covers_fresh_stars(tiny):
     noisy = noise_model(config).draw(images, noise / 4.98, rng)
     error = estimator(tiny).predict(noisy) - images
     for part in np.array_split(np.argsort(noise), 3):
-        within = covered(error[part], noise[part], tiny.errors.noise, tiny.errors.half_width68)
-        assert within == pytest.approx(0.6827, abs=0.05)
+        coverage = covered(error[part], noise[part], tiny.errors.noise, tiny.errors.half_width68)
+        assert coverage == pytest.approx(0.6827, abs=0.05)
     for row in tiny.info.metrics:
         assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
 
@@ -162,25 +166,25 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(mixture):
     """Its σ tells stars apart; the bundle's table corrects it. Threads change nothing."""
     images, noise, rng = fresh_stars()
     noisy = images + rng.normal(size=images.shape) * noise[:, None, None]
-    known = {"flux": 1.0, "background": 0.0, "noise": noise}
-    found, again = (PsfModel(mixture).predict(noisy, **known, threads=n) for n in (1, 2))
-    assert all((getattr(again, name) == getattr(found, name)).all() for name in ("psf", "snr"))
-    free = PsfModel(mixture).predict(noisy + 3.0, noise=noise)
-    kept = np.isfinite(free.psf).all(axis=(1, 2))
+    stated = {"flux": 1.0, "background": 0.0, "noise": noise}
+    exact, threaded = (PsfModel(mixture).predict(noisy, **stated, threads=n) for n in (1, 2))
+    assert all((getattr(threaded, name) == getattr(exact, name)).all() for name in ("psf", "snr"))
+    fitted = PsfModel(mixture).predict(noisy + 3.0, noise=noise)
+    valid = np.isfinite(fitted.psf).all(axis=(1, 2))
     for part in np.array_split(np.argsort(noise), 3):
-        for prediction, rows, scatter in ((found, part, 0.02), (free, part[kept[part]], 0.035)):
+        for prediction, rows, scatter in ((exact, part, 0.02), (fitted, part[valid[part]], 0.035)):
             error, width = np.abs(prediction.psf - images)[rows], prediction.uncertainty[rows]
-            wide = width * prediction.ratio95[rows, None, None]
+            width95 = width * prediction.ratio95[rows, None, None]
             assert (error <= width).mean() == pytest.approx(0.683, abs=0.03)
-            assert (error <= wide).mean() == pytest.approx(0.95, abs=scatter)
+            assert (error <= width95).mean() == pytest.approx(0.95, abs=scatter)
     assert mixture.info.metrics[0]["coverage95"] == pytest.approx(0.95, abs=0.02)
-    error, scale = found.psf - images, noise[:, None, None]
-    wrong, doubt = (np.square(a / scale).mean(axis=(1, 2)) for a in (error, found.uncertainty))
-    surest, least = np.array_split(np.argsort(doubt), 2)
-    assert wrong[least].mean() > 1.3 * wrong[surest].mean()
-    assert free.psf[kept].sum(axis=(1, 2)) == pytest.approx(free.flux[kept], rel=1e-3)
-    one = PsfModel(mixture).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
-    np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
+    error, scale = exact.psf - images, noise[:, None, None]
+    error2, sigma2 = (np.square(a / scale).mean(axis=(1, 2)) for a in (error, exact.uncertainty))
+    surest, unsure = np.array_split(np.argsort(sigma2), 2)
+    assert error2[unsure].mean() > 1.3 * error2[surest].mean()
+    assert fitted.psf[valid].sum(axis=(1, 2)) == pytest.approx(fitted.flux[valid], rel=1e-3)
+    single = PsfModel(mixture).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
+    np.testing.assert_allclose(single.psf[0], exact.psf[7], atol=1e-6)
 
 
 def test_a_mixture_measures_flux_better_than_the_photometry_and_flags_blends(mixture, tiny):
@@ -188,37 +192,40 @@ def test_a_mixture_measures_flux_better_than_the_photometry_and_flags_blends(mix
     noise = np.minimum(noise, 0.01)
     noisy = images + rng.normal(size=images.shape) * noise[:, None, None]
     models = [PsfModel(bundle) for bundle in (mixture, tiny)]
-    free, dae = (model.predict(noisy + 3.0, noise=noise) for model in models)
-    errors = [np.sqrt(np.square(found.flux - 1).mean()) for found in (free, dae)]
+    gmm, dae = (model.predict(noisy + 3.0, noise=noise) for model in models)
+    errors = [np.sqrt(np.square(result.flux - 1).mean()) for result in (gmm, dae)]
     assert errors[0] < 0.9 * errors[1]
     # Whatever the flux, the light of the stamp stays.
-    light = free.flux + 144 * free.background
+    light = gmm.flux + 144 * gmm.background
     assert light == pytest.approx(dae.flux + 144 * dae.background, nan_ok=True)
     blends = 0.7 * noisy + 0.3 * np.roll(noisy, 5, axis=2)
-    strange, other = (model.predict(blends, noise=noise) for model in models)
-    flagged = [(p.flags & StarFlag.UNLIKE_TRAINING > 0).mean() for p in (free, strange, other)]
+    gmm_blend, dae_blend = (model.predict(blends, noise=noise) for model in models)
+    flagged = [(p.flags & StarFlag.UNLIKE_TRAINING > 0).mean() for p in (gmm, gmm_blend, dae_blend)]
     assert flagged[0] < 0.02 and flagged[1] > 0.1 > flagged[2]
-    assert np.isfinite(strange.outlier_score).mean() > 0.9 and np.isnan(other.outlier_score).all()
+    assert (
+        np.isfinite(gmm_blend.outlier_score).mean() > 0.9
+        and np.isnan(dae_blend.outlier_score).all()
+    )
 
 
-@pytest.mark.parametrize("told", [(), ("background", "noise")])
-def test_bright_pixels_are_covered_as_the_others_are(tiny, told):
+@pytest.mark.parametrize("names", [(), ("background", "noise")])
+def test_bright_pixels_are_covered_as_the_others_are(tiny, names):
     """Of unseen stars, whatever is known of them beside their flux."""
     images, rng = gaussians(1500, 99), np.random.default_rng(5)
     model = PsfModel(tiny)
     for noise in (6e-3, 1.5e-2):
         noisy = images + noise * rng.normal(size=images.shape) + 3.0
-        known = {"background": 3.0, "noise": noise}
-        found = model.predict(noisy, **{name: known[name] for name in told})
-        kept = np.isfinite(found.psf).all(axis=(1, 2))
-        error, width = np.abs(found.psf - images)[kept], found.uncertainty[kept]
-        bright = brightest(found.psf[kept])
+        stated = {"background": 3.0, "noise": noise}
+        result = model.predict(noisy, **{name: stated[name] for name in names})
+        valid = np.isfinite(result.psf).all(axis=(1, 2))
+        error, width = np.abs(result.psf - images)[valid], result.uncertainty[valid]
+        bright = brightest(result.psf[valid])
         assert bright.mean() == pytest.approx(20 / 256, abs=0.01)
-        both = (found.ratio95_bright, bright), (found.ratio95, ~bright)
-        for ratio, pixels in both:
-            wide = width * ratio[kept, None, None]
+        cases = (result.ratio95_bright, bright), (result.ratio95, ~bright)
+        for ratio, pixels in cases:
+            width95 = width * ratio[valid, None, None]
             assert (error <= width)[pixels].mean() == pytest.approx(0.683, abs=0.03)
-            assert (error <= wide)[pixels].mean() == pytest.approx(0.95, abs=0.02)
+            assert (error <= width95)[pixels].mean() == pytest.approx(0.95, abs=0.02)
 
 
 def test_errors_of_some_stars_are_those_stars_errors():
@@ -226,12 +233,12 @@ def test_errors_of_some_stars_are_those_stars_errors():
     star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
     error = np.arange(10.0)[None, :, None, None] + np.zeros((2, 10, 4, 4))
     distance = 100.0 + np.arange(20.0).reshape(2, 10)
-    some = StarErrors(np.array([1.0, 2.0]), error, star, distance).of(
+    subset = StarErrors(np.array([1.0, 2.0]), error, star, distance).of(
         np.array([False, True, False, False, True])
     )
-    assert some.star.tolist() == [1, 4, 1, 4]
-    assert (some.error[:, :, 0, 0] == [1, 4, 6, 9]).all()
-    assert (some.distance == [[101, 104, 106, 109], [111, 114, 116, 119]]).all()
+    assert subset.star.tolist() == [1, 4, 1, 4]
+    assert (subset.error[:, :, 0, 0] == [1, 4, 6, 9]).all()
+    assert (subset.distance == [[101, 104, 106, 109], [111, 114, 116, 119]]).all()
 
 
 def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
@@ -241,9 +248,9 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     error = rng.normal(size=(1, 4000, 8, 8)) * scale
     errors = StarErrors(np.array([0.01]), np.abs(error), star, np.zeros((1, 4000)))
     fresh = np.abs(rng.normal(size=(400, 8, 8)) * scale[:400])
-    found = crossed_coverage(errors)(fresh, 0.01)
-    wanted = {"coverage68": (0.9973 + 0.2611) / 2, "coverage95": (1 + 0.4865) / 2}
-    assert found == pytest.approx(wanted, abs=0.01)
+    coverage = crossed_coverage(errors)(fresh, 0.01)
+    expected = {"coverage68": (0.9973 + 0.2611) / 2, "coverage95": (1 + 0.4865) / 2}
+    assert coverage == pytest.approx(expected, abs=0.01)
 
 
 def test_distance_is_the_number_of_components_whatever_the_noise():
@@ -292,11 +299,11 @@ def test_shipped_bundle_is_small_and_wide():
 def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     """The bundle that errs least on the validation stars, of a fit that has not seen them."""
     config = load_stage(stage.ship.stage.settings.reads, TINY)
-    given = {"stars": folder / "stars.h5", "out": tmp_path / "bundles"}
+    inputs = {"stars": folder / "stars.h5", "out": tmp_path / "bundles"}
     weights = {name: 0 * array for name, array in tiny.weights.items()}
-    worse, better = tmp_path / "none.psf.safetensors", folder / "tiny.psf.safetensors"
-    write_bundle(replace(tiny, weights=weights), worse)
-    stage.ship(config, (worse, better), **given)
+    untrained, trained = tmp_path / "none.psf.safetensors", folder / "tiny.psf.safetensors"
+    write_bundle(replace(tiny, weights=weights), untrained)
+    stage.ship(config, (untrained, trained), **inputs)
     lines = capsys.readouterr().out.splitlines()[:2]
     errors = [float(line.split("MSE ")[1].split()[0]) for line in lines]
     assert errors[0] > 2 * errors[1]
@@ -307,21 +314,24 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
     with pytest.raises(BundleError, match=r"half-widths contain 50\.0%"):
-        stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
+        stage.ship(config, (tmp_path / "poor.psf.safetensors",), **inputs)
 
 
 def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_two_thirds_or_more():
     """Own noise three times the method's errors: most of these are hidden in it, star by star."""
     rng = np.random.default_rng(6)
-    own, error = 3e-3, 1e-3
+    own_sigma, error = 3e-3, 1e-3
     zero = np.zeros((2000, 8, 8), np.float32)
-    own_noise = np.full(zero.shape, own)
+    own_noise = np.full(zero.shape, own_sigma)
     of = NoiseModel(1.0, 1e4), np.zeros((2000, 4)), np.zeros(2000), own_noise
-    stars = HeldOutStars(zero, rng.normal(0, own, zero.shape), *of)
+    stars = HeldOutStars(zero, rng.normal(0, own_sigma, zero.shape), *of)
     psf = rng.normal(0, error, zero.shape)
-    few = np.arange(40)
-    errors, distance = stars.errors(psf[few], few)[None], np.ones((1, few.size))
-    width = StarErrors(np.ones(1), errors, few, distance).half_width
-    assert width.min() > 0 and 0.1 * own < width.mean() < 0.7 * own
-    within = covered(stars.errors(psf), np.ones(2000), np.ones(1), width)
-    assert within == pytest.approx(0.72, abs=0.05)
+    first_stars = np.arange(40)
+    errors, distance = (
+        stars.errors(psf[first_stars], first_stars)[None],
+        np.ones((1, first_stars.size)),
+    )
+    width = StarErrors(np.ones(1), errors, first_stars, distance).half_width
+    assert width.min() > 0 and 0.1 * own_sigma < width.mean() < 0.7 * own_sigma
+    coverage = covered(stars.errors(psf), np.ones(2000), np.ones(1), width)
+    assert coverage == pytest.approx(0.72, abs=0.05)

@@ -30,7 +30,7 @@ from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.wings import StarFluxes, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
-SIZE, SKY, STAMP, WIDE = 330, 200.0, 10, 61
+SIZE, SKY, STAMP, FRAME = 330, 200.0, 10, 61
 RADIUS = np.geomspace(5, 25, 7)  # of the tents of wings
 CORE, CORE_PX, WING_PX = 0.94, 1.4, 3.0  # flux of the Gaussian, its σ, and the radius of the wings
 
@@ -45,13 +45,13 @@ def profile(dx, dy):
 
 def stamps(x, y):
     """Stars (n, WIDE, WIDE) at the sub-pixel phases of places; a pixel is 3 × 3 points."""
-    axis = (np.arange(WIDE * 3) + 0.5) / 3 - 0.5 - WIDE // 2
+    axis = (np.arange(FRAME * 3) + 0.5) / 3 - 0.5 - FRAME // 2
     phase = np.stack([y - np.floor(y + 0.5), x - np.floor(x + 0.5)], axis=1)
     light = [profile(*np.meshgrid(axis - px, axis - py)) for py, px in phase]
-    return np.array(light).reshape(-1, WIDE, 3, WIDE, 3).mean(axis=(2, 4))
+    return np.array(light).reshape(-1, FRAME, 3, FRAME, 3).mean(axis=(2, 4))
 
 
-FEW = {"train_stars": 50, "test_stars": 12}
+COUNTS = {"train_stars": 50, "test_stars": 12}
 
 
 @pytest.fixture(scope="module")
@@ -64,26 +64,26 @@ def sky(tmp_path_factory):
     flux = 10 ** rng.uniform(3.7, 5.3, len(single))
     paired = np.arange(len(single)) % 5 == 0
     angle = rng.uniform(0, 2 * np.pi, paired.sum())
-    beside = single[paired] + 5.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    place = np.concatenate([single, beside])
+    companions = single[paired] + 5.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    place = np.concatenate([single, companions])
     light = np.concatenate([flux, 0.5 * flux[paired]])
     pixels = np.full((SIZE, SIZE), SKY)
     add_stamps(pixels, light[:, None, None] * stamps(*place.T), *place.T)
     pixels = rng.poisson(pixels) + rng.normal(0, 3, pixels.shape)
     write_field(folder / "i.fits", folder / "i.csv", pixels, *place.T, GAIN=1.0, RDNOISE=3.0)
     words = ("--catalogue", folder / "i.csv", "--method", "field", "--out", folder / "model")
-    few = ["methods=[noisy,field]", "framing.stamp_px=10", "field.orders=[0]", "field.modes=8"]
-    few += [f"parts.{name}={count}" for name, count in FEW.items()]
+    settings = ["methods=[noisy,field]", "framing.stamp_px=10", "field.orders=[0]", "field.modes=8"]
+    settings += [f"parts.{name}={count}" for name, count in COUNTS.items()]
     with few_draws():
-        done = psfdae("from-stars", folder / "i.fits", *words, *few)
-    assert done.exit_code == 0, done.output
+        result = psfdae("from-stars", folder / "i.fits", *words, *settings)
+    assert result.exit_code == 0, result.output
     true = Table({"x": place[:, 0], "y": place[:, 1], "flux": light})
-    true["pair"] = np.concatenate([paired, np.ones(len(beside), bool)])
+    true["pair"] = np.concatenate([paired, np.ones(len(companions), bool)])
     return folder, folder / "model/i.psf.safetensors", true
 
 
 @pytest.fixture(scope="module")
-def found(sky):
+def phot(sky):
     """The photometry of all stars, which are looked for."""
     folder, path, _ = sky
     observation = ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
@@ -92,88 +92,88 @@ def found(sky):
 
 def matched(rows, true):
     """Row of every true star; there is one within a pixel of each."""
-    place, where = (np.stack([t["x"], t["y"]], axis=1) for t in (rows, true))
-    off, row = cKDTree(place).query(where)
+    place, target = (np.stack([t["x"], t["y"]], axis=1) for t in (rows, true))
+    off, row = cKDTree(place).query(target)
     assert (off < 1.0).mean() > 0.98
     return np.where(off < 1.0, row, -1)
 
 
-def test_fluxes_are_those_of_the_stars_with_their_wings(sky, found):
+def test_fluxes_are_those_of_the_stars_with_their_wings(sky, phot):
     true = sky[2]
-    row = matched(found.stars, true)
+    row = matched(phot.stars, true)
     for kind in (~true["pair"], true["pair"]):
-        chosen = kind & (row >= 0) & (true["flux"] > 1e4)
-        ratio = found.stars["flux"][row[chosen]] / true["flux"][chosen]
-        error = found.stars["flux_error"][row[chosen]] / true["flux"][chosen]
+        is_bright = kind & (row >= 0) & (true["flux"] > 1e4)
+        ratio = phot.stars["flux"][row[is_bright]] / true["flux"][is_bright]
+        error = phot.stars["flux_error"][row[is_bright]] / true["flux"][is_bright]
         assert np.median(ratio) == pytest.approx(1.0, abs=0.004)
         pull = (ratio - np.median(ratio)) / error
         assert 0.5 < (np.abs(pull) < 1).mean() < 0.85
     # The model's own flux has not what lies beyond its stamp, nor what it takes for sky.
-    short = np.median(found.stars["flux_model"][row] / true["flux"])
+    short = np.median(phot.stars["flux_model"][row] / true["flux"])
     assert 0.975 < short < 0.993
 
 
-def test_there_are_as_many_stars_as_are_true(sky, found):
+def test_there_are_as_many_stars_as_are_true(sky, phot):
     true = sky[2]
-    assert len(found.stars) == pytest.approx(len(true), abs=0.02 * len(true))
-    assert found.residual.std() == pytest.approx(np.sqrt(SKY + 9), rel=0.15)
-    assert abs(np.median(found.residual)) < 0.5
+    assert len(phot.stars) == pytest.approx(len(true), abs=0.02 * len(true))
+    assert phot.residual.std() == pytest.approx(np.sqrt(SKY + 9), rel=0.15)
+    assert abs(np.median(phot.residual)) < 0.5
 
 
 def test_a_star_behind_a_brighter_one_is_found_in_the_second_round():
     level, noise = np.zeros((60, 60)), np.ones((60, 60))
     rows, columns = np.mgrid[:60, :60]
-    left = 40 * np.exp(-((rows - 20) ** 2 + (columns - 33) ** 2) / 4.0)
-    left += 40 * np.exp(-((rows - 40) ** 2 + (columns - 10) ** 2) / 4.0)
-    sky = crowded.Sky(left, level, noise, level > 0, np.nan)
-    known = np.array([[10.2, 40.1], [30.0, 20.0]])
-    place, flux = crowded.with_hidden_stars(sky, noise, known, np.array([1e4, 1e4]), 5.0, 3.0)
-    assert place[:2].tolist() == known.tolist() and len(place) == len(flux) == 3
+    residual = 40 * np.exp(-((rows - 20) ** 2 + (columns - 33) ** 2) / 4.0)
+    residual += 40 * np.exp(-((rows - 40) ** 2 + (columns - 10) ** 2) / 4.0)
+    sky = crowded.Sky(residual, level, noise, level > 0, np.nan)
+    bright = np.array([[10.2, 40.1], [30.0, 20.0]])
+    place, flux = crowded.with_hidden_stars(sky, noise, bright, np.array([1e4, 1e4]), 5.0, 3.0)
+    assert place[:2].tolist() == bright.tolist() and len(place) == len(flux) == 3
     assert place[2] == pytest.approx([33, 20], abs=0.1)
     # Beside a bright star, as much light may be a PSF that is a little off.
-    doubt = np.where(left > 1, 40.0, 1.0)
-    assert len(crowded.with_hidden_stars(sky, doubt, known, flux[:2], 5.0, 3.0)[0]) == 2
+    doubt = np.where(residual > 1, 40.0, 1.0)
+    assert len(crowded.with_hidden_stars(sky, doubt, bright, flux[:2], 5.0, 3.0)[0]) == 2
 
 
-def test_aperture_corrections(found):
+def test_aperture_corrections(phot):
     for x, y in ((100.0, 100.3), (290.4, 150.0)):
         image = stamps(np.array([x]), np.array([y]))[0]
-        middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + WIDE // 2
+        middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + FRAME // 2
 
         def light(radius, image=image, middle=middle):
             return CircularAperture(middle, radius).do_photometry(image)[0][0]
 
         for radius in (3.0, 4.0, 8.0, 15.0):
-            true = light(found.radius_px) / light(radius)
-            assert found.aperture_correction(x, y, radius) == pytest.approx(true, rel=0.005)
-    assert found.aperture_correction(150, 150, found.radius_px) == pytest.approx(1.0, abs=2e-3)
+            true = light(phot.radius_px) / light(radius)
+            assert phot.aperture_correction(x, y, radius) == pytest.approx(true, rel=0.005)
+    assert phot.aperture_correction(150, 150, phot.radius_px) == pytest.approx(1.0, abs=2e-3)
     with pytest.raises(ValueError, match="expected above 0 up to 25"):
-        found.aperture_correction(150, 150, 26)
+        phot.aperture_correction(150, 150, 26)
 
 
-def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
+def test_a_model_knows_the_light_beyond_its_stamps(sky, phot):
     folder, path, true = sky
     model = load_model(path)
-    assert model.wings is not None and found.wings is not None
+    assert model.wings is not None and phot.wings is not None
     # Wings are found in the image, and are no settings of the stars.
     stars = read_product(folder / "model/stars.h5", "stars")
     assert model.info.config["stars"] == stars.config
     light, error = model.wings.light()
-    assert light == pytest.approx(found.wings.light()[0], abs=4 * error + 0.004)
+    assert light == pytest.approx(phot.wings.light()[0], abs=4 * error + 0.004)
     observation = ImageInput(folder / "i.fits", catalogue=folder / "i.csv").open(STAMP, 2)
     ((_, measured),) = model.stream(observation)
-    alone = ~true["pair"] & (true["flux"] > 1e4)
-    ratio = measured.flux_total[alone] / true["flux"][alone]
+    is_single = ~true["pair"] & (true["flux"] > 1e4)
+    ratio = measured.flux_total[is_single] / true["flux"][is_single]
     # Wings of few stars have an error of their own.
     assert np.median(ratio) == pytest.approx(1.0, abs=0.006 + 2 * error)
-    assert np.median(measured.flux[alone] / true["flux"][alone]) < 0.993
+    assert np.median(measured.flux[is_single] / true["flux"][is_single]) < 0.993
     assert (measured.flux_total_error > measured.flux_error).all()
     assert psfdae("psf", path, "--grid", "2x2", "--out", folder / "g.fits").exit_code == 0
     header = fits.getheader(folder / "g.fits")
     assert header["FLUXRAD"] == 2.5 * STAMP
     assert header["INMODEL"] == pytest.approx(1 / (1 + light))
     assert model.aperture_correction(150, 150, 4.0) == pytest.approx(
-        found.aperture_correction(150, 150, 4.0), rel=0.006
+        phot.aperture_correction(150, 150, 4.0), rel=0.006
     )
 
 
@@ -199,15 +199,15 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     """An even light beside them does not count; faint stars leave what is expected of any star."""
     rng = np.random.default_rng(1)
     place, flux = rng.uniform(0, 300, (30, 2)), brightness * 10 ** rng.uniform(4, 5.5, 30)
-    outer = np.full(30, 0.03)
+    outer_part = np.full(30, 0.03)
     true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
-    stars = StarFluxes(place, flux, outer)
+    stars = StarFluxes(place, flux, outer_part)
     bands = tented_light((300, 300), stars, true)
     tented = np.concatenate([light for _, light in bands], axis=1)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
-    known = np.full(image.shape, 5.0), nothing
-    wings = wings_of(image, *known, stars, 10)
+    noise = np.full(image.shape, 5.0), nothing
+    wings = wings_of(image, *noise, stars, 10)
     light, error = wings.light()
     # In a unit whose square single precision cannot hold, they are the same.
     unit = np.float32(1e-25)
@@ -219,20 +219,20 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
         assert error < 0.05 * light
         # Of a sky with structure pixels share what is left; the error knows it.
         wavy = image + 10.0 * np.sin(np.arange(300) / 15)[:, None]
-        off, doubt = wings_of(wavy, *known, stars, 10).light()
+        off, doubt = wings_of(wavy, *noise, stars, 10).light()
         assert doubt > 4 * error and abs(off - true.light()[0]) < 2 * doubt
     else:
         # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
         assert light == pytest.approx(0.65 * 0.03, abs=0.002)
         assert 0.3 * light < error < 1.5 * light
-    assert wings_of(image, *known, stars._replace(flux=np.full(30, np.nan)), 10) is None
+    assert wings_of(image, *noise, stars._replace(flux=np.full(30, np.nan)), 10) is None
 
 
 def test_the_light_of_wings_is_the_sum_over_pixels():
     wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
     star = StarFluxes(np.array([[40.3, 40.1]]), np.ones(1), np.ones(1))
-    drawn = tented_light((81, 81), star, wings)
-    total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in drawn)
+    bands = tented_light((81, 81), star, wings)
+    total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in bands)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
 
@@ -260,20 +260,20 @@ def test_models_of_photutils_do_not_mix(sky):
     first = load_model(sky[1])
     weights = first.bundle.weights
     smooth = uniform_filter(weights["coefficients"], (1, 5, 5))
-    wider = weights | {"coefficients": smooth}
-    other = type(first)(replace(first.bundle, weights=wider))
-    one, two = (model.to_photutils(3, 2) for model in (first, other))
-    x, y = one.grid_xypos[4]
-    assert one.data[4] == pytest.approx(first.psf_at(x, y, 2), abs=1e-12)
+    smooth_w = weights | {"coefficients": smooth}
+    smooth_model = type(first)(replace(first.bundle, weights=smooth_w))
+    first_grid, second_grid = (model.to_photutils(3, 2) for model in (first, smooth_model))
+    x, y = first_grid.grid_xypos[4]
+    assert first_grid.data[4] == pytest.approx(first.psf_at(x, y, 2), abs=1e-12)
     rows, columns = np.mgrid[:40, :40]
-    drawn = sum(two.evaluate(columns, rows, 1e3, a, 20.0) for a in (16.0, 21.0))
+    image = sum(second_grid.evaluate(columns, rows, 1e3, a, 20.0) for a in (16.0, 21.0))
     start = Table({"x": [16.2, 20.9], "y": [20.1, 19.9], "group_id": [1, 1]})
     # It keeps what it has made of a model until that is collected as garbage.
     gc.disable()
     try:
         fluxes = [
-            list(PSFPhotometry(model, 9, aperture_radius=3)(drawn, init_params=start)["flux_fit"])
-            for model in (one, two)
+            list(PSFPhotometry(model, 9, aperture_radius=3)(image, init_params=start)["flux_fit"])
+            for model in (first_grid, second_grid)
         ]
     finally:
         gc.enable()
@@ -290,9 +290,9 @@ def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
     rng = np.random.default_rng(4)
     place = np.vstack([rng.uniform(low, high, (20, 2)), low, low - 9.3, high + 7.6])
     corner = np.rint(place).astype(int) - 4
-    drawn = grid.stamps(place, corner, 9)
-    for (x, y), (left, top), light in zip(place, corner, drawn, strict=True):
-        rows, columns = np.mgrid[top : top + 9, left : left + 9]
+    lights = grid.stamps(place, corner, 9)
+    for (x, y), (column0, row0), light in zip(place, corner, lights, strict=True):
+        rows, columns = np.mgrid[row0 : row0 + 9, column0 : column0 + 9]
         expected = photutils.evaluate(columns, rows, 1.0, x, y)
         assert light[0] == pytest.approx(expected, abs=limit * expected.max())
     assert not grid.stamps(place, corner + 99, 9).any()
@@ -304,8 +304,8 @@ def test_derivatives_of_a_grid_are_those_of_its_light(sky):
     corner = np.rint(place).astype(int) - 4
     slopes = grid.stamps(place, corner, 9)[0, 1:]
     for slope, move in zip(slopes, step * np.eye(2), strict=True):
-        less, more = (grid.stamps(place + s * move, corner, 9)[0, 0] for s in (-1, 1))
-        assert slope == pytest.approx((more - less) / (2 * step), abs=2e-3 * np.abs(slope).max())
+        low, high = (grid.stamps(place + s * move, corner, 9)[0, 0] for s in (-1, 1))
+        assert slope == pytest.approx((high - low) / (2 * step), abs=2e-3 * np.abs(slope).max())
 
 
 def test_the_command_and_its_table(sky, tmp_path):
@@ -313,10 +313,10 @@ def test_the_command_and_its_table(sky, tmp_path):
     true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])
     true[:40].write(tmp_path / "magnitudes.csv")
     words = ("photometry", folder / "i.fits", "--model", model, "--detect")
-    out, left = tmp_path / "stars.fits", tmp_path / "left.fits"
-    more = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", left)
-    done = psfdae(*words, "--out", out, *more)
-    assert done.exit_code == 0, done.output
+    out, residual = tmp_path / "stars.fits", tmp_path / "left.fits"
+    options = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", residual)
+    result = psfdae(*words, "--out", out, *options)
+    assert result.exit_code == 0, result.output
     rows, header = Table.read(out), fits.getheader(out, 1)
     assert header["ZEROPT"] == pytest.approx(24.5, abs=0.01) and header["FLUXRAD"] == 25.0
     assert 0.975 < header["INMODEL"] < 0.995
@@ -324,7 +324,7 @@ def test_the_command_and_its_table(sky, tmp_path):
     assert np.median(rows["mag"][row] - true["mag"]) == pytest.approx(0.0, abs=0.01)
     place = WCS(fits.getheader(folder / "i.fits")).world_to_pixel_values(rows["ra"], rows["dec"])
     assert place == pytest.approx(np.array([rows["x"], rows["y"]]), abs=1e-6)
-    assert fits.getdata(left).shape == (SIZE, SIZE)
+    assert fits.getdata(residual).shape == (SIZE, SIZE)
 
 
 def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
@@ -333,16 +333,18 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     rows["X_IMAGE"][24] = 5000.0  # off the image
     rows.write(tmp_path / "some.csv")
     words = ("photometry", folder / "i.fits", "--model", model, "--out", tmp_path / "some.ecsv")
-    done = psfdae(*words, "--catalogue", tmp_path / "some.csv")
-    assert done.exit_code == 0, done.output
-    found = Table.read(tmp_path / "some.ecsv")
-    assert len(found) == 25 and not np.isfinite(found["flux"][24]) and found["flags"][24] > 0
-    ratio = (found["flux"] / true["flux"][:25])[:24][~true["pair"][:24]]
+    result = psfdae(*words, "--catalogue", tmp_path / "some.csv")
+    assert result.exit_code == 0, result.output
+    measured = Table.read(tmp_path / "some.ecsv")
+    assert (
+        len(measured) == 25 and not np.isfinite(measured["flux"][24]) and measured["flags"][24] > 0
+    )
+    ratio = (measured["flux"] / true["flux"][:25])[:24][~true["pair"][:24]]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("options", "message"),
     [
         (["x.txt"], "x.txt"),
         (["o.csv", "--zero-point", "nan"], "--zero-point"),
@@ -350,50 +352,52 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
         (["o.csv", "--residual", "o.csv"], "o.csv"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path, monkeypatch, more, message):
+def test_what_cannot_be_measured_is_refused_in_one_line(
+    sky, tmp_path, monkeypatch, options, message
+):
     folder, model, _ = sky
     monkeypatch.chdir(tmp_path)
     for name, place in (("near.csv", [100.0, 150.0]), ("far.csv", [1.0, 2.0])):
         Table({"x": place, "y": place, "mag": [10.0, 11.0]}).write(name)
     words = ("photometry", folder / "i.fits", "--model", model, "--catalogue", "near.csv")
-    assert message in refused(*words, "--origin", 0, "--out", *more)
+    assert message in refused(*words, "--origin", 0, "--out", *options)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["far.csv", "near.csv"]
 
 
-def test_light_of_others_leaves_each_star_alone(sky, found):
+def test_light_of_others_leaves_each_star_alone(sky, phot):
     """Stars of pairs, without what their neighbours add: within the noise and 3 % of their peak."""
     folder, _, true = sky
     place = np.stack([true["x"], true["y"]], axis=1)
     pairs = np.flatnonzero(true["pair"])
     pixels = fits.getdata(folder / "i.fits").astype(float) - SKY
     cut = (pixels, pixels.shape, *place.T, STAMP, 2)
-    seen = cut_image(*cut)[0]
-    light = light_of_others(found, place)(slice(None), STAMP, 2)
-    middle = slice(WIDE // 2 - STAMP // 2 - 2, WIDE // 2 + STAMP // 2 + 2)
-    own = np.array(true["flux"])[:, None, None] * stamps(*place.T)[:, middle, middle]
-    doubt = np.sqrt(SKY + np.abs(seen)) * 4 + 0.03 * own.max(axis=(1, 2), keepdims=True)
-    off, before = (np.abs(a - own)[pairs] > doubt[pairs] for a in (seen - light, seen))
-    assert off.mean() < 0.01 and before.mean() > 0.05
+    data = cut_image(*cut)[0]
+    light = light_of_others(phot, place)(slice(None), STAMP, 2)
+    middle = slice(FRAME // 2 - STAMP // 2 - 2, FRAME // 2 + STAMP // 2 + 2)
+    own_light = np.array(true["flux"])[:, None, None] * stamps(*place.T)[:, middle, middle]
+    doubt = np.sqrt(SKY + np.abs(data)) * 4 + 0.03 * own_light.max(axis=(1, 2), keepdims=True)
+    off, raw_off = (np.abs(a - own_light)[pairs] > doubt[pairs] for a in (data - light, data))
+    assert off.mean() < 0.01 and raw_off.mean() > 0.05
 
 
-def chosen(sky, **settings):
-    few = {"stamp_px": STAMP, **FEW, **settings}
-    return Stars.from_image(sky[0] / "i.fits", sky[0] / "i.csv", **few)
+def stars_of(sky, **settings):
+    options = {"stamp_px": STAMP, **COUNTS, **settings}
+    return Stars.from_image(sky[0] / "i.fits", sky[0] / "i.csv", **options)
 
 
 def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     """Stars of pairs are good where many are crowded, and as alike as single ones."""
-    before = chosen(sky)
+    raw = stars_of(sky)
     level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))
-    saturated = chosen(sky, saturate=level).candidates.verdict == "saturated"
+    saturated = stars_of(sky, saturate=level).candidates.verdict == "saturated"
     monkeypatch.setattr("psfdae.model.stars.is_crowded", lambda _: True)
-    after = chosen(sky, saturate=level)
+    clean = stars_of(sky, saturate=level)
     # Those are still seen without their neighbours.
-    assert saturated.any() and (after.candidates.verdict[saturated] == "saturated").all()
+    assert saturated.any() and (clean.candidates.verdict[saturated] == "saturated").all()
     paired = np.array(sky[2]["pair"])
-    assert paired[before.candidates.bright.row].mean() < 0.02
-    assert paired[after.candidates.bright.row].mean() > 0.2 and len(after) > 1.2 * len(before)
-    bright = after.candidates.bright
+    assert paired[raw.candidates.bright.row].mean() < 0.02
+    assert paired[clean.candidates.bright.row].mean() > 0.2 and len(clean) > 1.2 * len(raw)
+    bright = clean.candidates.bright
     single, images = ~paired[bright.row], bright.aligned()
     ratio = bright.flux / np.array(sky[2]["flux"])[bright.row]
     for part in (single, ~single):

@@ -31,7 +31,7 @@ from psfdae.stars.noise import NoiseModel
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stars.example import add_stamps, write_field
 
-SIDE, WIDE, FIELD = 10, 26, 1000.0
+SIDE, FRAME, FIELD = 10, 26, 1000.0
 SNR = (5.0, 10.0, 20.0, 50.0)
 
 
@@ -43,8 +43,8 @@ def truth(position, centre, side, spread=0.0, seed=0):
     from scipy.special import erf
 
     u = 2 * np.asarray(position) / FIELD - 1
-    own = 1 + spread * np.random.default_rng(seed).standard_normal(len(u))
-    width = (1.05 + 0.12 * u[:, 0] + 0.08 * u[:, 1] ** 2) * own
+    scale = 1 + spread * np.random.default_rng(seed).standard_normal(len(u))
+    width = (1.05 + 0.12 * u[:, 0] + 0.08 * u[:, 1] ** 2) * scale
     edges = np.arange(side + 1) - side // 2 - 0.5
     images = 0.0
     for part, size in ((0.8, 1.0), (0.2, 1.9)):
@@ -65,18 +65,18 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
     rng = np.random.default_rng(seed)
     position = rng.uniform(0, FIELD, (count, 2))
     centre = rng.uniform(-0.5, 0.5, (count, 2))
-    where = position if varied else np.full((count, 2), FIELD / 2)
-    images = truth(where, centre, WIDE, spread, seed)
+    place = position if varied else np.full((count, 2), FIELD / 2)
+    images = truth(place, centre, FRAME, spread, seed)
     noise = 10 ** rng.uniform(-3.5, -3, count)
     images = images + noise[:, None, None] * rng.standard_normal(images.shape)
-    inner = images[:, 8:18, 8:18].sum(axis=(1, 2))
-    images, noise = images / inner[:, None, None], noise / inner
+    flux = images[:, 8:18, 8:18].sum(axis=(1, 2))
+    images, noise = images / flux[:, None, None], noise / flux
     peak = np.zeros((count, 2), int)
     listed = centre + 0.1 + 0.05 * rng.standard_normal((count, 2))
-    known = {"peak": peak, "listed": listed, "position": position, "noise": noise}
-    nothing = {"centre": listed, "snr": 1 / noise, "row": np.arange(count)}
-    nothing["colour"] = np.full(count, np.nan)
-    return BrightStars(stamps=images, flux=np.ones(count), **known, **nothing)
+    measurements = {"peak": peak, "listed": listed, "position": position, "noise": noise}
+    columns = {"centre": listed, "snr": 1 / noise, "row": np.arange(count)}
+    columns["colour"] = np.full(count, np.nan)
+    return BrightStars(stamps=images, flux=np.ones(count), **measurements, **columns)
 
 
 def gridded(path):
@@ -92,8 +92,8 @@ def fitted(stars, orders=(2,), **changed):
     images = stars.stamps[:, 8:18, 8:18].astype(np.float32)
     number = np.arange(len(images))
     noise = NoiseModel(1.0, 1e6)
-    own = {"bright": stars, "star": number}
-    data = TrainingSet(images, images, number, number[:0], np.array([0.01]), noise, **own)
+    star_facts = {"bright": stars, "star": number}
+    data = TrainingSet(images, images, number, number[:0], np.array([0.01]), noise, **star_facts)
     config = load_stage(("field",), [])
     settings = config.field.model_copy(update={"orders": list(orders), **changed})
     return FieldMixture.fit(data, field=settings)
@@ -110,7 +110,7 @@ def field(stars):
 
 
 @pytest.fixture(scope="module")
-def chosen(stars):
+def cv_field(stars):
     """Order and smoothness are those of stars left out, as for a user's image."""
     return fitted(stars, (0, 1, 2))
 
@@ -128,8 +128,8 @@ class Faint:
         self.noise = self.sigma[:, None, None] * rng.standard_normal(self.psf.shape)
         self.stamps = 1000 * self.psf + 3 + self.noise
 
-    def measured(self, field, **given):
-        return field.measure(self.stamps, self.sigma, self.position, **given)
+    def measured(self, field, **known):
+        return field.measure(self.stamps, self.sigma, self.position, **known)
 
     def mse(self, estimate):
         return float(np.square(estimate.psf - self.psf).mean())
@@ -143,8 +143,8 @@ def size(images):
 @pytest.mark.parametrize("snr", SNR)
 def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     faint = Faint(1000, snr)
-    found = faint.measured(field)
-    measured = found.measured
+    result = faint.measured(field)
+    measured = result.measured
     error = np.sqrt(np.einsum("nii->ni", measured.covariance))
     off = np.stack(
         [measured.flux - 1000, measured.background - 3, *(measured.centre.T - faint.centre.T)], 1
@@ -159,13 +159,13 @@ def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     pull = np.quantile(np.abs(off / error), 0.68, axis=0)
     assert ((pull > 0.85) & (pull < 1.2)).all(), pull
     if snr > 5:
-        ratio = size(found.psf) / size(faint.psf) - 1
+        ratio = size(result.psf) / size(faint.psf) - 1
         assert abs(np.median(ratio)) < 0.02 + 3 * 1.25 * ratio.std() / np.sqrt(len(ratio))
-    star = found.psf * measured.flux[:, None, None] / 1000
-    inside = (np.abs(star - faint.psf) <= found.sigma).mean()
+    star = result.psf * measured.flux[:, None, None] / 1000
+    inside = (np.abs(star - faint.psf) <= result.sigma).mean()
     assert 0.62 < inside < 0.87  # of a wing, few large errors make the variance
     assert np.square(star - faint.psf).mean() == pytest.approx(
-        np.square(found.sigma, dtype=float).mean(), rel=0.2
+        np.square(result.sigma, dtype=float).mean(), rel=0.2
     )
     flux_and_sky = measured.covariance[:, 0, 1] / (error[:, 0] * error[:, 1])
     assert np.corrcoef(off[:, 0], off[:, 1])[0, 1] == pytest.approx(flux_and_sky.mean(), abs=0.12)
@@ -176,12 +176,12 @@ def test_known_place_is_better_than_a_list_and_a_list_better_than_nothing(field)
     rng = np.random.default_rng(3)
     listed = faint.centre + 0.1 + 0.05 * rng.standard_normal(faint.centre.shape)
     exact = faint.mse(faint.measured(field, centre=faint.centre + 0.1, fixed=True))
-    near = faint.mse(faint.measured(field, centre=listed))
-    assert exact < near < 0.7 * faint.mse(faint.measured(field))
+    with_list = faint.mse(faint.measured(field, centre=listed))
+    assert exact < with_list < 0.7 * faint.mse(faint.measured(field))
     # A list that is wrong by a pixel does not spoil the brighter stars.
     bright_ones = Faint(200, 20.0)
-    wrong = bright_ones.measured(field, centre=bright_ones.centre + 1.0)
-    assert bright_ones.mse(wrong) < 1.2 * bright_ones.mse(bright_ones.measured(field))
+    with_wrong_list = bright_ones.measured(field, centre=bright_ones.centre + 1.0)
+    assert bright_ones.mse(with_wrong_list) < 1.2 * bright_ones.mse(bright_ones.measured(field))
 
 
 def test_a_star_without_a_position_is_that_of_the_mean_field(field):
@@ -189,22 +189,24 @@ def test_a_star_without_a_position_is_that_of_the_mean_field(field):
     faint, all_over = Faint(10, 5.0), np.random.default_rng(4).uniform(0, FIELD, (500, 2))
     position = faint.position.copy()
     position[::2] = np.nan
-    given = {"centre": faint.centre + 0.1, "fixed": True, "flux": np.full(10, 1e3)}
-    found = field.measure(faint.stamps, np.full(10, 1e5), position, **given)
+    known = {"centre": faint.centre + 0.1, "fixed": True, "flux": np.full(10, 1e3)}
+    result = field.measure(faint.stamps, np.full(10, 1e5), position, **known)
     for star, centre in enumerate(faint.centre):
-        where = all_over if star % 2 == 0 else faint.position[star : star + 1]
-        terms = field.model.terms(where)
-        mean = unit(field.model.images(terms, np.tile(centre, (len(where), 1)), SIDE)).mean(axis=0)
-        assert found.psf[star] == pytest.approx(mean, abs=0.02 * mean.max())
-    nothing_said = field.measure(faint.stamps, np.full(10, 1e5), None, **given)
-    assert nothing_said.psf[::2] == pytest.approx(found.psf[::2], abs=1e-7)
-    assert (nothing_said.sigma[1::2] > found.sigma[1::2]).mean() > 0.8
+        positions = all_over if star % 2 == 0 else faint.position[star : star + 1]
+        terms = field.model.terms(positions)
+        mean = unit(field.model.images(terms, np.tile(centre, (len(positions), 1)), SIDE)).mean(
+            axis=0
+        )
+        assert result.psf[star] == pytest.approx(mean, abs=0.02 * mean.max())
+    no_place = field.measure(faint.stamps, np.full(10, 1e5), None, **known)
+    assert no_place.psf[::2] == pytest.approx(result.psf[::2], abs=1e-7)
+    assert (no_place.sigma[1::2] > result.sigma[1::2]).mean() > 0.8
 
 
 def test_without_noise_the_data_come_back_and_without_data_the_field(field):
     faint = Faint(20, 1e5)
-    found = faint.measured(field, flux=np.full(20, 1e3), sky=np.full(20, 3.0))
-    assert found.psf == pytest.approx(faint.psf, abs=2e-4 * faint.psf.max())
+    result = faint.measured(field, flux=np.full(20, 1e3), sky=np.full(20, 3.0))
+    assert result.psf == pytest.approx(faint.psf, abs=2e-4 * faint.psf.max())
     hopeless = field.measure(
         faint.stamps,
         1e5 * np.ones(20),
@@ -215,54 +217,54 @@ def test_without_noise_the_data_come_back_and_without_data_the_field(field):
     )
     expected = field.model.images(field.model.terms(faint.position), faint.centre, SIDE)
     assert hopeless.psf == pytest.approx(unit(expected), abs=0.01 * faint.psf.max())
-    assert (hopeless.sigma > found.sigma).all()
+    assert (hopeless.sigma > result.sigma).all()
 
 
 @pytest.mark.parametrize("snr", [5.0, 50.0])
-def test_outlier_score_has_the_law_of_chi2_and_tells_blends(chosen, snr):
-    field = chosen
+def test_outlier_score_has_the_law_of_chi2_and_tells_blends(cv_field, snr):
+    field = cv_field
     faint = Faint(400, snr)
-    here, nowhere = faint.measured(field), field.measure(faint.stamps, faint.sigma)
+    placed, no_place = faint.measured(field), field.measure(faint.stamps, faint.sigma)
     axes = PosteriorLimits.outlier_axes
-    for found in (here, nowhere):
-        assert np.median(found.outlier_score) == pytest.approx(axes, rel=0.25)
-        assert (found.outlier_score < axes + 8 * np.sqrt(2 * axes)).mean() > 0.98
+    for result in (placed, no_place):
+        assert np.median(result.outlier_score) == pytest.approx(axes, rel=0.25)
+        assert (result.outlier_score < axes + 8 * np.sqrt(2 * axes)).mean() > 0.98
     blend = 0.8 * faint.psf + 0.2 * np.roll(faint.psf, 3, axis=2)
-    strange = field.measure(1000 * (blend + faint.noise / 1000), faint.sigma, faint.position)
+    blended = field.measure(1000 * (blend + faint.noise / 1000), faint.sigma, faint.position)
     if snr == 50:
-        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.99)
+        assert np.median(blended.outlier_score) > np.quantile(placed.outlier_score, 0.99)
 
 
 def test_flux_and_sky_that_are_known_are_taken(field):
     faint = Faint(300, 20.0)
-    known = faint.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
-    assert faint.mse(known) < faint.mse(faint.measured(field))
-    assert known.measured.flux == pytest.approx(1000, rel=0.02)
-    assert known.measured.background == pytest.approx(3.0)
-    assert (known.measured.covariance[:, 1, 1] == 0).all()
+    result = faint.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
+    assert faint.mse(result) < faint.mse(faint.measured(field))
+    assert result.measured.flux == pytest.approx(1000, rel=0.02)
+    assert result.measured.background == pytest.approx(3.0)
+    assert (result.measured.covariance[:, 1, 1] == 0).all()
     # A method of flux 1 is that, and the same as other methods see it.
     restored = field.estimate((faint.stamps - 3) / 1000, faint.sigma / 1000, faint.position).psf
-    assert restored == pytest.approx(known.psf, abs=2e-3)
+    assert restored == pytest.approx(result.psf, abs=2e-3)
 
 
 def test_stars_are_restored_in_groups_that_do_not_matter(field):
-    each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
-    given = [np.concatenate([getattr(stars, n) for stars in each]) for n in ("stamps", "sigma")]
-    whole = field.measure(*given)
-    few = replace(field, limits=PosteriorLimits(stars_at_once=13)).measure(*given)
-    assert few.psf == pytest.approx(whole.psf, abs=1e-7)
-    assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
+    groups = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
+    inputs = [np.concatenate([getattr(stars, n) for stars in groups]) for n in ("stamps", "sigma")]
+    joint = field.measure(*inputs)
+    batched = replace(field, limits=PosteriorLimits(stars_at_once=13)).measure(*inputs)
+    assert batched.psf == pytest.approx(joint.psf, abs=1e-7)
+    assert batched.measured.flux == pytest.approx(joint.measured.flux, rel=1e-9)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
 def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr):
     faint = Faint(40, snr)
-    found = faint.measured(field)
+    result = faint.measured(field)
     limits = PosteriorLimits(min_nodes=round(PosteriorLimits.max_node_area_px2 * 16))
     every = faint.measured(replace(field, limits=limits))
-    assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
-    assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
-    assert found.evidence == pytest.approx(every.evidence, abs=2e-3)
+    assert np.abs(result.psf - every.psf).max() < 0.01 * every.sigma.max()
+    assert result.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
+    assert result.evidence == pytest.approx(every.evidence, abs=2e-3)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
@@ -270,13 +272,13 @@ def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, s
     """x − s (C + s)⁻¹ (x − m), with C as a whole, for flux, sky and centre that are known."""
     field, faint = replace(field, limits=PosteriorLimits(min_axes=SIDE**2)), Faint(30, snr)
     flux, sky = np.full(30, 1000.0), np.full(30, 3.0)
-    found = faint.measured(field, centre=faint.centre, fixed=True, flux=flux, sky=sky)
+    result = faint.measured(field, centre=faint.centre, fixed=True, flux=flux, sky=sky)
     at = faint.centre + field.listed[0]
-    near = np.square(field.places - at[:, None]).sum(axis=-1).argmin(axis=1)
+    nearest = np.square(field.places - at[:, None]).sum(axis=-1).argmin(axis=1)
     means = field.model.images(field.model.terms(faint.position), at, SIDE).reshape(30, -1)
     s = (faint.sigma[0] / 1000) ** 2
     for k, mean, stamp, psf, sigma in zip(
-        near, means, faint.stamps, found.psf, found.sigma, strict=True
+        nearest, means, faint.stamps, result.psf, result.sigma, strict=True
     ):
         node, star = field.nodes[k], (stamp.ravel() - 3) / 1000
         inverse = np.linalg.inv(
@@ -297,45 +299,45 @@ def test_centres_are_as_likely_as_nodes_have_room_in_the_box(field):
     nearest = np.rint(places / 0.25).astype(int)
     edges = np.arange(-7.5, 8)
     counted = np.histogram2d(*nearest.T, bins=(edges, edges))[0]
-    found = np.exp(log_node_prior(field, np.full((1, 2), np.nan)))[0].reshape(15, 15)
+    prior = np.exp(log_node_prior(field, np.full((1, 2), np.nan)))[0].reshape(15, 15)
     assert field.settings.centring_px == 1.5 and field.settings.step_px == 0.25
     for part in (slice(1, 2), slice(2, -2)):
         share = counted[part, 2:-2].sum() / len(places)
-        assert found[part, 2:-2].sum() == pytest.approx(share, rel=0.02)
-    assert (found[counted == 0] == 0).all()
+        assert prior[part, 2:-2].sum() == pytest.approx(share, rel=0.02)
+    assert (prior[counted == 0] == 0).all()
 
 
 def test_the_unit_of_a_star_does_not_matter_to_the_field():
     """Stars of any flux, in units of which their noise is, too, have the same PSF."""
-    alike, rng = bright(60, spread=0.0), np.random.default_rng(3)
+    twins, rng = bright(60, spread=0.0), np.random.default_rng(3)
     noise = np.where(np.arange(60) < 30, 1e-2, 1e-3)
 
     def fit(unit):
-        wide = unit[:, None, None] * alike.stamps
-        stars = replace(alike, stamps=wide, flux=unit, noise=unit * noise)
+        stamps = unit[:, None, None] * twins.stamps
+        stars = replace(twins, stamps=stamps, flux=unit, noise=unit * noise)
         return fit_field(stars, 1e6, 14, SIDE, [1], 0.5, 100.0)
 
-    one, other = fit(np.ones(60)), fit(unit := 10 ** rng.uniform(-5.0, 5.0, 60))
-    assert other.model.coefficients == pytest.approx(one.model.coefficients, abs=1e-4)
-    assert other.flux / unit == pytest.approx(one.flux, rel=1e-3)
-    assert other.centre == pytest.approx(one.centre, abs=1e-3)
+    unit_fit, scaled_fit = fit(np.ones(60)), fit(unit := 10 ** rng.uniform(-5.0, 5.0, 60))
+    assert scaled_fit.model.coefficients == pytest.approx(unit_fit.model.coefficients, abs=1e-4)
+    assert scaled_fit.flux / unit == pytest.approx(unit_fit.flux, rel=1e-3)
+    assert scaled_fit.centre == pytest.approx(unit_fit.centre, abs=1e-3)
 
 
-def test_order_is_what_the_field_has(chosen):
+def test_order_is_what_the_field_has(cv_field):
     assert fitted(bright(60, varied=False), (0, 1)).model.order == 0
-    assert chosen.model.order >= 1
-    few = bright(60)
-    alone = fitted(replace(few, position=np.full((60, 2), np.nan)), (0, 1, 2))
-    assert alone.model.order == 0
-    assert np.isfinite(Faint(50, 20.0).measured(alone).psf).all()
+    assert cv_field.model.order >= 1
+    few_stars = bright(60)
+    no_place = fitted(replace(few_stars, position=np.full((60, 2), np.nan)), (0, 1, 2))
+    assert no_place.model.order == 0
+    assert np.isfinite(Faint(50, 20.0).measured(no_place).psf).all()
 
 
 def test_photon_noise_takes_no_light_from_the_wings():
     """Weights by a star's own pixels would take half a photon from each, here 3 % of its light."""
     stars, rng, photons, noise = bright(80, varied=False), np.random.default_rng(5), 1e3, 4e-3
     sigma = np.sqrt(noise**2 + np.maximum(stars.stamps, 0.0) / photons)
-    wide = stars.stamps + sigma * rng.standard_normal(sigma.shape)
-    stars = replace(stars, stamps=wide, noise=np.full(80, noise))
+    stamps = stars.stamps + sigma * rng.standard_normal(sigma.shape)
+    stars = replace(stars, stamps=stamps, noise=np.full(80, noise))
     model = fit_field(stars, (photons * noise) ** 2, SIDE + 4, SIDE, [0], 0.5, 1e4).model
     middle, place = np.zeros((1, 2)), np.full((1, 2), FIELD / 2)
     core = [
@@ -349,23 +351,23 @@ def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
     """Neighbours at the edges of the frames spoil fluxes, which phases must not make up for."""
     stars, rng = bright(60), np.random.default_rng(3)
     angle, flux = rng.uniform(0, 2 * np.pi, 60), rng.uniform(0, 0.3, 60)
-    beside = truth(stars.position, 6.5 * np.stack([np.sin(angle), np.cos(angle)], axis=1), WIDE)
-    stars = replace(stars, stamps=stars.stamps + flux[:, None, None] * beside)
+    halo = truth(stars.position, 6.5 * np.stack([np.sin(angle), np.cos(angle)], axis=1), FRAME)
+    stars = replace(stars, stamps=stars.stamps + flux[:, None, None] * halo)
     model = fit_field(stars, 1e6, SIDE + 4, SIDE, [2], 0.5, 100.0).model
     steps = np.arange(-0.5, 0.5, 0.125)
     phase = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     for place in ([200.0, 300.0], [700.0, 800.0]):
-        where = np.repeat([place], len(phase), axis=0)
-        seen = unit(truth(where, phase, WIDE))[:, 8:18, 8:18].sum(axis=(1, 2))
-        light = model.images(model.terms(where), phase, SIDE).sum(axis=(1, 2)) / seen
+        positions = np.repeat([place], len(phase), axis=0)
+        true_light = unit(truth(positions, phase, FRAME))[:, 8:18, 8:18].sum(axis=(1, 2))
+        light = model.images(model.terms(positions), phase, SIDE).sum(axis=(1, 2)) / true_light
         assert np.std(light / light.mean()) < 0.006
 
 
 def test_same_stars_give_the_same_fit(stars, field):
-    again = fitted(stars)
-    wanted = field.stored_arrays()
-    for name, array in again.stored_arrays().items():
-        assert array.tobytes() == wanted[name].tobytes(), name
+    refitted = fitted(stars)
+    arrays = field.stored_arrays()
+    for name, array in refitted.stored_arrays().items():
+        assert array.tobytes() == arrays[name].tobytes(), name
 
 
 def test_list_of_the_training_is_known(field):
@@ -390,8 +392,8 @@ def test_packed_is_the_same_to_half_precision(field):
         "field": field.settings.model_dump(),
     }
     faint = Faint(50, 10.0)
-    found = faint.measured(FieldMixture.restored(arrays, config, "realisation"))
-    assert found.psf == pytest.approx(faint.measured(field).psf, abs=1e-4)
+    result = faint.measured(FieldMixture.restored(arrays, config, "realisation"))
+    assert result.psf == pytest.approx(faint.measured(field).psf, abs=1e-4)
 
 
 def test_psf_between_the_stars_is_the_fields(field):
@@ -400,14 +402,14 @@ def test_psf_between_the_stars_is_the_fields(field):
     phase = (position - np.floor(position + 0.5))[:, ::-1]
     expected = unit(truth(position, phase, SIDE))
     position += 0.1  # as the list of the training is
-    found = field.psf_at(position)
-    assert np.square(unit(found) - expected).mean() < 1e-6
+    psf = field.psf_at(position)
+    assert np.square(unit(psf) - expected).mean() < 1e-6
     # Stars in the middle of their pixel have the sum 1, others what is left of it in the stamp.
     assert field.psf_at(np.rint(position)).sum(axis=(1, 2)) == pytest.approx(1.0)
-    assert found.sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.01)
+    assert psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.01)
     fine = field.psf_at(position, 4)
     assert fine.shape == (30, 41, 41)
-    assert fine[:, 0:40:4, 0:40:4] == pytest.approx(found, abs=1e-9)
+    assert fine[:, 0:40:4, 0:40:4] == pytest.approx(psf, abs=1e-9)
     # Beyond the stars it stays that of the edge.
     assert field.psf_at(np.array([[-500.0, 300.0]])) == pytest.approx(
         field.psf_at(np.array([[field.low[0] // 1 - 1, 300.0]])), abs=1e-3
@@ -437,35 +439,35 @@ def image(tmp_path_factory):
     words += ["parts.test_stars=30", "field.orders=[2]", "field.modes=16", "--method", "field"]
     words += ["--catalogue", folder / "bright.csv", "--out", folder / "model"]
     with few_draws():
-        done = psfdae("from-stars", folder / "i.fits", *words)
-    assert done.exit_code == 0, done.output
+        result = psfdae("from-stars", folder / "i.fits", *words)
+    assert result.exit_code == 0, result.output
     inside = flux * truth(position, centre, SIDE).sum(axis=(1, 2))
-    known = {"position": position, "flux": flux, "inside": inside}
-    known = {name: values[~is_bright] for name, values in known.items()}
-    return folder, folder / "model/i.psf.safetensors", known
+    true = {"position": position, "flux": flux, "inside": inside}
+    true = {name: values[~is_bright] for name, values in true.items()}
+    return folder, folder / "model/i.psf.safetensors", true
 
 
-def predicted(image, *more):
+def predicted(image, *options):
     folder, model, _ = image
-    out = folder / f"out{len(more)}.fits"
+    out = folder / f"out{len(options)}.fits"
     words = ("--catalogue", folder / "faint.csv", "--model", model, "--out", out, "--overwrite")
-    done = psfdae("predict", folder / "i.fits", *words, "--quiet", *more)
-    assert done.exit_code == 0, done.output
+    result = psfdae("predict", folder / "i.fits", *words, "--quiet", *options)
+    assert result.exit_code == 0, result.output
     return Table.read(out, hdu="STARS"), fits.getdata(out, "UNCERT")
 
 
 def test_predict_measures_flux_and_centre_with_their_errors(image):
     """The bundle is small, and the list of the training says how good this one is."""
     stars, uncertainty = predicted(image)
-    known = image[2]
+    truths = image[2]
     assert np.isfinite(stars["outlier_score"]).all()
     assert image[1].stat().st_size < 5e6
     assert (stars["flags"] == 0).mean() > 0.95
-    assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005
+    assert abs(np.mean(stars["flux"] / truths["inside"]) - 1) < 0.005
     for column, true in (
-        ("flux", known["inside"]),
-        ("x_fit", known["position"][:, 0]),
-        ("y_fit", known["position"][:, 1]),
+        ("flux", truths["inside"]),
+        ("x_fit", truths["position"][:, 0]),
+        ("y_fit", truths["position"][:, 1]),
     ):
         error = stars[f"{column.removesuffix('_fit')}_error"]
         pull = np.quantile(np.abs(stars[column] - true) / error, 0.68)
@@ -480,18 +482,18 @@ def test_fixed_positions_are_kept(image):
     position = image[2]["position"]
     assert stars["x_fit"].data == pytest.approx(position[:, 0], abs=1e-3)
     assert (stars["x_error"] == 0).all() and (stars["corr_flux_x"] == 0).all()
-    free, _ = predicted(image)
+    measured, _ = predicted(image)
     inside = image[2]["inside"]
-    assert np.std(stars["flux"] / inside) < 1.02 * np.std(free["flux"] / inside)
+    assert np.std(stars["flux"] / inside) < 1.02 * np.std(measured["flux"] / inside)
 
 
 def test_python_takes_positions_and_centres(image):
     model, faint = load_model(image[1]), Faint(200, 5.0)
-    placed, exact = (
-        model.predict(faint.stamps, position=faint.position, **known)
-        for known in ({}, {"centre": faint.centre[:, ::-1], "fixed": True})
+    at_position, exact = (
+        model.predict(faint.stamps, position=faint.position, **centres)
+        for centres in ({}, {"centre": faint.centre[:, ::-1], "fixed": True})
     )
-    errors = [p.psf / p.flux[:, None, None] - faint.psf for p in (placed, exact)]
+    errors = [p.psf / p.flux[:, None, None] - faint.psf for p in (at_position, exact)]
     assert np.square(errors[1]).mean() < 0.5 * np.square(errors[0]).mean()
     with pytest.raises(PredictionError, match="position of shape"):
         model.predict(faint.stamps, position=faint.position[:3])
@@ -503,9 +505,9 @@ def test_bad_pixels_are_left_out(image):
     model, faint = load_model(image[1]), Faint(100, 50.0)
     spoilt = faint.stamps.copy()
     spoilt[:, 5, 6] = np.nan
-    clean, found = (model.predict(s, position=faint.position) for s in (faint.stamps, spoilt))
-    assert np.median(np.abs(found.flux / clean.flux - 1)) < 0.03
-    assert (found.flags & 1).all()
+    clean, repaired = (model.predict(s, position=faint.position) for s in (faint.stamps, spoilt))
+    assert np.median(np.abs(repaired.flux / clean.flux - 1)) < 0.03
+    assert (repaired.flags & 1).all()
 
 
 @pytest.fixture(scope="module")
@@ -534,8 +536,8 @@ def test_psf_writes_what_photutils_reads(oblong, tmp_path):
     assert grid.data[5] == pytest.approx(model.psf_at(*np.rint(grid.grid_xypos[5])), abs=1e-6)
     words = ("--at", "310.4,422", "--oversampling", 1, "--out", tmp_path / "one.fits")
     assert psfdae("psf", oblong, *words).exit_code == 0
-    one = fits.getdata(tmp_path / "one.fits")
-    assert one.shape == (1, SIDE, SIDE) and one.sum() == pytest.approx(1.0)
+    single = fits.getdata(tmp_path / "one.fits")
+    assert single.shape == (1, SIDE, SIDE) and single.sum() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -562,14 +564,14 @@ def test_photometry_of_photutils_with_the_grid_is_unbiased(image):
 
     A PSF of a place holds the flux that a star in the middle of its pixel has in its stamp.
     """
-    folder, path, known = image
+    folder, path, true = image
     out = folder / "photometry.fits"
     assert psfdae("psf", path, "--grid", "7x7", "--out", out).exit_code == 0
-    start = Table(known["position"], names=("x", "y"))
+    start = Table(true["position"], names=("x", "y"))
     photometry = PSFPhotometry(gridded(out), (9, 9), aperture_radius=4)
-    found = photometry(fits.getdata(folder / "i.fits").astype(float) - 100.0, init_params=start)
-    middle = truth(known["position"], np.zeros_like(known["position"]), SIDE)
-    ratio = found["flux_fit"] / (known["flux"] * middle.sum(axis=(1, 2)))
+    fluxes = photometry(fits.getdata(folder / "i.fits").astype(float) - 100.0, init_params=start)
+    middle = truth(true["position"], np.zeros_like(true["position"]), SIDE)
+    ratio = fluxes["flux_fit"] / (true["flux"] * middle.sum(axis=(1, 2)))
     assert len(ratio) >= 400
     assert abs(np.mean(ratio) - 1) < 0.005
     assert np.std(ratio) < 0.03
@@ -579,9 +581,9 @@ def test_photometry_of_photutils_with_the_grid_is_unbiased(image):
 def test_sigma_knows_the_doubt_about_the_flux(field, snr):
     """Flux and sky found: the nine brightest pixels are within σ as often as of a normal law."""
     faint = Faint(500, snr)
-    found = faint.measured(field)
-    error = np.abs(found.measured.flux[:, None, None] * found.psf - 1000 * faint.psf)
-    sigma = found.measured.flux[:, None, None] * found.sigma
-    bright = found.psf >= np.sort(found.psf.reshape(500, -1))[:, -9, None, None]
+    result = faint.measured(field)
+    error = np.abs(result.measured.flux[:, None, None] * result.psf - 1000 * faint.psf)
+    sigma = result.measured.flux[:, None, None] * result.sigma
+    bright = result.psf >= np.sort(result.psf.reshape(500, -1))[:, -9, None, None]
     for width, part in ((1.0, 0.683), (1.96, 0.95)):
         assert (error <= width * sigma)[bright].mean() == pytest.approx(part, abs=0.04)

@@ -20,7 +20,7 @@ from psfdae.stars.noise import NoiseModel
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
 LEVEL = 2e-3
-ONE = {
+BASIC = {
     **{"stars": None, "components": [1], "shrinkage": [20.0]},
     **{"principal": 8, "place": 1.0, "threads": 1},
 }
@@ -36,46 +36,46 @@ def stars(count, seed=1):
 
     def images(width):
         r2 = (axis - at[:, :1])[:, None] ** 2 + (axis - at[:, 1:])[:, :, None] ** 2
-        made = np.exp(-0.5 * r2 / width[:, None, None] ** 2)
-        return (made / made.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
+        light = np.exp(-0.5 * r2 / width[:, None, None] ** 2)
+        return (light / light.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
 
     return images(width), images(1.1 * width)
 
 
-class Placed(GaussianMixture):
+class PlacedGmm(GaussianMixture):
     needs = Needs(level=True, position=True)
 
 
-def where(count, seed=1):
+def kind_places(count, seed=1):
     """Positions that have to do with the stars' kinds."""
     return stars(count, seed)[0][:, 3, 3:5] + np.random.default_rng(seed).normal(
         0, 0.01, (count, 2)
     )
 
 
-def training(count=400, same=True, images=None):
+def training(count=400, of_images=True, images=None):
     x, y = stars(count) if images is None else (images, images)
     part = np.arange(len(x))
     judge = part[::8] if len(x) > 8 else part[:0]
     return TrainingSet(
         images=x,
-        references=x if same else y,
+        references=x if of_images else y,
         fit=np.setdiff1d(part, judge),
         validation=judge,
         levels=np.array([LEVEL, 4 * LEVEL]),
         noise=NOISE,
-        positions=where(len(x)),
+        positions=kind_places(len(x)),
     )
 
 
 @cache
-def _fitted(clusters, same, kind):
-    return kind.fit(training(400, same), Gmm(**{**ONE, "components": [clusters]}))
+def _fitted(clusters, of_images, kind):
+    return kind.fit(training(400, of_images), Gmm(**{**BASIC, "components": [clusters]}))
 
 
-def fitted(clusters=1, same=True, kind=GaussianMixture, **numbers):
+def fitted(clusters=1, of_images=True, kind=GaussianMixture, **numbers):
     """A fit without what it remembers of other tests."""
-    return replace(_fitted(clusters, same, kind), **numbers)
+    return replace(_fitted(clusters, of_images, kind), **numbers)
 
 
 def noisy_of(images, level=LEVEL):
@@ -98,8 +98,8 @@ def dense(mixture, noisy, level, position):
     They are those of the joint vector of image, position and reference.
     """
     axes, pixels = mixture.axes.astype(float), D * D
-    told = mixture.center.shape[1]
-    place = position @ mixture.whitening if told else position[:, :0]
+    size = mixture.center.shape[1]
+    place = position @ mixture.whitening if size else position[:, :0]
     z = np.hstack([noisy.reshape(len(noisy), -1), place])
     noise = np.zeros(z.shape[1])
     noise[:pixels] = (NOISE.kappa * level) ** 2 + 1.0 / pixels / NOISE.flux(level)
@@ -110,25 +110,25 @@ def dense(mixture, noisy, level, position):
     pooled, nu = joint.T @ joint / len(joint), mixture.shrinkage[0]
     log, means, squares = [], [], []
     for k, last in enumerate(mixture.count.cumsum()):
-        own = joint[last - mixture.count[k] : last]
-        covariance = (own.T @ own + nu * pooled) / (len(own) + nu)
+        rows = joint[last - mixture.count[k] : last]
+        covariance = (rows.T @ rows + nu * pooled) / (len(rows) + nu)
         image = mixture.mean[k] @ axes.T
-        other = mixture.mean_reference[k] if len(mixture.cross) else image
-        star = [image - 1 / pixels, other if len(mixture.cross) else image - 1 / pixels]
-        free = mixture.flux_sigma * np.concatenate([star[0], np.zeros(told), star[1]])
-        covariance += np.outer(free, free)
-        seen, hidden = slice(z.shape[1]), slice(z.shape[1], None)
-        observed = covariance[seen, seen] + np.diag(noise)
+        reference = mixture.mean_reference[k] if len(mixture.cross) else image
+        star = [image - 1 / pixels, reference if len(mixture.cross) else image - 1 / pixels]
+        flux_row = mixture.flux_sigma * np.concatenate([star[0], np.zeros(size), star[1]])
+        covariance += np.outer(flux_row, flux_row)
+        observables, hidden = slice(z.shape[1]), slice(z.shape[1], None)
+        data_cov = covariance[observables, observables] + np.diag(noise)
         mean = np.concatenate([image, mixture.center[k]])
-        law = multivariate_normal(mean, observed, allow_singular=True)
+        law = multivariate_normal(mean, data_cov, allow_singular=True)
         log.append(law.logpdf(z) + np.log(mixture.count[k] / len(joint)))
-        gain = np.linalg.solve(observed, covariance[seen, hidden]).T
-        means.append(other + (z - mean) @ gain.T)
-        inside = np.diag(covariance[hidden, hidden] - gain @ covariance[seen, hidden])
+        gain = np.linalg.solve(data_cov, covariance[observables, hidden]).T
+        means.append(reference + (z - mean) @ gain.T)
+        inside = np.diag(covariance[hidden, hidden] - gain @ covariance[observables, hidden])
         squares.append(means[-1] ** 2 + inside)
     peak = np.max(log, axis=0)
     weight = np.exp(log - peak)
-    evidence = peak + np.log(weight.sum(axis=0)) + 0.5 * told * np.log(2 * np.pi)
+    evidence = peak + np.log(weight.sum(axis=0)) + 0.5 * size * np.log(2 * np.pi)
     mean, square = (
         np.einsum("kn,knp->np", weight / weight.sum(axis=0), a) for a in (means, squares)
     )
@@ -136,41 +136,47 @@ def dense(mixture, noisy, level, position):
     return *shaped, evidence
 
 
-@pytest.mark.parametrize("same", [True, False])
-@pytest.mark.parametrize("kind", [GaussianMixture, Placed])
+@pytest.mark.parametrize("of_images", [True, False])
+@pytest.mark.parametrize("kind", [GaussianMixture, PlacedGmm])
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
 @pytest.mark.usefixtures("exact")
-def test_sums_are_those_of_dense_matrices(same, kind, level):
+def test_sums_are_those_of_dense_matrices(of_images, kind, level):
     """Those of images of one noise, and those of images that say theirs one by one."""
-    mixture, places = fitted(12, same, kind, **EXACT), where(50, seed=2)
+    mixture, places = fitted(12, of_images, kind, **EXACT), kind_places(50, seed=2)
     noisy = noisy_of(stars(50, seed=2)[0], level)
     mean, sigma, evidence = dense(mixture, noisy, level, places)
     for levels in (level, np.full(len(noisy), level)):
-        found = mixture.estimate(noisy, levels, places)
-        np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
-        np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.01, atol=1e-7)
-        np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
+        result = mixture.estimate(noisy, levels, places)
+        np.testing.assert_allclose(result.psf, mean, atol=2e-4 * mean.max())
+        np.testing.assert_allclose(result.sigma**2, sigma**2, rtol=0.01, atol=1e-7)
+        np.testing.assert_allclose(result.evidence, evidence, atol=0.05)
 
 
-@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("of_images", [True, False])
 @pytest.mark.usefixtures("exact")
-def test_a_flux_that_is_an_estimate_is_found(same):
-    mixture, rng, pixels = fitted(12, same, **EXACT), np.random.default_rng(3), D * D
-    images, wider = stars(300, seed=2)
+def test_a_flux_that_is_an_estimate_is_found(of_images):
+    mixture, rng, pixels = fitted(12, of_images, **EXACT), np.random.default_rng(3), D * D
+    images, wide_psf = stars(300, seed=2)
     flux = rng.normal(1.0, 0.1, (300, 1, 1))
     noisy = NOISE.draw(images, LEVEL / 5, rng) + (flux - 1) * (images - 1 / pixels)
     noisy += ((1 - noisy.sum(axis=(1, 2))) / pixels)[:, None, None]
-    free = mixture.free_flux()
-    found, mean = free.estimate(noisy, LEVEL / 5), dense(free, noisy, LEVEL / 5, where(300))[0]
-    sky = ((found.flux - 1) / pixels if same else 0 * found.flux)[:, None, None]
-    np.testing.assert_allclose(found.psf, mean + sky, atol=2e-4 * mean.max())
-    np.testing.assert_allclose(found.psf.sum(axis=(1, 2)), found.flux, atol=2e-3)
-    assert np.std(found.flux - flux.ravel()) < 0.5 * np.std(flux)
-    truth = images if same else wider
-    errors = [found.psf / found.flux[:, None, None], mixture.estimate(noisy, LEVEL / 5).psf] - truth
+    loose = mixture.free_flux()
+    result, mean = (
+        loose.estimate(noisy, LEVEL / 5),
+        dense(loose, noisy, LEVEL / 5, kind_places(300))[0],
+    )
+    sky = ((result.flux - 1) / pixels if of_images else 0 * result.flux)[:, None, None]
+    np.testing.assert_allclose(result.psf, mean + sky, atol=2e-4 * mean.max())
+    np.testing.assert_allclose(result.psf.sum(axis=(1, 2)), result.flux, atol=2e-3)
+    assert np.std(result.flux - flux.ravel()) < 0.5 * np.std(flux)
+    truth = images if of_images else wide_psf
+    errors = [
+        result.psf / result.flux[:, None, None],
+        mixture.estimate(noisy, LEVEL / 5).psf,
+    ] - truth
     assert np.square(errors[0]).mean() < 0.9 * np.square(errors[1]).mean()
     assert (
-        free.free_flux().flux_sigma == free.flux_sigma
+        loose.free_flux().flux_sigma == loose.flux_sigma
         and mixture.estimate(noisy, LEVEL / 5).flux is None
     )
 
@@ -181,23 +187,23 @@ def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     flux = np.random.default_rng(5).normal(1.0, mixing.FLUX_SIGMA, (400, 1))
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
-    plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
+    plain, spread = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
     assert mixture.total_variance == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
-    assert (mixture.free_flux().total_variance > 0.9 * moved - 1e-3 * plain.max()).all()
-    assert (moved > 1.2 * plain).any()
+    assert (mixture.free_flux().total_variance > 0.9 * spread - 1e-3 * plain.max()).all()
+    assert (spread > 1.2 * plain).any()
 
 
 def test_one_cluster_is_linear_mmse():
-    data, mixture = training(same=False), fitted(same=False)
+    data, mixture = training(of_images=False), fitted(of_images=False)
     x, y = (a.reshape(len(a), -1).astype(float) for a in (data.images, data.references))
     noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(np.full(20, 1.0 / D**2), LEVEL)[0]
     dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
     system = dx.T @ dx / len(x) + s * np.eye(D**2)
     residual = noisy.reshape(20, -1) - x.mean(axis=0)
-    wanted = y.mean(axis=0) + (dy.T @ dx / len(x) @ np.linalg.solve(system, residual.T)).T
+    expected = y.mean(axis=0) + (dy.T @ dx / len(x) @ np.linalg.solve(system, residual.T)).T
     np.testing.assert_allclose(
-        mixture.estimate(noisy, LEVEL).psf.reshape(20, -1), wanted, atol=1e-5
+        mixture.estimate(noisy, LEVEL).psf.reshape(20, -1), expected, atol=1e-5
     )
 
 
@@ -205,15 +211,15 @@ def test_levels_of_their_own_are_those_of_all():
     mixture = fitted(12)
     levels = np.repeat(np.geomspace(1e-3, 1e-2, 20), 5)
     noisy = noisy_of(stars(100, seed=2)[0], levels)
-    each = np.concatenate(
+    single = np.concatenate(
         [mixture.estimate(z[None], v).psf for z, v in zip(noisy, levels, strict=True)]
     )
-    error = np.square(mixture.estimate(noisy, levels).psf - each).mean()
-    assert error < 4e-3 * np.square(each - stars(100, seed=2)[0]).mean()
+    error = np.square(mixture.estimate(noisy, levels).psf - single).mean()
+    assert error < 4e-3 * np.square(single - stars(100, seed=2)[0]).mean()
 
 
 def test_positions_have_unit_variance_within_clusters():
-    p = fitted(4, kind=Placed).deviation_center
+    p = fitted(4, kind=PlacedGmm).deviation_center
     assert p.T @ p / len(p) == pytest.approx(np.eye(2), abs=1e-5)
 
 
@@ -235,71 +241,73 @@ def test_rows_of_a_cluster_have_the_products_of_their_formulas():
 
 
 def test_validation_stars_choose_and_the_last_value_that_was_tried_is_named(capsys):
-    settings = Gmm(**{**ONE, "components": [1, 12], "shrinkage": [5.0, 1e6]})
-    wanted = GaussianMixture.fit(training(), settings)
-    assert len(wanted.count) == 12 and wanted.shrinkage == [5.0]
-    assert wanted.count.sum() == 400
+    settings = Gmm(**{**BASIC, "components": [1, 12], "shrinkage": [5.0, 1e6]})
+    mixture = GaussianMixture.fit(training(), settings)
+    assert len(mixture.count) == 12 and mixture.shrinkage == [5.0]
+    assert mixture.count.sum() == 400
     assert "K = 12" in capsys.readouterr().out
-    other = GaussianMixture.fit(training().without_validation(), settings)
-    assert len(other.count) == 12 and other.count.sum() == 350
+    no_judge = GaussianMixture.fit(training().without_validation(), settings)
+    assert len(no_judge.count) == 12 and no_judge.count.sum() == 350
 
 
 def test_a_search_goes_both_ways_and_more_clusters_must_pay():
-    asked = []
+    tries = []
 
     def climbed(errors, start, pays=0.0):
-        asked.clear()
-        return mixture_fit.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
+        tries.clear()
+        return mixture_fit.climbed([*errors], start, lambda k: tries.append(k) or errors[k], pays)
 
     falling = {1: 9.0, 4: 5.0, 16: 4.0, 64: 3.98, 256: 1.0}
-    assert climbed(falling, 4, pays=0.02) == 16 and 256 not in asked and 1 not in asked
+    assert climbed(falling, 4, pays=0.02) == 16 and 256 not in tries and 1 not in tries
     assert climbed(falling, 4) == 256
-    assert climbed({1: 3.99, 4: 4.0, 16: 4.1, 64: 1.0}, 4, pays=0.02) == 1 and 64 not in asked
+    assert climbed({1: 3.99, 4: 4.0, 16: 4.1, 64: 1.0}, 4, pays=0.02) == 1 and 64 not in tries
     assert climbed({1: 2.0, 4: 2.0, 16: 2.0}, 4) == 4
 
 
-@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("is_free", [False, True])
 @pytest.mark.usefixtures("exact")
-def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free):
-    mixture = fitted(same=False, outlier_coordinates=10, **EXACT)
-    mixture = mixture.free_flux() if free else mixture
+def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(is_free):
+    mixture = fitted(of_images=False, outlier_coordinates=10, **EXACT)
+    mixture = mixture.free_flux() if is_free else mixture
     noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(1.0 / D**2, LEVEL)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
     row = mixture.flux_sigma * mixture.contrast[0, :10].astype(float)
-    usual = np.diag(mixture.total_variance[:10] + s)
+    common = np.diag(mixture.total_variance[:10] + s)
     covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
-    wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
-    wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]
-    found = mixture.outlier_score(noisy, np.full(20, LEVEL))
-    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=0.05)
+    expected = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
+    expected += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(common)[1]
+    score = mixture.outlier_score(noisy, np.full(20, LEVEL))
+    np.testing.assert_allclose(score, expected, rtol=2e-3, atol=0.05)
 
 
 def test_noise_of_the_training_stars_is_no_part_of_the_prior():
     rng, images, sky = np.random.default_rng(4), stars(2000)[0], 0.01
-    own = images + rng.normal(0, sky, images.shape).astype(np.float32)
-    told = replace(
-        training(images=own),
-        own_noise=lambda which, mean: (which.size - 1) * sky**2 * np.eye(D * D),
+    grainy = images + rng.normal(0, sky, images.shape).astype(np.float32)
+    denoised = replace(
+        training(images=grainy),
+        own_noise=lambda star_numbers, mean: (star_numbers.size - 1) * sky**2 * np.eye(D * D),
     )
-    settings = Gmm(**{**ONE, "components": [8]})
-    clean, raw, less = (
+    settings = Gmm(**{**BASIC, "components": [8]})
+    clean, raw, corrected = (
         GaussianMixture.fit(data, settings)
-        for data in (training(images=images), training(images=own), told)
+        for data in (training(images=images), training(images=grainy), denoised)
     )
-    excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, less)]
+    excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, corrected)]
     assert excess[0] > 0.1 and abs(excess[1]) < 0.2 * excess[0]
     truth = stars(400, seed=2)[0]
-    errors = [np.square(m.estimate(noisy_of(truth), LEVEL).psf - truth).mean() for m in (raw, less)]
+    errors = [
+        np.square(m.estimate(noisy_of(truth), LEVEL).psf - truth).mean() for m in (raw, corrected)
+    ]
     assert errors[1] < errors[0]
 
 
 def test_it_is_stored_and_the_same_again(tmp_path):
-    mixture, noisy = fitted(12, same=False), stars(5, seed=2)[0]
+    mixture, noisy = fitted(12, of_images=False), stars(5, seed=2)[0]
     mixture.save(tmp_path / "a.h5", CONFIG)
-    again = GaussianMixture.load(tmp_path / "a.h5")
+    stored = GaussianMixture.load(tmp_path / "a.h5")
     np.testing.assert_array_equal(
-        again.estimate(noisy, LEVEL).psf, mixture.estimate(noisy, LEVEL).psf
+        stored.estimate(noisy, LEVEL).psf, mixture.estimate(noisy, LEVEL).psf
     )
     twice = _fitted.__wrapped__(12, False, GaussianMixture)
     for name in GaussianMixture.stored():
@@ -315,17 +323,17 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
 
     arrays, _ = mixture.pack(D, NOISE.kappa * LEVEL)
     assert arrays["rows"].sum() == len(arrays["deviation"]) < 400
-    whole, main = mixture.estimate(noisy, LEVEL), restored(arrays)
-    assert np.square(main.psf - whole.psf).mean() < 1e-4 * np.square(whole.psf - truth).mean()
-    np.testing.assert_allclose(main.sigma, whole.sigma, rtol=0.01)
-    np.testing.assert_allclose(main.evidence, whole.evidence, atol=0.5)
+    full, main = mixture.estimate(noisy, LEVEL), restored(arrays)
+    assert np.square(main.psf - full.psf).mean() < 1e-4 * np.square(full.psf - truth).mean()
+    np.testing.assert_allclose(main.sigma, full.sigma, rtol=0.01)
+    np.testing.assert_allclose(main.evidence, full.evidence, atol=0.5)
     assert len(mixture.pack(D, 0.1)[0]["deviation"]) < 0.6 * len(arrays["deviation"])
     size = sum(array.nbytes for array in arrays.values())
     unlimited = packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]
     assert unlimited["rows"].tolist() == arrays["rows"].tolist()
     smaller = packed(mixture, D, NOISE.kappa * LEVEL, 0.8 * size)[0]
     assert 0.6 * size < sum(array.nbytes for array in smaller.values()) <= 0.8 * size
-    errors = [np.square(e.psf - truth).mean() for e in (restored(smaller), whole)]
+    errors = [np.square(e.psf - truth).mean() for e in (restored(smaller), full)]
     assert errors[0] < 1.1 * errors[1]
     with pytest.raises(BundleError, match=r"takes more than 0.001 MB"):
         packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
@@ -342,28 +350,31 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
 def test_arrays_that_no_fit_leaves_are_named(name, change):
     arrays = fitted(4).pack(D, NOISE.kappa * LEVEL)[0]
 
-    def wrong(arrays):
+    def violated(arrays):
         laws = GaussianMixture.restored(arrays, CONFIG, "realisation").conditions()
-        return [law for law, _, right in laws if not np.all(right)]
+        return [law for law, _, is_fulfilled in laws if not np.all(is_fulfilled)]
 
-    assert wrong(arrays) == []
-    assert wrong(arrays | {name: change(arrays[name])})[0] == name
+    assert violated(arrays) == []
+    assert violated(arrays | {name: change(arrays[name])})[0] == name
 
 
 def test_the_position_is_used_where_it_tells_something():
     """Positions decide the kind of the star; or they are those of other stars."""
-    data, settings = training(), Gmm(**{**ONE, "components": [4, 12]})
-    truth, place = stars(400, seed=2)[0], where(400, seed=2)
+    data, settings = training(), Gmm(**{**BASIC, "components": [4, 12]})
+    truth, place = stars(400, seed=2)[0], kind_places(400, seed=2)
     noisy = noisy_of(truth, 4 * LEVEL)
-    told, untold = (kind.fit(data, settings) for kind in (Placed, GaussianMixture))
+    placed, unplaced = (kind.fit(data, settings) for kind in (PlacedGmm, GaussianMixture))
     errors = [
-        np.square(m.estimate(noisy, 4 * LEVEL, place).psf - truth).mean() for m in (told, untold)
+        np.square(m.estimate(noisy, 4 * LEVEL, place).psf - truth).mean()
+        for m in (placed, unplaced)
     ]
     assert errors[0] < 0.9 * errors[1]
     # Learnt on one half of the field, it is wrong on the other.
     misled = data.positions.copy()
     misled[data.validation] = misled[data.validation[::-1]] * [-1.0, 3.0]
-    kept = Placed.fit(replace(data, positions=misled), settings)
+    misfit = PlacedGmm.fit(replace(data, positions=misled), settings)
     np.testing.assert_allclose(
-        kept.estimate(noisy, LEVEL, place).psf, kept.estimate(noisy, LEVEL, -place).psf, atol=1e-7
+        misfit.estimate(noisy, LEVEL, place).psf,
+        misfit.estimate(noisy, LEVEL, -place).psf,
+        atol=1e-7,
     )

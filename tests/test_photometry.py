@@ -58,10 +58,10 @@ def test_bad_pixels_are_marked_and_repaired(noisy, stars, model, noise, value, p
     clean, estimate = robust_flux(noisy, model), robust_flux(broken, model)
     assert estimate.flags[3] == flags
     assert abs(estimate.flux[3] - clean.flux[3]) < 2 * estimate.flux_error[3]
-    wrong = estimate.images[3] != noisy[3]
-    assert wrong.any()
+    is_repaired = estimate.images[3] != noisy[3]
+    assert is_repaired.any()
     # What is put in is closer to the truth than a measured pixel would be, on average.
-    assert rms((estimate.images[3] - stars[3])[wrong]) < 2 * noise.kappa * 1e-3
+    assert rms((estimate.images[3] - stars[3])[is_repaired]) < 2 * noise.kappa * 1e-3
 
 
 def test_sky_without_a_star_is_marked_and_good_stars_are_not(stars, model, noise):
@@ -87,22 +87,22 @@ def test_one_fit_is_the_one_of_dense_matrices(stars, model):
     x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
     used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
     prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
-    found = module.generalised_least_squares(x, used, prior, sigma, model)
+    results = module.generalised_least_squares(x, used, prior, sigma, model)
     covariance = (model.basis * model.variance) @ model.basis.T
-    for star, (flux, error, score, repaired) in enumerate(zip(*found, strict=True)):
-        whole = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
-        kept, lost = np.flatnonzero(used[star]), np.flatnonzero(~used[star])
-        inverse = np.linalg.inv(whole[np.ix_(kept, kept)])
-        mean = model.mean[kept]
+    for star, (flux, error, score, repaired) in enumerate(zip(*results, strict=True)):
+        total = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
+        used_px, bad_px = np.flatnonzero(used[star]), np.flatnonzero(~used[star])
+        inverse = np.linalg.inv(total[np.ix_(used_px, used_px)])
+        mean = model.mean[used_px]
         information = mean @ inverse @ mean
-        assert flux == pytest.approx(mean @ inverse @ x[star, kept] / information, rel=1e-6)
+        assert flux == pytest.approx(mean @ inverse @ x[star, used_px] / information, rel=1e-6)
         assert error == pytest.approx(information**-0.5, rel=1e-6)
-        residual = inverse @ (x[star, kept] - flux * mean)
+        residual = inverse @ (x[star, used_px] - flux * mean)
         expected = np.abs(residual) / np.sqrt(np.diag(inverse))
-        assert score[kept] == pytest.approx(expected, rel=1e-5, abs=1e-8)
-        filled = flux * model.mean[lost] + whole[np.ix_(lost, kept)] @ residual
-        assert repaired[kept] == pytest.approx(x[star, kept], abs=0)
-        assert repaired[lost] == pytest.approx(filled, rel=1e-5, abs=1e-8)
+        assert score[used_px] == pytest.approx(expected, rel=1e-5, abs=1e-8)
+        filled = flux * model.mean[bad_px] + total[np.ix_(bad_px, used_px)] @ residual
+        assert repaired[used_px] == pytest.approx(x[star, used_px], abs=0)
+        assert repaired[bad_px] == pytest.approx(filled, rel=1e-5, abs=1e-8)
 
 
 def test_model_of_stars_of_any_flux_refuses_those_without_and_stamps_of_another_size(stars, model):
@@ -124,13 +124,13 @@ def whole_model(gaussian_stars):
     return FluxModel.fit(gaussian_stars)
 
 
-def measure(model, stamps, start, bad=False, **known):
+def measure(model, stamps, start, bad=False, **stated):
     """Photometry of stamps of which some is known."""
     unknown = dict.fromkeys(("flux", "background", "noise"), np.nan)
-    given = {name: np.full(len(stamps), value) for name, value in (unknown | known).items()}
+    values = {name: np.full(len(stamps), value) for name, value in (unknown | stated).items()}
     bad = np.zeros(stamps.shape, dtype=bool) | bad
     start = np.full(len(stamps), start)
-    return Photometer(model, 48).measure(stamps, bad, start, SimpleNamespace(**given))
+    return Photometer(model, 48).measure(stamps, bad, start, SimpleNamespace(**values))
 
 
 @pytest.mark.parametrize("sky_known", [True, False])
@@ -138,23 +138,25 @@ def test_flux_is_the_one_of_dense_matrices(gaussian_stars, whole_model, sky_know
     """F = mᵀQx / mᵀQm with Q = S⁻¹, without its part along the sky where that is unknown."""
     stars, sky, sigma = gaussian_stars[:10].astype(np.float64), 70.0, 8.0
     stamps = 1e3 * stars + sky + np.random.default_rng(5).normal(0, sigma, stars.shape)
-    known = {"noise": sigma} | ({"background": sky} if sky_known else {})
-    found = measure(whole_model, stamps, sky + 3.0, **known)
+    stated = {"noise": sigma} | ({"background": sky} if sky_known else {})
+    phot = measure(whole_model, stamps, sky + 3.0, **stated)
     covariance = (whole_model.basis * whole_model.variance) @ whole_model.basis.T
-    mean, one = whole_model.mean, np.ones(256)
+    mean, flat_sky = whole_model.mean, np.ones(256)
     for star in range(10):
-        prior = found.flux[star] ** 2 + sigma**2 / (mean @ mean)
+        prior = phot.flux[star] ** 2 + sigma**2 / (mean @ mean)
         inverse = np.linalg.inv(prior * covariance + sigma**2 * np.eye(256))
         if not sky_known:
-            inverse -= np.outer(inverse @ one, inverse @ one) / (one @ inverse @ one)
+            inverse -= np.outer(inverse @ flat_sky, inverse @ flat_sky) / (
+                flat_sky @ inverse @ flat_sky
+            )
         x, information = stamps[star].ravel() - sky, mean @ inverse @ mean
         error = information**-0.5
-        assert found.flux_error[star] == pytest.approx(error, rel=0.01)
-        assert found.flux[star] == pytest.approx(mean @ inverse @ x / information, abs=0.05 * error)
-        left = 0.0 if sky_known else (x.sum() - found.flux[star]) / 256
-        assert found.background[star] == pytest.approx(sky + left, abs=1e-3)
-        image = (x - left) / found.flux[star]
-        assert found.images[star].ravel() == pytest.approx(image, abs=1e-5)
+        assert phot.flux_error[star] == pytest.approx(error, rel=0.01)
+        assert phot.flux[star] == pytest.approx(mean @ inverse @ x / information, abs=0.05 * error)
+        sky_error = 0.0 if sky_known else (x.sum() - phot.flux[star]) / 256
+        assert phot.background[star] == pytest.approx(sky + sky_error, abs=1e-3)
+        image = (x - sky_error) / phot.flux[star]
+        assert phot.images[star].ravel() == pytest.approx(image, abs=1e-5)
 
 
 @pytest.mark.parametrize("sigma", [0.1, 10.0])
@@ -172,11 +174,11 @@ def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels(gaussian_stars,
     stamps += np.random.default_rng(6).normal(0, 8.0, stamps.shape)
     bad = np.zeros(stamps.shape, dtype=bool)
     bad[:, 2:5, 3:9] = True
-    found = measure(whole_model, stamps, 0.0, bad, background=sky)
-    alone = robust_flux(np.where(bad, np.nan, stamps - sky), whole_model)
-    assert found.flux == pytest.approx(alone.flux, rel=1e-6)
-    assert found.flux_error == pytest.approx(alone.flux_error, rel=1e-6)
-    assert found.background == pytest.approx(sky, abs=1e-12)
+    phot = measure(whole_model, stamps, 0.0, bad, background=sky)
+    masked = robust_flux(np.where(bad, np.nan, stamps - sky), whole_model)
+    assert phot.flux == pytest.approx(masked.flux, rel=1e-6)
+    assert phot.flux_error == pytest.approx(masked.flux_error, rel=1e-6)
+    assert phot.background == pytest.approx(sky, abs=1e-12)
 
 
 def test_stars_as_bright_as_their_error_are_fitted_and_flagged_as_with_care(
@@ -185,32 +187,32 @@ def test_stars_as_bright_as_their_error_are_fitted_and_flagged_as_with_care(
     """Flux below its error is none, below three times it is faint, whichever solver is asked."""
     flux = np.linspace(-1.0, 4.0, 300)[:, None, None]
     stamps = 10.0 * flux * gaussian_stars + np.random.default_rng(8).normal(0, 1, (300, 16, 16))
-    found = measure(whole_model, stamps, 0.0)
-    ratio = found.flux / found.flux_error
+    phot = measure(whole_model, stamps, 0.0)
+    ratio = phot.flux / phot.flux_error
     assert (ratio < 1).sum() > 50 and ((ratio > 1) & (ratio < 2)).sum() > 20
-    assert np.array_equal((found.flags & NO_FLUX) > 0, ~(ratio > 1))
-    assert np.array_equal((found.flags & FAINT) > 0, (ratio > 1) & (ratio < 3))
-    assert (found.images[ratio < 1] == 0).all()
-    alone = robust_flux(stamps, whole_model.with_free_sky)
+    assert np.array_equal((phot.flags & NO_FLUX) > 0, ~(ratio > 1))
+    assert np.array_equal((phot.flags & FAINT) > 0, (ratio > 1) & (ratio < 3))
+    assert (phot.images[ratio < 1] == 0).all()
+    dense = robust_flux(stamps, whole_model.with_free_sky)
     careful = ratio < 2
-    assert found.flux[careful] == pytest.approx(alone.flux[careful], rel=1e-6)
-    assert found.flux_error[careful] == pytest.approx(alone.flux_error[careful], rel=1e-6)
+    assert phot.flux[careful] == pytest.approx(dense.flux[careful], rel=1e-6)
+    assert phot.flux_error[careful] == pytest.approx(dense.flux_error[careful], rel=1e-6)
 
 
 def test_another_flux_of_the_same_light_is_another_sky(gaussian_stars, whole_model):
     rng = np.random.default_rng(9)
     stamps = 1e3 * gaussian_stars[:20] + 70.0 + rng.normal(0, 3.0, (20, 16, 16))
-    found = measure(whole_model, stamps, 72.0)
+    phot = measure(whole_model, stamps, 72.0)
     factor = rng.uniform(0.5, 2.0, 20)
-    other = found.with_flux(factor)
+    rescaled = phot.with_flux(factor)
 
     def light(measured):
         sky = measured.background[:, None, None]
         return measured.flux[:, None, None] * measured.images + sky
 
-    assert other.flux == pytest.approx(factor * found.flux)
-    assert other.images.sum(axis=(1, 2)) == pytest.approx(found.images.sum(axis=(1, 2)), abs=1e-4)
-    assert light(other) == pytest.approx(light(found), abs=1e-3)
+    assert rescaled.flux == pytest.approx(factor * phot.flux)
+    assert rescaled.images.sum(axis=(1, 2)) == pytest.approx(phot.images.sum(axis=(1, 2)), abs=1e-4)
+    assert light(rescaled) == pytest.approx(light(phot), abs=1e-3)
 
 
 @pytest.mark.parametrize("sky_known", [True, False])
@@ -225,15 +227,15 @@ def test_residuals_of_the_border_are_those_of_dense_matrices(
     x = stars - total[:, None] / 256
     leading, variance = whole_model.basis[:, -48:], whole_model.variance[-48:]
     weight = np.tile(1 / (variance + sigma**2), (3, 1))
-    found = LeadingModes(whole_model, 48).border_scores(
+    scores = LeadingModes(whole_model, 48).border_scores(
         x, x @ leading, total, flux, weight, np.full(3, sigma**2), np.full(3, sky_known)
     )
     inverse = np.linalg.inv((leading * variance) @ leading.T + sigma**2 * np.eye(256))
     if not sky_known:
-        beyond = inverse @ np.ones(256)
-        inverse -= np.outer(beyond, beyond) / beyond.sum()
+        column = inverse @ np.ones(256)
+        inverse -= np.outer(column, column) / column.sum()
     residual = (stars - flux[:, None] * whole_model.mean) @ inverse / np.sqrt(np.diag(inverse))
-    assert found == pytest.approx(residual[:, border_pixels(16)], abs=1e-4)
+    assert scores == pytest.approx(residual[:, border_pixels(16)], abs=1e-4)
 
 
 def test_root_mean_square_of_scores_is_without_outliers_and_without_nan():
@@ -257,18 +259,18 @@ def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():
     kernel = np.outer([1, 2, 1], [1, 2, 1])[None] / 16
     expected = ndimage.convolve(stamps, kernel, mode="nearest")
     assert smoothed(stamps) == pytest.approx(expected, abs=1e-12)
-    many = smoothed(np.random.default_rng(1).normal(size=(4000, 16, 16)))
-    assert (many[:, 3, 3] - many[:, 9, 9]).std() == pytest.approx(np.sqrt(2) * 6 / 16, rel=0.05)
+    smooth = smoothed(np.random.default_rng(1).normal(size=(4000, 16, 16)))
+    assert (smooth[:, 3, 3] - smooth[:, 9, 9]).std() == pytest.approx(np.sqrt(2) * 6 / 16, rel=0.05)
 
 
 def test_cut_moves_the_middle_and_repeats_the_edge():
-    wide = np.arange(2 * 100).reshape(2, 10, 10)
-    assert np.array_equal(cut(wide, 6), wide[:, 2:8, 2:8])
-    found = cut(wide, 6, np.array([[0, 0], [-1, 2]]))
-    assert np.array_equal(found[0], wide[0, 2:8, 2:8])
-    assert np.array_equal(found[1], wide[1, 1:7, 4:10])
-    beyond = cut(wide, 6, np.array([[4, 0], [0, 0]]))[0]
-    assert (beyond[4:] == wide[0, 9, 2:8]).all()
+    frames = np.arange(2 * 100).reshape(2, 10, 10)
+    assert np.array_equal(cut(frames, 6), frames[:, 2:8, 2:8])
+    moved_px = cut(frames, 6, np.array([[0, 0], [-1, 2]]))
+    assert np.array_equal(moved_px[0], frames[0, 2:8, 2:8])
+    assert np.array_equal(moved_px[1], frames[1, 1:7, 4:10])
+    off_edge = cut(frames, 6, np.array([[4, 0], [0, 0]]))[0]
+    assert (off_edge[4:] == frames[0, 9, 2:8]).all()
 
 
 # Shapes
@@ -300,8 +302,8 @@ def test_width_and_axes_of_a_gaussian_with_its_pixel(sigma, ratio, degrees):
 
 def test_shapes_of_nothing_are_nan_and_of_anything_finite():
     square = np.ones((16, 16))
-    odd = np.random.default_rng(0).random((16, 16)) ** 8
-    spikes = [square, odd, 1e30 * np.eye(16), np.eye(16)[:1] * square]
+    skewed = np.random.default_rng(0).random((16, 16)) ** 8
+    spikes = [square, skewed, 1e30 * np.eye(16), np.eye(16)[:1] * square]
     shapes = measure_shapes(np.stack([0 * square, -square, np.nan * square, *spikes]))
     assert np.isnan(shapes.fwhm_px[:3]).all()
     for values in vars(shapes).values():

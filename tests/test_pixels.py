@@ -67,9 +67,9 @@ def test_cosmic_rays_are_found_and_stars_are_none(fwhm):
     image = field(fwhm)[0]
     assert not cosmic_rays(image).any()
     dirty, true = with_cosmics(image)
-    found = cosmic_rays(dirty)
-    assert (found & ~true).sum() <= 2
-    assert (found & true).sum() >= 0.9 * true.sum()
+    flagged = cosmic_rays(dirty)
+    assert (flagged & ~true).sum() <= 2
+    assert (flagged & true).sum() >= 0.9 * true.sum()
 
 
 def test_no_star_as_narrow_as_a_pixel_is_a_cosmic_ray():
@@ -85,14 +85,14 @@ def test_a_saturated_star_has_no_cosmic_rays(clean):
 def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
     image, place, _ = clean
     dirty, true = with_cosmics(image)
-    before = Stars.from_image(image, detect=True, **CAMERA)
+    clean_set = Stars.from_image(image, detect=True, **CAMERA)
     stars = Stars.from_image(dirty, detect=True, **CAMERA)
     distance, _ = cKDTree(place).query(stars.candidates.bright.position)
-    assert (distance < 1).all() and len(stars) >= 0.9 * len(before)
-    found = np.count_nonzero(cosmic_rays(dirty))
-    assert abs(found - true.sum()) < 0.1 * true.sum()
-    assert f"left out: {found} pixels of cosmic rays and hot pixels" in "\n".join(stars.notes)
-    assert "left out" not in "\n".join(before.notes)
+    assert (distance < 1).all() and len(stars) >= 0.9 * len(clean_set)
+    count = np.count_nonzero(cosmic_rays(dirty))
+    assert abs(count - true.sum()) < 0.1 * true.sum()
+    assert f"left out: {count} pixels of cosmic rays and hot pixels" in "\n".join(stars.notes)
+    assert "left out" not in "\n".join(clean_set.notes)
 
 
 def test_a_listed_cosmic_ray_is_flagged_sharp(clean):
@@ -145,16 +145,16 @@ def test_a_step_of_the_sky_is_sharp_in_its_level(clean):
     slope = np.linspace(0, 200, SIDE)[None]
     assert not sky_steps(image + slope, none, 0) and not sky_steps(image + slope, none, 1)
     step = np.where(np.arange(SIDE) < 150, 0.0, 40.0)[None]
-    found = sky_level(image + step, none)
-    assert np.abs(found.level - SKY - step).max() < 5.0
-    assert found.notes == ("the sky has a step at column 150: the parts have their own sky",)
+    fitted = sky_level(image + step, none)
+    assert np.abs(fitted.level - SKY - step).max() < 5.0
+    assert fitted.notes == ("the sky has a step at column 150: the parts have their own sky",)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 50.0])
 def test_the_level_follows_a_sky_that_curves_within_a_few_meshes(amplitude):
     """A wave of 300 px and a slope, up to the edges; a flat sky is smoothed over meshes."""
-    down, right = np.indices((400, 400)) / 400
-    sky = amplitude * (np.sin(8.0 * down + 4.0 * right) + 3.0 * right)
+    along_columns, along_rows = np.indices((400, 400)) / 400
+    sky = amplitude * (np.sin(8.0 * along_columns + 4.0 * along_rows) + 3.0 * along_rows)
     noise = np.random.default_rng(6).normal(0, 15, sky.shape)
     off = sky_level(sky + noise, np.zeros(sky.shape, bool)).level - sky
     assert off.std() < (6.0 if amplitude else 0.4) and abs(off.mean()) < 1.5
@@ -167,9 +167,9 @@ def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
     sky = sky_of(image + halo, np.zeros(image.shape, bool))
     assert "structure within 64 px" in sky.notes[0]
     stars = sky.stars(5.0)
-    found = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
-    assert (cKDTree(found).query(place)[0] < 1).mean() > 0.9
-    assert (cKDTree(place).query(found)[0] > 2).sum() < 5
+    sources = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
+    assert (cKDTree(sources).query(place)[0] < 1).mean() > 0.9
+    assert (cKDTree(place).query(sources)[0] > 2).sum() < 5
 
 
 def test_noise_of_neighbours_that_is_shared_is_that_of_their_sum(clean):
@@ -198,29 +198,29 @@ def test_trails_are_found_and_stars_are_none(clean):
 def test_bad_pixels_cost_no_stars_and_nan_is_as_a_mask(clean, part):
     image = clean[0]
     mask = np.random.default_rng(1).uniform(size=image.shape) < part
-    before = Stars.from_image(image, detect=True, **CAMERA)
-    few = {"train_stars": 100, "test_stars": 20}  # images of them
+    clean_set = Stars.from_image(image, detect=True, **CAMERA)
+    image_counts = {"train_stars": 100, "test_stars": 20}  # images of them
     masked, nan = (
-        Stars.from_image(pixels, detect=True, **CAMERA, **more, **few)
-        for pixels, more in (
+        Stars.from_image(pixels, detect=True, **CAMERA, **option, **image_counts)
+        for pixels, option in (
             (np.where(mask, 3e4, image), {"mask": mask.astype(np.uint8)}),
             (np.where(mask, np.nan, image), {}),
         )
     )
-    assert len(masked) >= 0.9 * len(before)
+    assert len(masked) >= 0.9 * len(clean_set)
     assert f"{mask.sum()} pixels that are masked or have no value" in "\n".join(nan.notes)
     for name, column in masked.columns.items():
         assert np.array_equal(column.values, nan.columns[name].values, equal_nan=True), name
     # What fills a pixel is near what was there: far nearer than the sky is.
-    bright, whole = masked.candidates.bright, before.candidates.bright
-    _, same = cKDTree(whole.position).query(bright.position)
-    true = whole.stamps[same]
+    bright, clean_bright = masked.candidates.bright, clean_set.candidates.bright
+    _, clean_row = cKDTree(clean_bright.position).query(bright.position)
+    true = clean_bright.stamps[clean_row]
     core = np.zeros_like(bright.bad)
     core[:, 13:20, 13:20] = True
-    chosen = bright.bad & core & (true > 50 * bright.noise[:, None, None])
-    ratio = bright.stamps[chosen] / true[chosen] - 1
-    assert chosen.sum() >= 5 * part / 0.01 and np.abs(ratio).max() < 0.3
-    off = bright.centre - whole.centre[same]
+    filled = bright.bad & core & (true > 50 * bright.noise[:, None, None])
+    ratio = bright.stamps[filled] / true[filled] - 1
+    assert filled.sum() >= 5 * part / 0.01 and np.abs(ratio).max() < 0.3
+    off = bright.centre - clean_bright.centre[clean_row]
     assert np.abs(off - np.rint(off)).max() < 0.03  # a stamp may be cut about the next pixel
 
 
@@ -229,14 +229,14 @@ def test_bad_pixels_have_no_weight_in_the_field(clean):
     """Nothing that is written into them changes the fit."""
     image, place, _ = clean
     mask = np.random.default_rng(2).uniform(size=image.shape) < 0.005
-    before, after = (
+    clean_field, masked_field = (
         fitted_to(Stars.from_image(i, place, mask=m.astype(np.uint8), **CAMERA), FieldMixture)
         for i, m in ((image, np.zeros_like(mask)), (image, mask))
     )
     at = np.array([[160.2, 160.4]])
-    difference = after.psf_at(at) - before.psf_at(at)
+    difference = masked_field.psf_at(at) - clean_field.psf_at(at)
     # σ of a pixel of the mean of all stars, times that part of it which is left out, and some.
-    assert np.abs(difference).max() < 0.002 * before.psf_at(at).max()
+    assert np.abs(difference).max() < 0.002 * clean_field.psf_at(at).max()
 
 
 def test_a_star_without_a_fifth_of_its_light_is_incomplete(clean):
@@ -257,17 +257,17 @@ def test_completed_stars_are_their_neighbours_scaled():
     shift = rng.uniform(-0.5, 0.5, (20, 2))
     shape = np.stack([drawn(moffat(3.0), [(16 + x, 16 + y)], [1.0], 32) for y, x in shift])
     flux = rng.uniform(1e4, 1e5, 20)
-    wide, bad = shape * flux[:, None, None], np.zeros(shape.shape, bool)
+    light, bad = shape * flux[:, None, None], np.zeros(shape.shape, bool)
     bad[7, 16, 17] = True
-    hurt = np.where(bad, 0.0, wide)
+    hurt = np.where(bad, 0.0, light)
     zero = np.zeros((20, 2), int)
     position, nan = rng.uniform(0, 300, (20, 2)), np.full((20, 2), np.nan)
-    known = (position, flux, np.full(20, 5.0), flux / 30, np.arange(20), nan, nan[:, 0])
-    found, missing = completed(BrightStars(hurt, zero, shift, *known, bad), 16, 3)
-    assert found.stamps[7, 16, 17] == pytest.approx(wide[7, 16, 17], rel=0.02)
+    facts = (position, flux, np.full(20, 5.0), flux / 30, np.arange(20), nan, nan[:, 0])
+    repaired, missing = completed(BrightStars(hurt, zero, shift, *facts, bad), 16, 3)
+    assert repaired.stamps[7, 16, 17] == pytest.approx(light[7, 16, 17], rel=0.02)
     part = shape[7, 16, 17] / shape[7, 8:24, 8:24].sum()
     assert missing[7] == pytest.approx(part, rel=0.03) and missing.sum() == missing[7]
-    assert found.framed(20)[1].sum() == 20 * 400 - 1
+    assert repaired.framed(20)[1].sum() == 20 * 400 - 1
 
 
 def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):
@@ -275,10 +275,10 @@ def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):
     bad = np.zeros(image.shape, bool)
     column, row = np.rint(place).astype(int).T
     bad[row, column] = True
-    found = sky_of(np.where(bad, np.nan, image), bad).stars(5.0)
-    seen = np.stack([found["X_IMAGE"], found["Y_IMAGE"]], axis=1) - 1
-    distance, index = cKDTree(seen).query(place)
-    assert len(seen) == len(place) == len(set(index)) and distance.max() < 0.5
+    sources = sky_of(np.where(bad, np.nan, image), bad).stars(5.0)
+    centres = np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1) - 1
+    distance, index = cKDTree(centres).query(place)
+    assert len(centres) == len(place) == len(set(index)) and distance.max() < 0.5
 
 
 # Areas without data.
@@ -296,8 +296,8 @@ def test_blank_areas_are_bad_and_said(clean, value):
     assert stars.observation.positions[:, 0].min() > 59
     sky = stars.observation.sky()
     assert np.median(sky.level) == pytest.approx(SKY, rel=0.01)
-    known = place[place[:, 0] > 68]
-    assert cKDTree(stars.observation.positions).query(known)[0].max() < 8
+    target = place[place[:, 0] > 68]
+    assert cKDTree(stars.observation.positions).query(target)[0].max() < 8
 
 
 def test_noise_of_few_counts_has_no_blank_areas():
@@ -322,8 +322,8 @@ def test_overscan_of_the_header_is_bad_where_the_pixels_confirm_it(clean):
     frame[:, 300:] = rng.normal(50.0, 4.0, (SIDE, 20))
     ((key, area),) = bad_pixels.overscan([header], frame, none)
     assert key == "TRIMSEC" and area[:, 300:].all() and not area[:, :300].any()
-    other = fits.Header({"TRIMSEC": "[51:2098,1:2048]"}.items())
-    assert not bad_pixels.overscan([other], frame, none)
+    untrimmed = fits.Header({"TRIMSEC": "[51:2098,1:2048]"}.items())
+    assert not bad_pixels.overscan([untrimmed], frame, none)
 
 
 # Clipped skies.
@@ -334,8 +334,8 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
     clipped = np.clip(np.rint(image - SKY), 0, None)
     path = tmp_path / "clipped.fits"
     fits.writeto(path, clipped.astype(np.uint16))
-    said = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
-    assert "of the pixels have the least value, 0: the sky was clipped" in said
+    message = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
+    assert "of the pixels have the least value, 0: the sky was clipped" in message
     assert not (tmp_path / "m").exists()
     with pytest.raises(ObservationError, match="clipped"):
         Stars.from_image(clipped, place)
@@ -343,8 +343,8 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
         noise = np.random.default_rng(7).normal(sky, scatter, (256, 256))
         with pytest.raises(bad_pixels.ClippedSkyError, match="least value, 0: the sky"):
             bad_pixels.refuse_clipped_sky(np.maximum(noise, 0), np.zeros(noise.shape, bool))
-    few = np.random.default_rng(8).poisson(1.0, (256, 256)).astype(float)
-    bad_pixels.refuse_clipped_sky(few, np.zeros(few.shape, bool))
+    photons = np.random.default_rng(8).poisson(1.0, (256, 256)).astype(float)
+    bad_pixels.refuse_clipped_sky(photons, np.zeros(photons.shape, bool))
 
 
 # Units.
@@ -354,14 +354,16 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
 @pytest.mark.parametrize("unit", [1e-25, 1e10])
 def test_nothing_depends_on_the_unit(clean, unit):
     image = clean[0] - SKY
-    found = []
+    results = []
     for pixels in (image, image * unit):
         stars = Stars.from_image(pixels, detect=True)
         model = _Field(fitted_to(stars, FieldMixture), 16)
-        found.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
-    (one, first, table), (two, second, scaled) = found
-    assert (one.candidates.verdict == two.candidates.verdict).all()
-    assert two.candidates.bright.position == pytest.approx(one.candidates.bright.position)
+        results.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
+    (first_stars, first, table), (second_stars, second, scaled) = results
+    assert (first_stars.candidates.verdict == second_stars.candidates.verdict).all()
+    assert second_stars.candidates.bright.position == pytest.approx(
+        first_stars.candidates.bright.position
+    )
     assert second.psf_at(160.0, 160.0) == pytest.approx(first.psf_at(160.0, 160.0), abs=1e-7)
     off = np.array(scaled["flux"]) / unit - np.array(table["flux"])
     assert np.nanmax(np.abs(off) / np.array(table["flux_error"])) < 0.01

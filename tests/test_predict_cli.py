@@ -107,8 +107,9 @@ def test_image_and_catalogue(folder, field_psfs, shipped):
 def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
     columns = {"id": np.arange(2), "x": np.array([4.999999999883585, np.nan]), "flux": np.ones(2)}
     of_list = Table({"Flux": [1, 2], "flux_list": ["=1+1", "é"], "mag": [3.0, 4.0] * u.mag})
+    of_list["name"] = [b"@a", b"b"]
     table = star_table(columns, "electron / s", of_list)
-    names = ["id", "x", "flux", "Flux_list", "flux_list_list", "mag"]
+    names = ["id", "x", "flux", "Flux_list", "flux_list_list", "mag", "name"]
     for suffix in SUFFIXES:
         write_table(tmp_path / f"t{suffix}", table)
         again = QTable.read(tmp_path / f"t{suffix}")
@@ -118,8 +119,8 @@ def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
             units = [str(again[name].unit) for name in ("x", "flux", "mag")]
             assert units == ["pix", "electron / s", "mag"]
     assert (tmp_path / "t.csv").read_text().splitlines()[1:] == [
-        "0,5.0000,1,1,'=1+1,3.0",
-        "1,nan,1,2,é,4.0",
+        "0,5.0000,1,1,'=1+1,3.0,'@a",
+        "1,nan,1,2,é,4.0,b",
     ]
 
 

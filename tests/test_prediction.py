@@ -20,13 +20,13 @@ def rms(values):
     return np.sqrt(np.nanmean(np.square(values)))
 
 
-def has(found, flag):
-    return (found.flags & int(flag)) > 0
+def has(result, flag):
+    return (result.flags & int(flag)) > 0
 
 
-def compared(found):
+def compared(result):
     """Names of all arrays but the stars' numbers."""
-    return [name for name in (*found.columns, *CUBES) if name != "id"]
+    return [name for name in (*result.columns, *CUBES) if name != "id"]
 
 
 def same(a, b, rows=slice(None)):
@@ -40,10 +40,10 @@ def close(a, b, rows=slice(None), rel=1e-3):
     A residual is what little is left of hundreds of counts in single precision: to 2e-5 of the
     sky's RMS.
     """
-    least = {"position_angle_deg": 50 * rel, "residual": 2e-5 * SKY**0.5}
+    tolerances = {"position_angle_deg": 50 * rel, "residual": 2e-5 * SKY**0.5}
     for name in compared(a):
         x, y = (np.asarray(getattr(p, name)[rows], np.float64) for p in (a, b))
-        tolerance = np.maximum(rel * np.abs(y), least.get(name, 1e-3))
+        tolerance = np.maximum(rel * np.abs(y), tolerances.get(name, 1e-3))
         assert ((np.abs(x - y) <= tolerance) | (np.isnan(x) & np.isnan(y))).all(), name
     return True
 
@@ -65,37 +65,37 @@ def test_uncertainty_covers_68_per_cent_and_the_flux_error_is_the_scatter(
     shipped, field_psfs, level
 ):
     stars = observe(field_psfs, level)
-    for given in ({"flux": stars.flux, "background": SKY}, {"background": SKY}, {}):
-        found = shipped.predict(stars.stamps, **given)
-        kept = ~has(found, StarFlag.NO_FLUX)
-        assert kept.mean() > 0.99
-        error = np.abs(found.psf - stars.flux * stars.truth)[kept]
-        assert (error <= found.uncertainty[kept]).mean() == pytest.approx(0.68, abs=0.05)
-        if "flux" not in given and level > 1e-4:
-            scatter = rms(found.flux - stars.flux)
-            assert scatter == pytest.approx(rms(found.flux_error), rel=0.2)
-            assert np.nanmean(found.flux / stars.flux) == pytest.approx(1.0, abs=0.05)
+    for known in ({"flux": stars.flux, "background": SKY}, {"background": SKY}, {}):
+        result = shipped.predict(stars.stamps, **known)
+        valid = ~has(result, StarFlag.NO_FLUX)
+        assert valid.mean() > 0.99
+        error = np.abs(result.psf - stars.flux * stars.truth)[valid]
+        assert (error <= result.uncertainty[valid]).mean() == pytest.approx(0.68, abs=0.05)
+        if "flux" not in known and level > 1e-4:
+            scatter = rms(result.flux - stars.flux)
+            assert scatter == pytest.approx(rms(result.flux_error), rel=0.2)
+            assert np.nanmean(result.flux / stars.flux) == pytest.approx(1.0, abs=0.05)
 
 
 def test_errors_are_those_that_the_bundle_states(shipped, field_psfs):
     for row in shipped.info.metrics[3:6]:
         stars = observe(field_psfs, row["noise_level"])
-        found = shipped.predict(stars.stamps, flux=stars.flux, background=SKY)
-        mse = np.mean((found.psf / stars.flux - stars.truth) ** 2)
+        result = shipped.predict(stars.stamps, flux=stars.flux, background=SKY)
+        mse = np.mean((result.psf / stars.flux - stars.truth) ** 2)
         assert mse == pytest.approx(row["mse"], rel=0.15)
 
 
 def test_estimating_flux_and_sky_costs_less_than_the_noise_does(shipped, medium, clean):
-    given = shipped.predict(medium.stamps, flux=medium.flux, background=SKY)
-    given, estimated, noisy = (
+    with_known = shipped.predict(medium.stamps, flux=medium.flux, background=SKY)
+    with_known, estimated, noisy = (
         rms(images - medium.truth)
         for images in (
-            given.psf / medium.flux,
+            with_known.psf / medium.flux,
             clean.psf / clean.flux[:, None, None],
             (medium.stamps - SKY) / medium.flux,
         )
     )
-    assert given < estimated < 1.3 * given
+    assert with_known < estimated < 1.3 * with_known
     assert estimated < 0.5 * noisy
 
 
@@ -112,17 +112,17 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
 
 def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
     """What the model does not know of a star's shape would pass for flux and for no noise."""
-    told = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
+    no_misfit = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
     stars = observe(field_psfs, 3e-5)
-    found, without = (m.predict(stars.stamps) for m in (shipped, PsfModel(told)))
-    assert rms(found.flux / stars.flux - 1) < 0.7 * rms(without.flux / stars.flux - 1)
-    assert found.noise.min() > 0.8 * SKY**0.5
-    assert (found.flags > 0).mean() < 0.02
+    result, plain = (m.predict(stars.stamps) for m in (shipped, PsfModel(no_misfit)))
+    assert rms(result.flux / stars.flux - 1) < 0.7 * rms(plain.flux / stars.flux - 1)
+    assert result.noise.min() > 0.8 * SKY**0.5
+    assert (result.flags > 0).mean() < 0.02
 
 
 def test_residual_is_what_is_left_of_the_stamp(medium, clean):
-    left = medium.stamps - clean.background[:, None, None] - clean.psf
-    np.testing.assert_allclose(clean.residual, left, rtol=0, atol=1e-2)
+    residual = medium.stamps - clean.background[:, None, None] - clean.psf
+    np.testing.assert_allclose(clean.residual, residual, rtol=0, atol=1e-2)
     assert np.median(clean.chi2) == pytest.approx(1.0, abs=0.15)
 
 
@@ -132,11 +132,11 @@ def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypa
     flux = np.geomspace(1e4, 1e6, 60)[:, None, None]
     stamps = np.random.default_rng(4).poisson(flux * double + 100.0).astype(np.float32)
     monkeypatch.setattr(restoration, "MAX_CHI2", 2.0)
-    found = shipped.predict(stamps, gain=1.0, noise=10.0)
-    poor = has(found, StarFlag.POOR_FIT)
-    assert (poor == (found.chi2 > 2.0)).all() and 5 < poor.sum() < 55
-    without = shipped.predict(stamps, noise=10.0)  # the gain: fewer photons are expected
-    assert has(without, StarFlag.POOR_FIT).sum() >= poor.sum()
+    result = shipped.predict(stamps, gain=1.0, noise=10.0)
+    poor = has(result, StarFlag.POOR_FIT)
+    assert (poor == (result.chi2 > 2.0)).all() and 5 < poor.sum() < 55
+    no_gain = shipped.predict(stamps, noise=10.0)  # the gain: fewer photons are expected
+    assert has(no_gain, StarFlag.POOR_FIT).sum() >= poor.sum()
 
 
 @pytest.mark.parametrize("sigma", [None, 2.0])
@@ -156,18 +156,18 @@ def test_chi2_of_noise_is_1_whatever_part_of_it_a_star_follows(sigma):
 
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):
     stars = observe(field_psfs, 1e-4)
-    without = shipped.predict(stars.stamps, noise=SKY**0.5)
+    no_gain = shipped.predict(stars.stamps, noise=SKY**0.5)
     counted = shipped.predict(stars.stamps, noise=SKY**0.5, gain=1.0)
-    assert (counted.chi2 < without.chi2).all()
-    assert counted.flux_error == pytest.approx(np.hypot(without.flux_error, without.flux**0.5))
+    assert (counted.chi2 < no_gain.chi2).all()
+    assert counted.flux_error == pytest.approx(np.hypot(no_gain.flux_error, no_gain.flux**0.5))
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
 def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
-    found = shipped.predict(medium.stamps[:100].astype(np.float64) * unit)
-    np.testing.assert_allclose(found.psf / unit, clean.psf[:100], rtol=1e-3, atol=1e-2)
-    assert found.snr == pytest.approx(clean.snr[:100], rel=1e-3)
-    assert np.mean(found.flags == clean.flags[:100]) > 0.99
+    result = shipped.predict(medium.stamps[:100].astype(np.float64) * unit)
+    np.testing.assert_allclose(result.psf / unit, clean.psf[:100], rtol=1e-3, atol=1e-2)
+    assert result.snr == pytest.approx(clean.snr[:100], rel=1e-3)
+    assert np.mean(result.flags == clean.flags[:100]) > 0.99
 
 
 @pytest.mark.parametrize(("name", "rel"), [("shipped", 1e-3), ("network", 1e-4)])
@@ -185,12 +185,12 @@ def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, req
 
 @pytest.mark.parametrize("kind", [">f4", ">i2", list])
 def test_numbers_of_any_type_and_byte_order_are_taken_and_left_alone(shipped, medium, clean, kind):
-    few = medium.stamps[:9]
-    given = few.tolist() if kind is list else few.astype(kind)
-    psf = shipped.predict(given).psf
+    stamps = medium.stamps[:9]
+    values = stamps.tolist() if kind is list else stamps.astype(kind)
+    psf = shipped.predict(values).psf
     assert psf == pytest.approx(clean.psf[:9], rel=1e-4, abs=1e-2)
     assert psf.dtype == np.float32
-    assert np.array_equal(given, few.astype(kind) if kind is not list else few)
+    assert np.array_equal(values, stamps.astype(kind) if kind is not list else stamps)
 
 
 def put(value, *place):
@@ -211,19 +211,21 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize(("name", "alike"), [("shipped", close), ("network", same)])
-def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(name, alike, medium, request):
+@pytest.mark.parametrize(("name", "is_alike"), [("shipped", close), ("network", same)])
+def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(
+    name, is_alike, medium, request
+):
     model, stamps = request.getfixturevalue(name), medium.stamps.copy()
     for stamp, (_, change) in zip(stamps, BROKEN.values(), strict=False):
         change(stamp)
-    found = model.predict(stamps)
+    result = model.predict(stamps)
     for row, (kind, (flag, _)) in enumerate(BROKEN.items()):
-        assert (found.flags[row] & int(flag)) == int(flag), kind
-    lost = has(found, StarFlag.NO_FLUX)
-    assert np.isnan(found.psf[lost]).all()
-    assert np.isfinite(found.psf[~lost]).all()
-    assert np.isfinite(found.uncertainty[~lost]).all()
-    assert alike(found, model.predict(medium.stamps), slice(len(BROKEN), None))
+        assert (result.flags[row] & int(flag)) == int(flag), kind
+    dark = has(result, StarFlag.NO_FLUX)
+    assert np.isnan(result.psf[dark]).all()
+    assert np.isfinite(result.psf[~dark]).all()
+    assert np.isfinite(result.uncertainty[~dark]).all()
+    assert is_alike(result, model.predict(medium.stamps), slice(len(BROKEN), None))
 
 
 def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, clean):
@@ -249,16 +251,16 @@ def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, 
 def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean):
     flux = np.full(len(medium.stamps), np.nan)
     flux[::2] = medium.flux
-    found = shipped.predict(medium.stamps, flux=flux, noise=123.0)
-    assert (found.flux[::2] == medium.flux).all()
-    assert np.isnan(found.flux_error[::2]).all()
-    assert np.isfinite(found.flux_error[1::2]).all()
-    assert (found.noise == 123.0).all()
+    result = shipped.predict(medium.stamps, flux=flux, noise=123.0)
+    assert (result.flux[::2] == medium.flux).all()
+    assert np.isnan(result.flux_error[::2]).all()
+    assert np.isfinite(result.flux_error[1::2]).all()
+    assert (result.noise == 123.0).all()
     sky = shipped.predict(medium.stamps, background=SKY + 1.0)
     assert (sky.background == SKY + 1.0).all()
     assert rms(sky.flux / medium.flux - 1) < rms(clean.flux / medium.flux - 1)
-    wrong = shipped.predict(medium.stamps[:2], flux=np.array([0.0, -5.0]))
-    assert has(wrong, StarFlag.NO_FLUX).all()
+    dark = shipped.predict(medium.stamps[:2], flux=np.array([0.0, -5.0]))
+    assert has(dark, StarFlag.NO_FLUX).all()
 
 
 @pytest.mark.parametrize(("end", "factor"), [("LOW", 0.6), ("HIGH", 2.0)])
@@ -269,39 +271,39 @@ def test_sn_outside_the_training_is_flagged(shipped, field_psfs, end, factor):
     level = np.sqrt(np.square(psf).sum(axis=(1, 2), keepdims=True)) / (snr * KAPPA)
     stars = observe(psf, level)
     flux = stars.flux[:, 0, 0]
-    found = shipped.predict(stars.stamps, flux=flux, background=SKY, noise=SKY**0.5)
-    assert has(found, StarFlag[f"SNR_{end}"]).mean() >= (0.95 if end == "LOW" else 1.0)
+    result = shipped.predict(stars.stamps, flux=flux, background=SKY, noise=SKY**0.5)
+    assert has(result, StarFlag[f"SNR_{end}"]).mean() >= (0.95 if end == "LOW" else 1.0)
 
 
 def test_a_star_beside_the_middle_is_moved_there(shipped, field_psfs):
-    wide = np.zeros((64, 22, 22))
-    wide[:, 3:19, 3:19] = field_psfs[:64]
-    moved = np.roll(wide, (-2, 2), axis=(1, 2))
-    stars = observe(np.stack([wide, moved]).reshape(-1, 22, 22), 3e-4)
-    found = shipped.predict(stars.stamps, margin=3)
-    straight, shifted = found.shift_x[:64], found.shift_x[64:]
+    frames = np.zeros((64, 22, 22))
+    frames[:, 3:19, 3:19] = field_psfs[:64]
+    shifted_px = np.roll(frames, (-2, 2), axis=(1, 2))
+    stars = observe(np.stack([frames, shifted_px]).reshape(-1, 22, 22), 3e-4)
+    result = shipped.predict(stars.stamps, margin=3)
+    straight, shifted = result.shift_x[:64], result.shift_x[64:]
     assert (straight == 0).mean() > 0.98
     # Those that the jitter had moved the other way lie within it still.
     assert set(np.unique(shifted)) <= {0, 1, 2, 3}
     assert (shifted >= 2).mean() > 0.5
-    mine = shifted != 0
-    offset = np.stack([found.shift_y[64:], shifted], axis=1)
-    beside = found.psf[64:] - stars.flux * cut(moved, 16, offset)
-    assert rms(beside[mine]) < 1.3 * rms(found.psf[:64] - stars.flux * cut(wide, 16))
+    is_moved = shifted != 0
+    offset = np.stack([result.shift_y[64:], shifted], axis=1)
+    error = result.psf[64:] - stars.flux * cut(shifted_px, 16, offset)
+    assert rms(error[is_moved]) < 1.3 * rms(result.psf[:64] - stars.flux * cut(frames, 16))
     too_far = shipped.predict(stars.stamps[64:], margin=3).flags & int(StarFlag.OFF_CENTRE)
     assert (too_far > 0).mean() < 0.05
 
 
 def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs, clean):
-    unlike = StarFlag.UNLIKE_TRAINING | StarFlag.OUTLIER | StarFlag.OFF_CENTRE
+    unlike_flags = StarFlag.UNLIKE_TRAINING | StarFlag.OUTLIER | StarFlag.OFF_CENTRE
     neighbour = np.zeros_like(field_psfs)
     neighbour[:, 6:, :-6] = field_psfs[:, :-6, 6:]
     doubles = shipped.predict(observe(field_psfs + neighbour, 3e-4).stamps)
-    assert has(doubles, unlike).mean() > 0.8
+    assert has(doubles, unlike_flags).mean() > 0.8
     spike = np.zeros((50, 16, 16))
     spike[:, 8, 8] = 1.0
-    assert has(shipped.predict(observe(spike, 1e-3).stamps), unlike).all()
-    assert has(clean, unlike).mean() < 0.02
+    assert has(shipped.predict(observe(spike, 1e-3).stamps), unlike_flags).all()
+    assert has(clean, unlike_flags).mean() < 0.02
 
 
 @pytest.mark.parametrize(

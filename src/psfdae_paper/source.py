@@ -25,9 +25,10 @@ def source_hash(*names: str) -> str:
 
     These are the modules that they import, the modules that those import, and so on. Docstrings,
     comments and formatting do not count, nor do imports that only annotations or decorators use.
-    Modules that are imported by a computed name, such as that of the method that is fitted, cannot
-    be recognised, nor are imports that a module does not use itself, such as re-exports, relative
-    ones or those of all names; name these modules, too.
+    Four kinds of imports cannot be recognised, so that their modules have to be named, too: by a
+    computed name, such as that of the method that is fitted; relative ones; those of all names; and
+    those of a module that only passes names on, which it does not use itself. Packages above a
+    module count only where a name is imported from them: their `__init__.py` computes nothing.
 
     Parameters
     ----------

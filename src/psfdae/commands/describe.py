@@ -43,7 +43,8 @@ def description(bundle: Bundle) -> str:
     # All facts by their names, in the order in which they are printed.
     facts = {
         "Name": info.name,
-        "Format": f"{FORMAT_VERSION}, written {info.created} by psfdae {info.psfdae_version}",
+        # Only bundles of this one format are read.
+        "Written": f"{info.created} by psfdae {info.psfdae_version}, in format {FORMAT_VERSION}",
         "Licence": info.licence,
         "SHA-256": bundle.sha256,
         "Stamp": f"{info.stamp_px} × {info.stamp_px} px of {scale}",
@@ -56,7 +57,8 @@ def description(bundle: Bundle) -> str:
         "Trained on": f"{info.training_stars} {star_kind}, SHA-256 {info.training_sha256[:16]}…",
         **({"Adapted to": f"{info.adapted}, after its training"} if info.adapted else {}),
         **({"Light beyond the stamp": str(bundle.wings)} if bundle.wings else {}),
-        "Distance limit": f"{bundle.errors.distance_limit:.3g} in {info.components} components",
+        "Flagged as unlike": "stars farther from the training stars than a Mahalanobis distance of "
+        f"{bundle.errors.distance_limit:.3g} in {info.components} components",
     }
     # Names are padded to the longest one, so that all facts begin in the same column.
     width = max(len(name) for name in facts)
@@ -80,7 +82,7 @@ def _error_table(info: BundleInfo) -> str:
         rows.append(metrics | ({"gain": mse_noisy / mse} if mse_noisy and mse else {}))
     # Heading and number format of each column, by the name of the metric.
     formats = {
-        "noise_level": ("λ", ".2g"),
+        "noise_level": ("noise level", ".2g"),
         "noise": ("noise/flux", ".2e"),
         "snr": ("S/N", ".1f"),
         "mse_noisy": ("MSE noisy", ".2e"),

@@ -191,7 +191,18 @@ def votable(path: Path, content: bytes) -> Table:
 def regions(path: Path, lines: Sequence[str]) -> Table:
     """Read the centres of DS9's circles, points, ellipses, boxes and annuli.
 
-    Their text is the column `id`, if all have one. Regions that are excluded (−) are left out.
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    lines : sequence of str
+        Lines that are not blank.
+
+    Returns
+    -------
+    Table
+        Columns of positions as text: pixels from 1, or sky coordinates. The regions' text is the
+        column `id`, if all have one. Regions that are excluded (−) are left out.
 
     Raises
     ------
@@ -252,9 +263,21 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
 
 
 def stetson(path: Path, lines: Sequence[str]) -> Table:
-    """Read number, x and y, the first columns of a list of DAOPHOT itself (three head lines).
+    """Read number, x and y, the first columns of a list of DAOPHOT (Stetson 1987, PASP 99, 191).
 
-    Its pixels count from 1, as SExtractor's do.
+    Lists of the program itself have three head lines; those of IRAF's DAOPHOT are `text_table`'s.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    lines : sequence of str
+        Lines that are not blank.
+
+    Returns
+    -------
+    Table
+        Columns `id`, `X_IMAGE` and `Y_IMAGE`, text; pixels count from 1, as SExtractor's do.
 
     Raises
     ------

@@ -37,7 +37,7 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "flux_error": (OF_IMAGE, ".3g", "standard error; NaN if the flux was given"),
     "flux_total": (OF_IMAGE, ".7g", "within FLUXRAD; NaN if the model has no wings"),
     "flux_total_error": (OF_IMAGE, ".3g", "standard error"),
-    "flux_model": (OF_IMAGE, ".7g", "without the light that the model does not have"),
+    "flux_model": (OF_IMAGE, ".7g", "light of the star within the model's stamp"),
     "flux_iso": (OF_IMAGE, ".7g", "light above the threshold of the detection"),
     "background": (OF_IMAGE, ".6g", "sky per pixel"),
     "noise": (OF_IMAGE, ".4g", "RMS of the sky noise in a pixel"),
@@ -241,7 +241,8 @@ def write_table(path: Path, table: QTable) -> None:
         elif path.suffix.lower() == ".ecsv":
             plain.write(temporary, format="ascii.ecsv", overwrite=True)
         else:
-            # Texts of a list may begin like a formula.
+            # Texts of a list, in bytes or not, may begin like a formula.
+            plain.convert_bytestring_to_unicode()
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
             # Formats are those of the columns; numbers that are missing are written as such.

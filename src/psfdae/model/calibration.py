@@ -31,8 +31,7 @@ from psfdae.model.error_model import (
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.restoration import SNR_TOLERANCE
-from psfdae.model.star_sets import HeldOutStars
-from psfdae.stars.bright_stars import BrightStars
+from psfdae.model.star_sets import HeldOutStars, ModelStars
 
 NODES = 8
 """Noise levels at which errors are measured, equidistant in the logarithm."""
@@ -277,7 +276,7 @@ def _scales_at(
     return noise, scale, flux_scale
 
 
-def with_training_stars(model: PsfModel, bright: BrightStars) -> Bundle:
+def with_training_stars(model: PsfModel, stars: ModelStars) -> Bundle:
     """Return the bundle of a model with limits of outliers that training stars are not beyond.
 
     The noise of a training star is in the axes of the training, along which a star of the same
@@ -287,11 +286,11 @@ def with_training_stars(model: PsfModel, bright: BrightStars) -> Bundle:
     Parameters
     ----------
     model : PsfModel
-    bright : BrightStars
-        Training stars of the image.
+    stars : ModelStars
+        Those of a simulation change nothing: they have no noise.
     """
     bundle, errors = model.bundle, model.bundle.errors
-    if errors.outlier_limit is None:
+    if errors.outlier_limit is None or (bright := stars.bright) is None:
         return bundle
     # The stars as they are in the image, framed, with the flux 1.
     images, is_measured = bright.framed(bundle.info.stamp_px)

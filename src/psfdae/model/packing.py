@@ -81,8 +81,7 @@ def model_of(
         bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
     # Errors on test stars; in an image, limits of outliers by its training stars, too.
     bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
-    if model_stars.bright is not None:
-        bundle = with_training_stars(PsfModel(bundle, unpacked), model_stars.bright)
+    bundle = with_training_stars(PsfModel(bundle, unpacked), model_stars)
     # Metrics of test stars at the noise levels of the configuration.
     noisy = (
         (level, noisy_test_images(config, stars, model_stars.test, level))
@@ -143,8 +142,7 @@ def uncalibrated(
         noise_equivalent_px=area,
         components=components,
         training_sha256=checksum(images, model_stars.references),
-        # Simulated stars are one image each.
-        training_stars=len(images if model_stars.bright is None else model_stars.bright),
+        training_stars=len(model_stars.stars),
         method=fitted.name,
         reference=reference,
         **method_fields,

@@ -237,36 +237,48 @@ class ModelStars:
 
     Attributes
     ----------
+    product : product "stars"
     images, references : ndarray, shape (n, d, d)
         Training images of flux 1, and what is to be restored of them.
+    stars : ndarray of int, shape (m,)
+        Numbers of the training stars; those of an image have several images each.
     held_out : HeldOutStars
         Test stars.
     test : ndarray of int
         Their numbers in the product.
     noise_equivalent_px : float
         Noise-equivalent area of a typical star.
-    bright : BrightStars or None
-        Training stars of an image, each once; None if the stars are simulated.
     """
 
+    product: Product
     images: np.ndarray
     references: np.ndarray
+    stars: np.ndarray
     held_out: HeldOutStars
     test: np.ndarray
     noise_equivalent_px: float
-    bright: BrightStars | None
 
     @classmethod
     def of(cls, stars: Product, split_kind: str, reference: str, config: OfFit) -> ModelStars:
         """Return the parts of a product "stars", as `training_set` and `HeldOutStars` do."""
         parts = split_stars(stars, split_kind, config)
-        held_out = HeldOutStars.of(stars, reference, noise_model(config), parts.test)
-        images, references = stars["realisation"][parts.train], stars[reference][parts.train]
-        area, bright = star_area(stars, parts.train), None
-        if of_image(stars):
-            # Each bright star is in several of the images.
-            bright = BrightStars.of_product(stars).of(np.unique(stars["field_index"][parts.train]))
-        return cls(images, references, held_out, parts.test, area, bright)
+        numbers = np.unique(stars["field_index"][parts.train]) if of_image(stars) else parts.train
+        return cls(
+            stars,
+            stars["realisation"][parts.train],
+            stars[reference][parts.train],
+            numbers,
+            HeldOutStars.of(stars, reference, noise_model(config), parts.test),
+            parts.test,
+            star_area(stars, parts.train),
+        )
+
+    @property
+    def bright(self) -> BrightStars | None:
+        """The training stars of an image with the pixels around them; None if simulated."""
+        return (
+            BrightStars.of_product(self.product).of(self.stars) if of_image(self.product) else None
+        )
 
 
 def training_set(

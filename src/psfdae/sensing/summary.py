@@ -24,12 +24,14 @@ def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
     Parameters
     ----------
     draws : ndarray, shape (m, s, K + 4)
-        Draws of each star with modes, as `StarModes.parameters`.
+        m draws for each of the s stars with modes: coefficients, place, flux and sky in the units
+        of `StarModes.parameters`.
     modes : StarModes
 
     Returns
     -------
     ndarray of int, shape (m, s)
+        Numbers from 0 among all modes.
     """
     nearest = np.empty(draws.shape[:2], int)
     for row, star in enumerate(modes.best_modes.star):
@@ -43,7 +45,7 @@ def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
 
 
 def summarise_modes(
-    coefficients: np.ndarray, mode_of_draw: np.ndarray, modes: StarModes, sd: np.ndarray
+    coefficients: np.ndarray, mode_of_draw: np.ndarray, modes: StarModes, prior_sigma: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the table of posterior modes, by star and the most probable first.
 
@@ -54,13 +56,14 @@ def summarise_modes(
     mode_of_draw : ndarray of int, shape (m, s)
         Result of `nearest_modes`.
     modes : StarModes
-    sd : ndarray, shape (n, K)
-        Standard deviation of the prior of all stars, in waves.
+    prior_sigma : ndarray, shape (n, K)
+        Standard deviation of the prior of all n stars, in waves.
 
     Returns
     -------
     dict of ndarray
-        `star` (M,) and `probability` (M,); `mean` (M, K) and `covariance` (M, K, K) in waves.
+        `star` (M,), its number; `probability` (M,), the part of its draws; `mean` (M, K) and
+        `covariance` (M, K, K) of the coefficients in waves.
     """
     # Draws belong to the mode that is nearest; a mode without draws is left out.
     k = coefficients.shape[-1]
@@ -74,7 +77,9 @@ def summarise_modes(
             if len(draws) > 2 * k:
                 covariance = np.atleast_2d(np.cov(draws, rowvar=False))
             else:
-                covariance = modes.covariance[mode, :k, :k] * sd[star] * sd[star][:, None]
+                covariance = modes.covariance[mode, :k, :k] * np.outer(
+                    prior_sigma[star], prior_sigma[star]
+                )
             probability = len(draws) / coefficients.shape[1]
             rows.append((star, probability, draws.mean(axis=0), covariance))
     names, columns = ("star", "probability", "mean", "covariance"), zip(*rows, strict=True)

@@ -85,7 +85,10 @@ class Alignment(Group):
 
     @property
     def unit(self) -> np.ndarray:
-        """Ranges of decentre x, y in metres and tilt x, y in radians, shape (4,)."""
+        """Ranges of decentre x, y in metres and tilt x, y in radians, shape (4,).
+
+        States times this are the decentres and tilts of the mirror in SI units.
+        """
         # Both axes have the same ranges.
         tilt = np.deg2rad(self.tilt_range_deg)
         return np.array([self.decenter_range_m, self.decenter_range_m, tilt, tilt])
@@ -111,7 +114,13 @@ class Cnn(Group):
 
     @model_validator(mode="after")
     def check_layers(self) -> Cnn:
-        """Require odd kernels, and as many kernels and strides as widths."""
+        """Require odd kernels, and as many kernels and strides as widths.
+
+        Raises
+        ------
+        ValueError
+            With the list that is wrong.
+        """
         # An even kernel would shift the image by half a pixel.
         if any(side % 2 == 0 for side in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")

@@ -46,13 +46,34 @@ class Groups:
     }
 
     def names(self, options: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the names of the groups that a command with these options reads."""
+        """Return the names of the groups that a command with these options reads.
+
+        Parameters
+        ----------
+        options : mapping
+            Values of the command's options by name, such as `{"name": "gmm"}` of `fit`.
+        """
         return self.reads(**options) if callable(self.reads) else self.reads
 
     def __call__(
         self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]
     ) -> Config:
-        """Return the checked groups, from a file of the workflow, or from overrides `words`."""
+        """Return the checked groups, from a file of the workflow, or from overrides `words`.
+
+        Parameters
+        ----------
+        options : mapping
+            Values of the command's options by name.
+        file : Path, optional
+            File of `compose.write_settings`, which `--config` names.
+        words : sequence of str
+            Overrides such as noise.kappa=4.98, if there is no file.
+
+        Raises
+        ------
+        ConfigError
+            With each wrong key, its value and the allowed range.
+        """
         # Hydra and pydantic models are imported for commands that need them only.
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
@@ -80,6 +101,15 @@ def command(
     """Make a function the command `name`; its `config` has groups of the configuration.
 
     See `psfdae.commands.cli.command`, and `Groups` for `reads` and `choice`.
+
+    Parameters
+    ----------
+    name : str
+        Up to three words, such as "alignment figure stamps".
+    reads : tuple of str, or callable
+        Groups that the function gets as `config`; none if it has no such parameter.
+    choice : tuple of str
+        Overrides that precede those of the user.
     """
     # The command line calls `Groups` with the options, the file and the words that are left.
     return cli.command(name, Groups(reads, choice))

@@ -47,6 +47,11 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     ------
     ConfigError
         If Hydra refuses an override (unknown key or group option, bad syntax).
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Such as `dataset=dataset3`, `preset=smoke` or `noise.levels=[0.002]`.
     """
     return _composed(tuple(overrides))
 
@@ -129,6 +134,13 @@ def _reason(error: Exception, folder: Path) -> str:
 
     Hydra's own refusals name the key or option. Any other error comes from a damaged file, which
     Hydra does not name: the files are read one by one until one of them fails.
+
+    Parameters
+    ----------
+    error : Exception
+        What Hydra, or a library below it, raised.
+    folder : Path
+        Folder of the configuration.
     """
     from hydra.errors import HydraException, MissingConfigException, OverrideParseException
     from omegaconf.errors import OmegaConfBaseException
@@ -167,12 +179,28 @@ def load(overrides: Sequence[str] = ()) -> Config:
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        As of `compose`.
     """
     return validate_tree(compose(overrides))
 
 
 def validate_tree(tree: Mapping[str, Any]) -> Config:
-    """Check a composed configuration; raises ConfigError like `load`."""
+    """Check a composed configuration; raises ConfigError like `load`.
+
+    Parameters
+    ----------
+    tree : mapping
+        Groups by name, as `compose` returns them.
+
+    Returns
+    -------
+    Config
+        Lengths in metres, angles in the unit that their key names.
+    """
     # A dataset has all groups; scene 3 reads only some, and none of stars.
     if not _is_alignment(tree):
         return parse_settings(whole_config(), tree)
@@ -211,6 +239,13 @@ def load_file(model: type[Model], path: Path) -> Model:
     ------
     ConfigError
         One line per finding: file, key, what is allowed.
+
+    Parameters
+    ----------
+    model : type of Group
+        Class with the keys of the file, such as `Sweep`.
+    path : Path
+        YAML file.
     """
     from omegaconf import OmegaConf
 
@@ -249,6 +284,13 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     ------
     ConfigError
         Names each wrong key with its value and the allowed range, and unknown groups.
+
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups.
+    overrides : sequence of str
+        As of `compose`.
     """
     # A misspelt group is refused, even though the stage would not read it.
     tree = compose(overrides)
@@ -263,6 +305,13 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     ------
     ConfigError, ProductError
         If the file is no YAML or has other groups; names file, key and range.
+
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+    reads : tuple of str
+        Names of the groups that it must have, and no others.
     """
     tree = parse_yaml(path)
     # A file that is no mapping lacks all groups.
@@ -325,6 +374,14 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
+
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups; those that the configuration lacks are missing in the result, which is
+        refused.
+    tree : mapping or Group
+        Composed configuration.
     """
     # A model becomes a tree again, so that it is checked anew.
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
@@ -383,6 +440,11 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     ------
     ConfigError
         If an option does not exist.
+
+    Returns
+    -------
+    tuple of str
+        Overrides in the order in which they were given.
     """
     # Words such as train=onecycle choose a file of a group; scene 3 takes few of these groups.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
@@ -437,6 +499,16 @@ def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration tree without the settings that cannot change a result.
 
     These are marked `NEUTRAL` in their class, such as the time between checkpoints.
+
+    Parameters
+    ----------
+    tree : mapping
+        Groups by name, as values.
+
+    Returns
+    -------
+    dict
+        What a hash is made of: settings with the same hash give the same result.
     """
     neutral = {
         (group, name)

@@ -35,7 +35,18 @@ class Consistent(Group):
     @model_validator(mode="before")
     @classmethod
     def derive_values(cls, tree: object) -> object:
-        """Fill in derived values before the groups are checked."""
+        """Fill in derived values before the groups are checked.
+
+        Parameters
+        ----------
+        tree : object
+            Groups by name; anything else is left to the check of the types.
+
+        Returns
+        -------
+        object
+            The groups by `with_derived_values`.
+        """
         if not isinstance(tree, Mapping):
             return tree
         return with_derived_values(tree)
@@ -46,6 +57,11 @@ class Consistent(Group):
         """Refuse a scene and a telescope that do not have the same source of aberrations.
 
         The aberrations are settings of the scene or of the telescope: exactly one of them has some.
+
+        Raises
+        ------
+        ValueError
+            With the telescope, its scene, and a dataset that would do.
         """
         groups: Mapping[str, Any] = tree if isinstance(tree, Mapping) else {}
         # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
@@ -71,7 +87,13 @@ class Consistent(Group):
 
     @model_validator(mode="after")
     def check_jitter(self) -> Consistent:
-        """Refuse a jitter of aberrations for stars that have no random aberrations."""
+        """Refuse a jitter of aberrations for stars that have no random aberrations.
+
+        Raises
+        ------
+        ValueError
+            With both keys.
+        """
         # Groups that a stage does not read are absent, and telescopes may have no aberrations.
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
         # In waves RMS; own telescopes alone have it.
@@ -88,7 +110,13 @@ class Consistent(Group):
 
     @model_validator(mode="after")
     def check_scene_groups(self) -> Consistent:
-        """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere."""
+        """Require a secondary mirror in scene 3, and a backend of the propagation elsewhere.
+
+        Raises
+        ------
+        ValueError
+            With the key that is missing.
+        """
         # Both groups have keys that only one kind of dataset needs.
         prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
         # Groups that a stage does not read are absent, and are not checked.
@@ -151,7 +179,20 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
-    """Return a model of some groups of a whole configuration."""
+    """Return a model of some groups of a whole configuration.
+
+    Parameters
+    ----------
+    keys : tuple of str
+        Names of the groups.
+    whole_model : type of Group
+        Class that has them, such as that of `schema.whole_config`.
+
+    Returns
+    -------
+    type of Consistent
+        A class that refuses any other group, and checks relations between those that it has.
+    """
     # Fields keep their types, but none is optional: a stage needs all groups that it names.
     fields: dict[str, Any] = {
         key: (whole_model.model_fields[key].rebuild_annotation(), ...) for key in keys

@@ -34,6 +34,16 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
     """Return the methods that a file `config.yaml` lists, then all others.
 
     Raises ConfigError as `registered` does.
+
+    Parameters
+    ----------
+    path : Path
+        File `config.yaml` with the list `methods`.
+
+    Returns
+    -------
+    tuple of type of Method
+        Each class once.
     """
     try:
         tree = parse_yaml(path)
@@ -62,6 +72,16 @@ def oracles_last(names: Iterable[str]) -> list[type[Method]]:
     """Return the methods of some names in the order of legends: those that are given λ last.
 
     Within both kinds the order is that of the configuration.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names of methods; those that are not registered are passed over.
+
+    Returns
+    -------
+    list of type of Method
+        Methods that know the noise level have an advantage in comparisons, and stand apart.
     """
     # `sorted` keeps the order of equals.
     kinds = [kind for kind in registered() if kind.name in set(names)]

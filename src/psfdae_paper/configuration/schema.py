@@ -131,7 +131,13 @@ class WholePeriodOptics(Group):
     @field_validator("pupil_samples")
     @classmethod
     def check_order(cls, grid_sizes: list[int]) -> list[int]:
-        """Require ascending grid sizes, so that the first that suffices is the smallest one."""
+        """Require ascending grid sizes, so that the first that suffices is the smallest one.
+
+        Raises
+        ------
+        ValueError
+            With the list that is not ascending, or has a size twice.
+        """
         if sorted(set(grid_sizes)) != grid_sizes:
             raise ValueError(f"{grid_sizes} must be ascending")
         return grid_sizes
@@ -148,6 +154,16 @@ def checked_optics(tree: object) -> object:
     """Check settings of the optics by the class that has their keys.
 
     Scene 3 propagates the whole period of the image and has no choice of a backend.
+
+    Parameters
+    ----------
+    tree : object
+        The group `optics` as YAML has it.
+
+    Returns
+    -------
+    Optics or WholePeriodOptics
+        Checked settings; anything but a mapping is returned as it is, and refused by its type.
     """
     if not isinstance(tree, Mapping):
         return tree
@@ -285,7 +301,13 @@ class Config(Consistent):
 
     @model_validator(mode="after")
     def check_groups(self) -> Config:
-        """Refuse values of single groups that contradict those of other groups."""
+        """Refuse values of single groups that contradict those of other groups.
+
+        Raises
+        ------
+        ValueError
+            With the keys of both groups and their values.
+        """
         # Parts for training (with validation) and test have no star in common.
         part_stars = self.parts.train_stars + self.parts.test_stars
         if part_stars > self.stars.count:
@@ -314,6 +336,11 @@ def whole_config() -> type[Config]:
     """Return `Config` with the settings of all methods, and of the trainings of scene 3.
 
     Methods that are plugged in add groups, so that the class is made when it is first used.
+
+    Returns
+    -------
+    type of Config
+        The class that `compose.load` checks a dataset by, with a field for each group.
     """
     return _with_settings(registered())
 

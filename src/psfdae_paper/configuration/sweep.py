@@ -27,7 +27,11 @@ Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
 
 class Axis(Group):
-    """Setting that a sweep varies: listed values, named sets of values, or a range."""
+    """Setting that a sweep varies: listed values, named sets of values, or a range.
+
+    A file `config/sweep/NAME.yaml` has an axis for each name below `space`, such as
+    `train.lr: {low: 1.0e-4, high: 1.0e-2, log: true}` or `gmm.components: [[4], [16], [64]]`.
+    """
 
     # One of three forms: values, choices or a range.
     values: Annotated[list[Value], Field(min_length=1)] | None = Field(
@@ -52,7 +56,19 @@ class Axis(Group):
     @model_validator(mode="before")
     @classmethod
     def expand_short_forms(cls, tree: object) -> object:
-        """Accept a bare list as values, and names of choices that YAML reads as numbers."""
+        """Accept a bare list as values, and names of choices that YAML reads as numbers.
+
+        Parameters
+        ----------
+        tree : object
+            An axis as YAML has it.
+
+        Returns
+        -------
+        object
+            The same as a mapping with the keys of this class; anything else is left to the check of
+            the types, which refuses it.
+        """
         # YAML reads a name such as 3 as a number; names of choices are text.
         if isinstance(tree, list):
             return {"values": tree}
@@ -62,7 +78,14 @@ class Axis(Group):
 
     @model_validator(mode="after")
     def check_form(self) -> Axis:
-        """Require exactly one of the three forms, with its own keys only."""
+        """Require exactly one of the three forms, with its own keys only.
+
+        Raises
+        ------
+        ValueError
+            If there are no or several forms, a range is empty or lacks an end, or keys of another
+            form are there.
+        """
         # Both ends of a range count as one form.
         end_count = (self.low is not None) + (self.high is not None)
         form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
@@ -101,6 +124,18 @@ class Axis(Group):
 
         A choice brings its own keys; any other value goes to `keys`, or to the key that the axis
         is named by, as a list of equal numbers if `repeat` is given.
+
+        Parameters
+        ----------
+        name : str
+            Name of the axis, which is the key that it changes unless `keys` has others.
+        value : bool, int, float, str or list
+            One of `options`, or a number between the ends.
+
+        Returns
+        -------
+        dict
+            Value of each key, such as {"train.lr": 0.001}.
         """
         if self.choices is not None:
             return dict(self.choices[str(value)])
@@ -112,7 +147,11 @@ class Axis(Group):
 
 
 class Sweep(Group):
-    """Points of one model that are trained alike and compared by one metric."""
+    """Points of one model that are trained alike and compared by one metric.
+
+    It is a file `config/sweep/NAME.yaml`. `psfdae sweep list NAME` prints its points, the target
+    `sweep` of the workflow trains and compares them, and `psfdae best NAME` prints the best one.
+    """
 
     # What is trained, and on which data.
     kind: Literal["grid", "random", "adaptive"] = Field(
@@ -141,7 +180,13 @@ class Sweep(Group):
     @field_validator("model")
     @classmethod
     def check_name(cls, name: str) -> str:
-        """Require a method that stores a model, or a network of scene 3."""
+        """Require a method that stores a model, or a network of scene 3.
+
+        Raises
+        ------
+        ValueError
+            With the names that are allowed.
+        """
         # Methods without a file have nothing to train.
         stored = (method_class.name for method_class in registered() if method_class.storage)
         models = (*stored, *swept_networks())
@@ -170,7 +215,13 @@ class Sweep(Group):
 
     @model_validator(mode="after")
     def check_model(self) -> Sweep:
-        """Require a dataset and a metric that the model has, and trials for random draws."""
+        """Require a dataset and a metric that the model has, and trials for random draws.
+
+        Raises
+        ------
+        ValueError
+            For the first of these keys that does not go with the model or the kind of the sweep.
+        """
         # A grid has as many points as combinations.
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
@@ -191,7 +242,13 @@ class Sweep(Group):
 
     @model_validator(mode="after")
     def check_axes(self) -> Sweep:
-        """Refuse names of columns, ranges in a grid, and lists that would be repeated."""
+        """Refuse names of columns, ranges in a grid, and lists that would be repeated.
+
+        Raises
+        ------
+        ValueError
+            With the name of the axis.
+        """
         # The summary has these columns beside those of the axes.
         columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
@@ -207,7 +264,13 @@ class Sweep(Group):
 
     @model_validator(mode="after")
     def check_keys(self) -> Sweep:
-        """Refuse keys that the model does not read, and keys that are set by two axes."""
+        """Refuse keys that the model does not read, and keys that are set by two axes.
+
+        Raises
+        ------
+        ValueError
+            With the key, and those that may be changed.
+        """
         # Keys of an axis: those of all its choices; a range has the same keys at every value.
         keys = list(self.overrides)
         for name, axis in self.space.items():
@@ -226,7 +289,19 @@ class Sweep(Group):
 
 
 def point_groups(model: str) -> tuple[str, ...]:
-    """Return the groups of the configuration that a point of a model reads."""
+    """Return the groups of the configuration that a point of a model reads.
+
+    Parameters
+    ----------
+    model : str
+        Name of a method, or of a network of scene 3.
+
+    Returns
+    -------
+    tuple of str
+        Names of the groups. A point is named by the hash of their values, so that a change of any
+        other group repeats no training.
+    """
     if model in swept_networks():
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
@@ -244,6 +319,11 @@ def load_sweep(name: str) -> Sweep:
     ------
     ConfigError
         If there is no such sweep, or with one line per wrong key: file, key, what is allowed.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file, without its suffix.
     """
     if name not in sweep_names():
         raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")

@@ -37,7 +37,13 @@ class VonKarman(Group):
 
     @model_validator(mode="after")
     def check_layers(self) -> VonKarman:
-        """Require one strength for each layer, which add up to 1."""
+        """Require one strength for each layer, which add up to 1.
+
+        Raises
+        ------
+        ValueError
+            With the strengths, and how many there must be or what their sum must be.
+        """
         # Layers are two lists of equal length in the file.
         if len(self.layer_heights_m) != len(self.layer_strengths):
             raise ValueError(

@@ -57,6 +57,9 @@ def model(
     fitted as quadratic functions of the four numbers of a state: 25 states determine the model,
     and all states of the grid test it. A model that is off by more than
     alignment.model_tolerance_waves anywhere is refused.
+
+    The product has the coefficients in waves for each field, and the RMS residual from ray tracing
+    for each state of the grid and field.
     """
     # Few small arrays: threads would not pay.
     limit_threads(1)
@@ -97,6 +100,12 @@ def read_model(
     ------
     ProductError
         If the product is missing or damaged, or does not agree.
+
+    Returns
+    -------
+    QuadraticModel
+        Function of states (n, 4), in units of their range, to Zernike coefficients (n, F, Z) in
+        waves at the F fields.
     """
     # The wavefront of a state depends on the telescope's optics and on the range of the states.
     product = read_product(path, "alignment_model", ("coefficients",))
@@ -123,6 +132,11 @@ def read_states(
     ------
     ProductError
         If the product is missing or damaged, or does not agree.
+
+    Returns
+    -------
+    Product
+        `states` (n, 4) in units of the range; `stamps` (n, F, d, d), noise-free, each of sum 1.
     """
     # Stamps are (n, F, d, d), states (n, 4) in units of their range.
     product = read_product(path, "alignment_states", ("states", "stamps"))
@@ -146,6 +160,9 @@ def states(
     The set is the grid of the paper, the uniform states of the independent test, or the many
     uniform states that networks are trained on. Each state has a stamp at every field, centred on
     its centroid, of light 1.
+
+    Wavefronts come from traced rays or, with --model, from the quadratic model, which takes less
+    time. The product also has the Zernike coefficients in waves, and the light inside each stamp.
     """
     limit_threads(1)  # optics.threads batches run in parallel
     alignment = config.alignment
@@ -180,6 +197,11 @@ def _geometry(config: Config) -> dict[str, Column]:
 
     They are field angles in radians, Noll indices of the Zernike coefficients, and the range of
     the four numbers of a state in metres and radians.
+
+    Returns
+    -------
+    dict of Column
+        `fields` (F, 2), `noll` (Z,) and `unit` (4,).
     """
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
@@ -204,6 +226,8 @@ def telescope(
 
     They say how well the model reproduces rays, how far the telescope is out of focus, how well
     images separate the four numbers of a state, and how much light the stamps hold.
+
+    A row has a quantity, its value and its unit. Products of another telescope are refused.
     """
     # The model, and the two sets that serve as tests.
     quadratic = read_product(model, "alignment_model")

@@ -76,6 +76,9 @@ def train_dae(
 
     It learns to restore single stamps with noise of all levels to those without, and is applied
     to the stamps of a state before a network estimates the state.
+
+    The folder gets weights, settings and the error of every epoch. An interrupted training goes on
+    from the checkpoint, and ends with the same bytes.
     """
     # Both sets must have stamps of the same telescope.
     grid_product = read_states(grid)
@@ -107,6 +110,11 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     ----------
     kind : str
         Name of the network; empty for all.
+
+    Returns
+    -------
+    tuple of str
+        Names of groups, such as "cnn" and "train_original".
     """
     # Noise, and the settings of a DAE that is applied, only where some network needs them.
     kinds = [kind] if kind else trained_networks()
@@ -135,6 +143,9 @@ def train_network(
     Its input are the stamps of all fields of a state, its output the four numbers of the state in
     units of the range. The folder receives weights, the settings that made them, and the history
     of the loss.
+
+    With --dae the stamps are what the DAE makes of noisy ones. An interrupted training goes on from
+    its checkpoint if stamps and settings are the same, and ends with the same bytes.
     """
     from psfdae.methods.networks.training import fingerprint, progress, train
     from psfdae.methods.networks.weights import save_weights
@@ -222,6 +233,19 @@ def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
     ------
     ProductError
         If the folder `dae` has no network, or a damaged one.
+
+    Parameters
+    ----------
+    dae : Path
+        Folder of `alignment train-dae`.
+    config : Config
+        Its group `evaluation` has the number of threads, and of images at a time.
+    stamps : ndarray, shape (n, F, d, d)
+        Noisy stamps of sum 1.
+
+    Returns
+    -------
+    ndarray, shape (n, F, d, d), float32
     """
     network = Dae.load(dae, evaluation=config.evaluation)
     return network.predict(_single_stamps(stamps)).reshape(stamps.shape)
@@ -247,6 +271,11 @@ def noisy_test_states(
     test_set : str
     level : float
         Noise level λ.
+
+    Returns
+    -------
+    ndarray, shape (n, F, d, d)
+        Stamps with photon and sky noise, divided by the flux of the star.
     """
     if level == 0.0:
         return stamps
@@ -275,6 +304,11 @@ def network_predictor(
     ------
     ProductError
         If it was trained for other stamps, has another name, or is damaged.
+
+    Returns
+    -------
+    callable
+        Function of stamps (n, F, d, d) that returns states (n, 4), in units of the range.
     """
     import torch
 
@@ -320,6 +354,9 @@ def estimate(
     """Estimate the states of a test set with every learned method.
 
     Each method gets the same noisy stamps at every noise level, and without noise.
+
+    The product has the true states, the noise levels, and the estimates by level and method, all in
+    units of the range; the table of run times has seconds for the whole set.
     """
     limit_threads(config.evaluation.threads)
     product = read_states(states)
@@ -396,6 +433,9 @@ def fit_alignment_method(
     A fit begins at a network's estimate, and again at the twin of the state that it has reached,
     which has nearly the same stamps in focus. Flux and place of the stars are known; uniform
     states are fitted once more with both unknown.
+
+    The product has, for each fit, the estimates in units of the range, the deviance, how many
+    stamps were computed, whether it has converged, and whether the twin was better.
     """
     from psfdae_paper.alignment.emulator import StampEmulator
     from psfdae_paper.alignment.likelihood import StateLikelihood, StateOptics, refit_twins
@@ -481,6 +521,8 @@ def bound(
 
     The Cramér-Rao bound is the inverse of the Fisher information that the photons of all stamps
     of a state hold about its four numbers, with flux and place of the stars known and unknown.
+
+    The product has a covariance (4, 4) in units of the range for each bound, noise level and state.
     """
     from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
 

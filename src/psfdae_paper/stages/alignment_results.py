@@ -83,6 +83,16 @@ def read_results(
     ------
     ProductError
         If products differ in telescope, noise or states.
+
+    Parameters
+    ----------
+    estimates, fits, bounds : sequence of Path
+        Products of `alignment estimate`, `alignment fit` and `alignment bound`.
+
+    Yields
+    ------
+    MethodResult
+        One for each method and noise level, in the order of the products.
     """
     for product in products_of_one_test(estimates, fits, bounds):
         truth, test_set = product["states"], product.config["test_set"]
@@ -116,6 +126,16 @@ def products_of_one_test(
     ------
     ProductError
         With the first value that differs.
+
+    Parameters
+    ----------
+    estimates, fits, bounds : sequence of Path
+        Products of `alignment estimate`, `alignment fit` and `alignment bound`.
+
+    Returns
+    -------
+    list of Product
+        In this order, each with the column `states`.
     """
     same_keys = ("noise.kappa", "noise.background_photons", *Alignment.stamp_keys)
     products: list[Product] = []
@@ -140,6 +160,11 @@ def _require_states(product: Product, reference: Product) -> None:
     ------
     ProductError
         With the number of states, or the first state that differs.
+
+    Parameters
+    ----------
+    product, reference : Product
+        With the column `states`, (n, 4).
     """
     states, expected = product["states"], reference["states"]
     if np.array_equal(states, expected):
@@ -168,6 +193,9 @@ def tables(
     A row of the errors has the mean absolute error, the bias and the variance of a method in one
     of the four numbers of a state, at one noise level; rows of the Cramér-Rao bound have expected
     values.
+
+    Errors are in units of the range, and in metres and radians. Rows of correlations have the
+    measured coefficient of each pair of numbers, or that which the bound predicts.
     """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
@@ -210,6 +238,9 @@ def alignment_paper_tables(
     """Set measured errors beside the paper's tables.
 
     One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
+
+    Files are named alignment_paper_LEVEL and alignment_paper_correlation, with errors in units of
+    the range. It is refused if a noise level of the paper was not measured.
     """
     test_sets = (
         "Test set `grid`: the very states that the networks were trained on, with new noise; "
@@ -247,6 +278,9 @@ def time_table(
     """Tabulate the run times of the methods.
 
     A row has the seconds of an estimate, and those of all trainings that the method needs.
+
+    Seconds per estimate are means over all states of all test sets; NAME of --history is that of a
+    network, or dae.
     """
     # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
@@ -272,6 +306,9 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     """Draw the nine stamps of a few states before and after the DAE.
 
     The first two states of the set are shown, without noise and at every noise level.
+
+    They have the very noise of the tables. The DAE must be one that was trained on stamps of the
+    same telescope.
     """
     # The DAE must be that of these stamps.
     product = read_states(states)
@@ -297,7 +334,11 @@ def predicted(
     ],
     out: Png,
 ) -> None:
-    """Draw estimates against the truth, for each method, number of a state and noise level."""
+    """Draw estimates against the truth, for each method, number of a state and noise level.
+
+    A row of panels is a method, a column a number of the state, both axes in units of the range;
+    points on the diagonal are exact. Bounds and fits with unknown flux are left out.
+    """
     # Estimated states of each method and noise level.
     by_method: dict[str, dict[float, np.ndarray]] = {
         name: {} for name, aligner in ALIGNERS.items() if aligner.is_drawn
@@ -314,6 +355,9 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     """Draw errors against the size of the misalignment, with the Cramér-Rao bound.
 
     The error of a state is the mean of the absolute errors of its four numbers.
+
+    A panel is a noise level, and a curve a mean over states of about the same size, all in units of
+    the range. The bound is that of a normal error: the mean modulus is σ √(2/π).
     """
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
@@ -340,6 +384,9 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
 
     The curve is the difference χ² of the stamps of multiples of a state from those of the state:
     at −1, its twin, it is small in focus.
+
+    The table has a row for each noise level, defocus and multiple. The stamps of both states are
+    shown above the curves.
     """
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
@@ -382,6 +429,15 @@ def _stamps_of_multiples(
         The state in units of the range.
     stamps : ndarray, shape (len(multiples), F, d, d)
         Stamps of multiples of the state, with the CCD at a defocus of `defocus_m` metres.
+
+    Parameters
+    ----------
+    config : Config
+        Stage configuration of `alignment figure twin`.
+    defocus_m : float
+        Distance of the CCD beyond best focus, in metres.
+    multiples : ndarray, shape (n,)
+        Factors of the state.
     """
     # The telescope with another defocus, its wavefront, and its stamps.
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
@@ -399,6 +455,9 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     """Draw measured and predicted correlations of errors beside the paper's.
 
     A panel is the matrix of the correlations between the four numbers of a state.
+
+    Pairs that the paper does not print are empty. Only uniform states with noise are shown, for
+    methods with a short title.
     """
 
     def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:

@@ -46,6 +46,10 @@ def bank(
 
     They are other draws of the simulator that made the test stars, with a margin, so that one
     propagated star stands for all eight of its mirror images and rotations.
+
+    The product has the framed stars, the number of each one's field, its brightest pixel and the
+    Seidel coefficients. Its first bounds.bank_stars serve all bounds; the others only those that
+    are given the field.
     """
     limit_threads(1)  # batches run in parallel
     # Two draws of the simulator, one after the other: the second has its own random streams.
@@ -81,6 +85,10 @@ def bounds(
 
     The posterior mean over the simulator's stars has the least mean squared error; its tables say
     where the bank suffices for it. The local floor is the error if field and centring are known.
+
+    Three tables come out: the bounds with their standard errors, by noise level and reference; the
+    error for banks of growing size, which shows whether the bank is large enough; and the squared
+    error of every star.
     """
     # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
@@ -132,6 +140,9 @@ def optics(
     """Measure the methods that are given the telescope, on the test stars that are bounded.
 
     They estimate the wavefront of each star; one of them is given its position, too.
+
+    The table has the columns of `evaluate`. Such a method knows more than any other, and shows how
+    near an estimate of a single star comes to the bound.
     """
     limit_threads(1)
     product = read_product(stars, "stars")
@@ -172,7 +183,10 @@ def optics(
 def collect_bounds(
     out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
 ) -> None:
-    """Join the tables of several datasets' bounds; all must have the columns of the first."""
+    """Join the tables of several datasets' bounds; all must have the columns of the first.
+
+    PARTS are CSV files of the stage bounds, or of the stage optics; the rows keep their order.
+    """
     write_csv(out, read_tables(parts))
 
 
@@ -234,6 +248,9 @@ def paper_rows_table(
     stars; `stderr` is that of the bound. The paper's error is `below what this scene allows` if it
     is below a tight bound as in the stage efficiency. A bound that is not tight is above the least
     possible error: an error below it proves nothing.
+
+    A row is a method at a noise level of a dataset: the paper's error, that of this run, the bound
+    with its standard error, whether it is tight, the paper's error over the bound, and the verdict.
     """
     key = ["dataset", "noise_level"]
     # The paper's errors under the names of the methods here.

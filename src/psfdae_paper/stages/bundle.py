@@ -53,7 +53,12 @@ def bundle(
     *,
     out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
-    """Pack a trained network with its errors and all that it takes to apply it."""
+    """Pack a trained network with its errors and all that it takes to apply it.
+
+    Errors are measured on test stars, at the noise levels of the configuration; `psfdae describe`
+    prints them. Seed, noise and parts must be those of the training. A fit to other stars, or to
+    those of another telescope, is refused.
+    """
     # Exactly one option names a fit; its name is that of the method.
     limit_threads(config.evaluation.threads)
     fits_by_name = {key: place for key, place in vars(models).items() if place is not None}
@@ -85,6 +90,16 @@ def _fit_config(
         If a file of the fit, or a key of its configuration, is missing.
     ProductError
         For the first setting that differs.
+
+    Parameters
+    ----------
+    method_class : type of Method
+    place : Path
+        Folder or file of the fit.
+    config : Config
+        Stage configuration.
+    split : str, optional
+        Split that the fit must have.
     """
     # Files that the fit consists of.
     for path in fits.own_files(method_class, place):
@@ -117,6 +132,9 @@ def ship(
     """Make the bundle with the smallest error on validation stars the package's bundle.
 
     Flux and sky of these stars are estimated, and every noise level counts alike.
+
+    It is refused if its stated errors do not hold 63 to 73 % of those of its test stars at a noise
+    level, or if it is larger than 5 MB.
     """
     # The candidate with the smallest error.
     product, errors = read_stars(stars), {}
@@ -149,7 +167,16 @@ def ship(
 
 
 def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
-    """Return the MSE of PSFs of flux 1, as a geometric mean over the noise levels."""
+    """Return the MSE of PSFs of flux 1, as a geometric mean over the noise levels.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    stars : Product
+        Product "stars" of its training.
+    config : Config
+        Stage configuration of `ship`.
+    """
     method_class = method(bundle.info.method)
     # Split and reference of the model that is shipped.
     data = training_set(config, method_class, stars, "random", "realisation")

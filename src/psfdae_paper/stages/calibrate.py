@@ -50,6 +50,9 @@ def scan(
 
     The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
     only on image structure and dynamic range.
+
+    A row of the table is a point of the scan: pixel scale in arcsec, r0 in metres (empty in scene
+    1), noise level, dynamic range, and the mean SSIM of noisy stars to their noise-free images.
     """
     limit_threads(1)  # batches run in parallel
     # Columns of the paper's tables with the noise as it was, before any method.
@@ -91,7 +94,15 @@ def scan(
 
 
 class _CachedWavefronts:
-    """Turbulent wavefronts whose OPD is computed once per grid, not once per pixel scale."""
+    """Turbulent wavefronts whose OPD is computed once per grid, not once per pixel scale.
+
+    A scan computes the same wavefronts at many pixel scales: the pupil, and so the OPD, stays.
+
+    Parameters
+    ----------
+    source : WavefrontSource
+        Wavefronts of the fields.
+    """
 
     def __init__(self, source: WavefrontSource) -> None:
         self.source = source
@@ -105,6 +116,19 @@ class _CachedWavefronts:
         """Return the OPD of wavefronts like the source; double precision is not cached.
 
         Only few stars need double precision.
+
+        Parameters
+        ----------
+        index : ndarray of int, shape (n,)
+            Numbers of the wavefronts.
+        pupil : Pupil
+        dtype : dtype
+            float32 or float64.
+
+        Returns
+        -------
+        ndarray, shape (n, N, N)
+            In metres.
         """
         # Exact pixels of a few stars that compete for the maximum.
         if dtype != np.float32:
@@ -117,7 +141,15 @@ class _CachedWavefronts:
 
 
 def _source(config: Config, r0: float) -> WavefrontSource:
-    """Return wavefronts of the scanned stars, or of all fields behind turbulence of this r0."""
+    """Return wavefronts of the scanned stars, or of all fields behind turbulence of this r0.
+
+    Parameters
+    ----------
+    config : Config
+        Stage configuration of `scan`.
+    r0 : float
+        Fried parameter in metres; NaN in scene 1.
+    """
     if not isinstance(config.wavefront, VonKarman):
         # Scene 1: stars at random fields, with aberrations of their own.
         count, fields = config.calibration.stars, config.grid.points**2
@@ -135,6 +167,19 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
     """Add noise to images, scaled so that its MSE is that of a column of the paper.
 
     The noise of λ = `row.noise_level` has the variance (κλ)² plus that of the star's photons.
+
+    Parameters
+    ----------
+    images : ndarray, shape (n, d, d)
+        Noise-free stars of sum 1.
+    row : OriginalNoise
+        The column of the paper: noise level λ and the MSE of its noisy stars.
+    config : Config
+        Its group `noise` has the photons B of the sky in a pixel.
+
+    Returns
+    -------
+    ndarray, shape (n, d, d)
     """
     level, background = row.noise_level, config.noise.background_photons
     # The constant κ whose noise has the published MSE on these stars.
@@ -154,6 +199,10 @@ def calibrate(
 
     The noise constant κ is that of the columns' MSE, each weighted alike in its logarithm; one
     dynamic range and one pixel scale for each scene follow from the SSIM by least squares.
+
+    Four tables come out: fitted values beside the configured ones (fit.csv); each of the paper's
+    columns beside simulated noise (columns.csv); residuals by pixel scale (scales.csv); and how
+    well other r0 would do (degeneracy.csv). The configuration itself is not changed.
     """
     # Each of the paper's columns beside simulated stars with the configured parameters.
     products = dict(stars)
@@ -205,6 +254,16 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     """Return the pixel scales by scene and the r0 with which the stars were simulated.
 
     Stars of one scene must have the same static PSFs; raises ProductError.
+
+    Parameters
+    ----------
+    stars : dict of Path
+        Product "stars" of each dataset.
+
+    Returns
+    -------
+    dict of float
+        `scene1` and `scene2` in arcsec, `r0_m` in metres.
     """
     values: dict[str, float] = {}
     scenes: dict[str, Product] = {}
@@ -221,7 +280,17 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
 
 
 def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]:
-    """Return one original-noise column: published and simulated, at κλ and at its own MSE."""
+    """Return one original-noise column: published and simulated, at κλ and at its own MSE.
+
+    Parameters
+    ----------
+    row : OriginalNoise
+        Noise level, MSE and SSIM of the column in the paper.
+    path : Path
+        Product "stars" of its dataset.
+    config : Config
+        Stage configuration of `calibrate`.
+    """
     # The same stars with the configured κ, and with the κ of this column alone.
     images = read_product(path, "stars", ("realisation",))["realisation"]
     background = config.noise.background_photons

@@ -67,6 +67,8 @@ def compare(
     are settings that differ, the trainings, and errors with their significance. Where a folder has
     tables alone, such as results/reference, the mean errors are compared: which are equal, and
     which differ by more than seeds do.
+
+    Differences are paired star by star where both runs have the same noisy images.
     """
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
@@ -199,6 +201,11 @@ def warn_of_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
     ----------
     sizes : iterable of tuples
         Name of a number of stars, and its values in both runs.
+
+    Returns
+    -------
+    list of str
+        One paragraph of Markdown, or none.
     """
     differences = [f"{name} {first} (A), {second} (B)" for name, first, second in sizes]
     return [
@@ -208,7 +215,24 @@ def warn_of_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
 
 
 def describe_tables(first: Path, second: Path) -> str:
-    """Return as Markdown the mean errors of two runs that differ by more than seeds do."""
+    """Return as Markdown the mean errors of two runs that differ by more than seeds do.
+
+    Parameters
+    ----------
+    first, second : Path
+        Folders A and B, each with tables of mean errors.
+
+    Returns
+    -------
+    str
+        Numbers of rows that are equal, within the scatter between seeds, or beyond it, which are
+        listed; and whether the order of the paper's methods holds.
+
+    Raises
+    ------
+    ProductError
+        If a table is missing or damaged.
+    """
     columns = [*CELL, "method", "metric", "value", "stderr", "n"]
     first_errors, second_errors = (read_tables(_tables(run), columns) for run in (first, second))
     # Another kind of processor rounds differently; nearly all such differences are below a tenth
@@ -252,7 +276,13 @@ def describe_tables(first: Path, second: Path) -> str:
 
 
 def _row_lines(rows: pd.DataFrame) -> list[str]:
-    """Return a line of text for each dataset, split and reference of a table of errors."""
+    """Return a line of text for each dataset, split and reference of a table of errors.
+
+    Parameters
+    ----------
+    rows : DataFrame
+        With dataset, split, reference, method, metric and noise_level.
+    """
     lines = []
     for key, cell in rows.groupby(["dataset", "split", "reference"], sort=False):
         # Metrics of a method that differ at the same noise levels are named together.
@@ -271,7 +301,15 @@ def _cell(key: Sequence[Any]) -> str:
 
 
 def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
-    """Return a Markdown table, or "None." if there are no rows."""
+    """Return a Markdown table, or "None." if there are no rows.
+
+    Parameters
+    ----------
+    rows : sequence of sequences
+        Texts and numbers, the latter with four digits.
+    headers : sequence of str
+        Name of each column.
+    """
     if not rows:
         return "None."
     return tabulate(rows, headers, tablefmt="github", floatfmt=".4g", disable_numparse=[0])

@@ -23,7 +23,11 @@ def config(
         str | None, "Only the groups that this stage reads.", {"flag": "--stage"}
     ] = None,
 ) -> None:
-    """Check the configuration and print it, resolved, as YAML."""
+    """Check the configuration and print it, resolved, as YAML.
+
+    What it prints is what a run would have with the same overrides, defaults included; a wrong key
+    is refused with its allowed range.
+    """
     if only is None:
         settings = load(overrides)
     else:

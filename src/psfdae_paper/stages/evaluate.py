@@ -75,6 +75,10 @@ def evaluate(
 
     Metrics are the MSE per pixel and the SSIM against the reference. All methods restore the same
     noisy images; standard errors are clustered by field, whose stars have a PSF in common.
+
+    Every method of the list `methods` needs its model, but for those that are fitted in a moment.
+    The table has a row for each method, noise level and metric; the Parquet file has one for each
+    star, with its field and all metrics.
     """
     # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
@@ -167,6 +171,9 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
     """Join evaluations into one tidy table, with the scatter of each method between seeds.
 
     The scatter, where it was measured, is that of a repeated fit with other random numbers.
+
+    Columns are dataset, split, reference, method, noise_level, metric, value, stderr, seed_stderr
+    and n, the number of stars.
     """
     # The standard error of a mean over stars does not hold the scatter between seeds.
     table = comparison.with_seed_stderr(
@@ -183,6 +190,9 @@ def held_out(
     """Compare errors in held-out fields with those in training fields, star by star.
 
     PER_STAR are the evaluations' Parquet files of both splits.
+
+    A row is a method at a noise level: the ratio of the errors of the same stars, as seen and as
+    held out, with its standard error. Above 1, the method is worse in fields that it has not seen.
     """
     columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
     # Errors in the same fields, as seen in training and as held out.
@@ -201,6 +211,8 @@ def paper_tables(
     """Write the paper's tables, with measured errors beside the published ones.
 
     Rows are methods, columns noise levels; measured errors are given for each reference.
+
+    The table is written as CSV, and beside it as Markdown for the pages.
     """
     # Each table as CSV, and beside it as Markdown.
     measured = read_tables(evaluations, MeasuredStars.columns)

@@ -44,7 +44,10 @@ Efficiency = Annotated[File, "CSV of the stage efficiency."]
 
 @command("figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
-    """Draw the static PSFs at their field positions, without the margin for centring errors."""
+    """Draw the static PSFs at their field positions, without the margin for centring errors.
+
+    Each has a square-root scale up to its own maximum.
+    """
     product = read_product(templates, "templates", ("psf", "grid", "field"))
     psf = without_margin(product)
     title = (
@@ -77,7 +80,11 @@ def figure_strip(
     ],
     out: Png,
 ) -> None:
-    """Draw test stars of the split random before and after restoration."""
+    """Draw test stars of the split random before and after restoration.
+
+    A row is a method at a noise level, a column a star; below each stamp stands its MSE × 10⁶. The
+    first row is the reference. Eight stars spread over the field are shown.
+    """
     # Eight stars side by side fill the width of a page.
     strip_stars = drawn_stars(config, stars, models, reference, 8)
     # Field angles of the stars as titles of the columns.
@@ -101,7 +108,11 @@ def figure_headline(
     efficiency: Efficiency,
     out: Png,
 ) -> None:
-    """Draw restored stars beside the errors and their bounds."""
+    """Draw restored stars beside the errors and their bounds.
+
+    At the left are five stars at one noise level, noisy and by every method, with the truth below;
+    at the right is the MSE of each method against the noise level, with the bounds.
+    """
     strip_stars = drawn_stars(config, stars, models, "realisation", 5)
     # Rows of restored stars, one for each method, and below them the truth.
     truth, *restored = strip_stars.rows(config, [level])
@@ -151,6 +162,18 @@ class DrawnStars:
         """Return rows of stamps: the reference, then the methods by noise level.
 
         `config` is that of the stage `evaluate`.
+
+        Parameters
+        ----------
+        config : Config
+            That of the stage `evaluate`.
+        levels : sequence of float
+            Noise levels λ.
+
+        Returns
+        -------
+        list of StripRow
+            Stamps (k, d, d) of flux 1, with their errors.
         """
         stars = self.test[self.selected]
         # The truth of each star that is drawn, and its field position for methods that use it.
@@ -188,6 +211,16 @@ def drawn_stars(
         The truth.
     count : int
         Number of stars to draw.
+
+    Returns
+    -------
+    DrawnStars
+        All test stars of the split, `count` of which are selected.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a model is not given, is damaged, or does not belong to the stars.
     """
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
@@ -207,7 +240,10 @@ def figure_curves(
     histories: Annotated[tuple[File, ...], {"argument": True}],
     out: Png,
 ) -> None:
-    """Draw training and validation error of networks against the optimiser's steps."""
+    """Draw training and validation error of networks against the optimiser's steps.
+
+    HISTORIES are tables of trainings, with the columns step, train_mse and validation_mse.
+    """
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
@@ -226,7 +262,10 @@ def figure_errors(
     evaluations: Evaluations,
     out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
 ) -> None:
-    """Draw metrics against the noise level, with the paper's points."""
+    """Draw metrics against the noise level, with the paper's points.
+
+    Each metric is a figure; it is refused if the tables have no row of the dataset.
+    """
     metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
         # An empty figure would hide that a table lacks the dataset.
@@ -263,6 +302,20 @@ def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFr
     """Read the rows of a dataset, and of a reference if one is given.
 
     ProductError if there are none.
+
+    Parameters
+    ----------
+    path : Path
+        CSV with the column dataset.
+    dataset : str
+        Name in the table.
+    reference : str, optional
+        "realisation" or "template".
+
+    Returns
+    -------
+    DataFrame
+        At least one row.
     """
     table = read_table(path)
     rows = table[table.dataset == dataset]

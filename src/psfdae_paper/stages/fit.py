@@ -26,7 +26,15 @@ Stars = Annotated[File, "Product of the stage stars."]
 
 
 def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
-    """Return the groups of settings that decide a fit of a method, or of any method."""
+    """Return the groups of settings that decide a fit of a method, or of any method.
+
+    Parameters
+    ----------
+    name : str
+        Name of a method; empty for all that any method reads.
+    **options
+        The other options of the command, which do not matter.
+    """
     return groups_of(name) if name else ("seed", "noise", "parts", *all_groups())
 
 
@@ -48,6 +56,9 @@ def fit(
 
     It learns from the training stars of the split, with noise as its settings say. The same
     settings give the same bytes, whether the fit was interrupted or not.
+
+    Settings of the method are groups of the configuration, such as gmm.components=[4]. Beside the
+    fit stands its resolved configuration, by which other stages refuse a fit of other stars.
     """
     # Stars of the split with their noise; training state goes to a file beside the fit.
     # The class of the method, and as many threads as its settings say.

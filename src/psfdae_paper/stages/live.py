@@ -35,6 +35,17 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
 
     Trainings that MLflow does not show, such as points of sweeps, are passed over. So are those of
     jobs of a cluster, unless MLFLOW_TRACKING_URI names a server: its nodes open no database.
+
+    Parameters
+    ----------
+    checkpoint : Path
+        File of the training's state, whose place in the results folder names the training.
+
+    Returns
+    -------
+    callable
+        Function of a row of the history: epoch, seconds and errors. An MLflow that fails does not
+        stop the training.
     """
     uri, database = server(), Path(os.environ["PSFDAE_RESULTS"], "mlflow.db")
     # Checkpoints are METHOD/DATASET/SPLIT-REFERENCE.pt and, of scene 3, alignment-NETWORK.pt.

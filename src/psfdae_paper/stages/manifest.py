@@ -16,6 +16,8 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
     `sha256sum --check --quiet SHA256SUMS` in the folder then names the files that are damaged.
     Listed are the products; logs, costs and MLflow's copies are not, nor are other runs in folders
     of this one.
+
+    In goes the folder of a run; SHA256SUMS is in it, in the form that `sha256sum` reads.
     """
     # Other runs, each with its settings, and the run of record may lie in folders of this one.
     other_runs = {path.parent for path in results.glob("*/**/.settings")} | {results / "reference"}

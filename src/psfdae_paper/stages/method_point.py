@@ -22,11 +22,18 @@ from psfdae_paper.sweeps.measured import Measured, Training, fit_in, measure_ima
 
 
 class MethodTraining(Training):
-    """Fit of a method to the training stars, as the stage `fit` makes it."""
+    """Fit of a method to the training stars, as the stage `fit` makes it.
+
+    `config` is the point's configuration, `model` the name of the method; `task` has the path of
+    the product "stars", split and reference, noise levels and output folder.
+    """
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files of the fit."""
+        """Names of the files of the fit.
+
+        They are removed before the point is trained again.
+        """
         method_class = method(self.model)
         return tuple(path.name for path in fits.outputs(method_class, fit_in(method_class, Path())))
 
@@ -35,6 +42,17 @@ class MethodTraining(Training):
 
         A method that also fits validation stars is fitted once more without them, for the errors
         on validation stars.
+
+        Returns
+        -------
+        Measured
+            Metrics of validation and test stars, settings, seconds and epochs; see
+            `Measured.metrics` for their names.
+
+        Raises
+        ------
+        FitError
+            If the training cannot go on: its errors are not finite, or all its starts have failed.
         """
         config, task, name = self.config, self.task, self.model
         method_class = method(name)

@@ -35,6 +35,9 @@ class StateNetworkTraining(Training):
 
     `config` is the point's configuration, `model` the name of the network, `task` the paths, noise
     levels and output folder.
+
+    Results are the same as those of the workflow with the same settings, so that a sweep and
+    `make reproduce` can be compared.
     """
 
     @property

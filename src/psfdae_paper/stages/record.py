@@ -54,6 +54,8 @@ def runtime(
 
     Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
     line of its log, which has the name of its benchmark.
+
+    Columns are the rule, its wildcards, wall_s and cpu_s in seconds, and peak_mb.
     """
     write_csv(out, job_costs(results), 6)
 
@@ -62,6 +64,11 @@ def job_costs(results: Path) -> pd.DataFrame:
     """Return a table with wall time, CPU time (s) and peak memory (MB) of every job.
 
     NaN stands where Snakemake has no number, or the log of a job no CPU time.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run, with the folders `benchmarks` and `logs`.
     """
     import pandas as pd
 
@@ -105,6 +112,9 @@ def reference(
     machine it was made. Files that take long (`MAY_STAY`) and are not up to date stay from the
     earlier record; provenance names them with the commit of that record, which must be in the
     history, and its date.
+
+    The folder gets tables, figures, runtime.csv and provenance.json; pages take their numbers from
+    these files alone.
     """
     from psfdae_paper.configuration.compose import load
 
@@ -221,6 +231,18 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
     Times are in seconds, sizes in MB. `wall_s` is the time during which a job of `make reproduce`
     ran, `on_request_s` that of each target beyond it.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run.
+    config : Config
+        Configuration of the run, for its numbers of threads.
+
+    Returns
+    -------
+    dict
+        What `provenance.json` holds, but for commit and retained files.
     """
     # Jobs of `make reproduce`: the CPU time of all together and the largest memory of one.
     costs = job_costs(results)
@@ -278,6 +300,13 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
     """Measure the speed of a float32 matrix product in GFLOP/s, the best of some repeats.
 
     Run times of two machines are expected to be in the inverse ratio of these speeds.
+
+    Parameters
+    ----------
+    size : int
+        Rows and columns of the matrices.
+    repeats : int
+        Number of products; other work on the machine slows most of them, but hardly all.
     """
     # Values do not matter for the speed.
     a = np.ones((size, size), dtype=np.float32)
@@ -289,6 +318,11 @@ def _busy_seconds(benchmarks: Path) -> float:
     """Return the wall time during which at least one job ran.
 
     Pauses between jobs, such as those before a run is resumed, do not count.
+
+    Parameters
+    ----------
+    benchmarks : Path
+        Folder with a table of Snakemake for each job.
     """
     # Start and end of each job: a benchmark is written when its job ends.
     ends = ((path.stat().st_mtime, _last_run(path)["s"]) for path in benchmarks.rglob("*.tsv"))

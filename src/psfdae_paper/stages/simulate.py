@@ -64,6 +64,11 @@ def simulate(
     """Draw the PSFs of a telescope over its field: psfdae simulate telescope=NAME.
 
     Writes templates.h5, psfs.png and fields.csv.
+
+    The telescope is an option of the group `telescope`, or a file of your own. The figure shows the
+    PSFs at their places in the field; the table has, for each field point, the light inside the
+    stamp, the FWHM in arcsec, ellipticity and position angle in degrees. Telescopes whose PSFs do
+    not fit into their stamps are refused, before any file is written.
     """
     # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
@@ -130,6 +135,17 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     """Measure the shapes of the stamps of the product "templates", without their margin.
 
     Widths become arcsec by the telescope's pixel scale.
+
+    Parameters
+    ----------
+    product : Product
+        Product "templates", with one PSF for each of the F field points.
+
+    Returns
+    -------
+    FieldOfPsfs
+        PSFs (F, d, d), the light of each inside its stamp, FWHM in arcsec, ellipticity, and
+        position angle in degrees.
     """
     psf = without_margin(product)
     shapes = measure_shapes(psf)
@@ -202,6 +218,17 @@ def _sufficient_stamp_px(
     """Return the smallest even stamp with enough light of the field that needs the largest one.
 
     None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
+
+    Parameters
+    ----------
+    config : Config
+        Stage configuration of `templates`.
+    worst_field : int
+        Number of the field with the least light inside its stamp.
+    max_px : int
+        Side of the largest stamp that is tried.
+    enough_light : float
+        Fraction of the light that a stamp has to hold.
     """
     # One propagation on the largest stamp; pixels of smaller ones are the same.
     framing = config.framing.model_copy(update={"stamp_px": max_px})
@@ -324,7 +351,11 @@ def write_example_field(
     *,
     out: Annotated[File, "FITS image."],
 ) -> None:
-    """Simulate an image of a star field with its star list, as an example."""
+    """Simulate an image of a star field with its star list, as an example.
+
+    The list is what a catalogue of the image would have: numbers, pixel and sky coordinates of all
+    stars but the faint halves of blends. The same seed gives the same image.
+    """
     check_outputs((out,), (catalogue,))
     write_example(out, catalogue, seed, side_px=side, bright=bright, faint=faint)
 
@@ -334,6 +365,20 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
 
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
+
+    Parameters
+    ----------
+    out, catalogue : Path
+        FITS image, in counts, and CSV list.
+    seed : int
+        Seed of places, fluxes and noise of the stars.
+    **attributes
+        Fields of `FieldRecipe`, such as `side_px=600` or `bright=80`.
+
+    Returns
+    -------
+    ExampleField
+        The image with the true place, flux and PSF of every star.
     """
     # Sizes and numbers of stars as asked for; all else as the recipe says.
     recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them

@@ -37,6 +37,9 @@ def templates(
 
     A PSF is the fraction of the light on each pixel. Its brightest pixel is in the middle, and it
     has a margin, from which stamps with any centring error are cut.
+
+    The product also has the light inside each stamp, the place of the brightest pixel, the angle of
+    each field point in radians, and the number of pupil samples.
     """
     limit_threads(1)  # batches run in parallel
     # PSFs have a margin, from which stamps with any centring error are cut.
@@ -73,6 +76,9 @@ def stars(
 
     Each star has its own image (realisation) and the static PSF of its field (template), both on a
     stamp of flux 1 with the same centring error, and the random numbers that made it.
+
+    Without random aberrations (stars.aberration_fraction = 0) realisations and templates are the
+    same. Noise is no part of the product: each stage draws it for the noise levels that it needs.
     """
     # A realisation has static and random aberrations, a template static ones only. Both are
     # framed on their own brightest pixel, moved by the same jitter and normalised by the flux

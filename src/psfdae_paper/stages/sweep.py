@@ -35,6 +35,11 @@ def training_class(model: str) -> str:
     """Return module and name of the class that trains and measures a model, as MODULE:NAME.
 
     It is imported by this name: the code of a point does not include that of the other kind.
+
+    Parameters
+    ----------
+    model : str
+        Name of a method, or of a network of scene 3.
     """
     if model in swept_networks():
         return "psfdae_paper.stages.network_point:StateNetworkTraining"
@@ -65,7 +70,11 @@ Overrides = Annotated[tuple[str, ...], {"argument": True}]
 
 @command("sweep list")
 def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = ()) -> None:
-    """List the points of a sweep as tab-separated text, without running it."""
+    """List the points of a sweep as tab-separated text, without running it.
+
+    Columns are the point's name and its values as KEY=VALUE, or the number of the trial if values
+    are proposed only when it runs.
+    """
     for entry in plan_sweep(name, overrides).points.values():
         values: Mapping[str, object] = entry.values or {"trial": entry.slot}
         print("\t".join([entry.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
@@ -86,6 +95,9 @@ def sweep_point(
 
     A point is named by the hash of all that decides its result, and found by the name of OUT; give
     the overrides with which the sweep was planned. `psfdae sweep list NAME` prints the points.
+
+    The folder gets result.json with metrics and settings, cost.json with seconds, tables of errors,
+    and the files of the model. A training that fails is a result, too.
     """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
@@ -184,6 +196,11 @@ def _train(training: Training) -> dict[str, object]:
     -------
     dict
         status, reason, epochs, attempt, metrics and config.
+
+    Parameters
+    ----------
+    training : Training
+        Its folder gets `cost.json`.
     """
     task = training.task
     # The duration of a training that fails is its cost, too.

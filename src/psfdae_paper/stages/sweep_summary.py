@@ -35,6 +35,8 @@ def sweep_summary(
     """Tabulate the points of a sweep and choose the best by its validation metric.
 
     All points must be finished; one that failed has a row with the reason.
+
+    best.yaml has the best point as overrides, as `psfdae best` prints them.
     """
     plan = plan_sweep(name, overrides)
     # Points in the order of the plan, whatever the order in which they ended.
@@ -129,6 +131,15 @@ def choose(
     """Return the result with the best validation metric, the first of equals.
 
     None if all points failed.
+
+    Parameters
+    ----------
+    results : sequence of mapping
+        `result.json` of every point.
+    metric : str
+        Name of a metric, such as "validation_mse".
+    direction : str
+        "minimize" or "maximize".
     """
     # `min` returns the first of equals.
     sign = 1.0 if direction == "minimize" else -1.0
@@ -150,6 +161,11 @@ def best_overrides(results: Path, name: str) -> list[str]:
     ------
     ProductError
         If the sweep has not been run.
+
+    Returns
+    -------
+    list of str
+        Words for `make reproduce SET="…"`.
     """
     path = results / "sweeps" / name / "best.yaml"
     if not path.is_file():
@@ -168,7 +184,11 @@ def sweep_figure(
     table: Annotated[File, "summary.csv of the same."],
     out: Annotated[File, "PNG."],
 ) -> None:
-    """Draw all points at once (parallel), or the metric against each axis (response)."""
+    """Draw all points at once (parallel), or the metric against each axis (response).
+
+    In the first figure a point is a line through its value on every axis, coloured by its rank; the
+    second has a panel for each axis, with validation and test metric.
+    """
     described = read_yaml(definition)
     # Axes as text: they may be numbers or names of options.
     table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))

@@ -134,7 +134,10 @@ def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt
 
 
 def server() -> str:
-    """Return the address of the server that the environment names, "" if none; set up MLflow."""
+    """Return the address of the server that the environment names, "" if none; set up MLflow.
+
+    MLFLOW_TRACKING_URI names it; without one, runs go into a database of the results folder.
+    """
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     # MLflow's own waits add up to minutes for a server that is away.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
@@ -144,7 +147,13 @@ def server() -> str:
 
 @contextmanager
 def locked(database: Path) -> Iterator[None]:
-    """Wait for other importers: two that meet on a new database would ruin it."""
+    """Wait for other importers: two that meet on a new database would ruin it.
+
+    Parameters
+    ----------
+    database : Path
+        SQLite file; the lock is a hidden file beside it.
+    """
     import fcntl
 
     # The lock of a process that ends is given up by the system.
@@ -190,7 +199,15 @@ def _import(
 
 
 def client_of(uri: str, database: Path) -> MlflowClient:
-    """Return a client of a server, or else of the database, which it makes if it is missing."""
+    """Return a client of a server, or else of the database, which it makes if it is missing.
+
+    Parameters
+    ----------
+    uri : str
+        Address of a server; "" takes the database.
+    database : Path
+        SQLite file.
+    """
     from mlflow import MlflowClient
 
     return MlflowClient(uri or f"sqlite:///{database.resolve()}")
@@ -212,6 +229,11 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
     ------
     TrackingError
         If the database keeps files in another place than `mlartifacts` beside it.
+
+    Returns
+    -------
+    str
+        MLflow's id.
     """
     # A server decides itself where artifacts go.
     is_served = uri.startswith(("http", "databricks"))
@@ -232,7 +254,14 @@ def experiment_of(client: MlflowClient, name: str, uri: str, database: Path) -> 
 
 
 def delete_live(client: MlflowClient, source: str) -> None:
-    """Delete the runs of trainings, seen live, whose model has a place in the results folder."""
+    """Delete the runs of trainings, seen live, whose model has a place in the results folder.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    source : str
+        Place of the model, such as dae/dataset3/random-realisation.
+    """
     if experiment := client.get_experiment_by_name(LIVE):
         for run in client.search_runs([experiment.experiment_id], f"tags.source = '{source}'"):
             client.delete_run(run.info.run_id)
@@ -293,6 +322,20 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
 
     These are its tags, data, model, metrics, parameters and files. The parameters are the settings
     that distinguish it (`settings_of`); all are in its file config.yaml.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    experiment : str
+        Id of the experiment.
+    run : TrackedRun
+    tags : dict of str
+        All tags of the run.
+
+    Returns
+    -------
+    str
+        MLflow's id of the run.
     """
     from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
 
@@ -329,7 +372,14 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
 
 
 def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
-    """Log metrics as far as they are finite; MLflow takes 1000 at once."""
+    """Log metrics as far as they are finite; MLflow takes 1000 at once.
+
+    Parameters
+    ----------
+    client : MlflowClient
+    run_id : str
+    metrics : sequence of Metric
+    """
     # A training that diverged has infinite errors, which no database takes.
     finite = [metric for metric in metrics if math.isfinite(metric.value)]
     for i in range(0, len(finite), 1000):
@@ -340,6 +390,15 @@ def tags_of(run: TrackedRun) -> dict[str, str]:
     """Return the tags of a run in MLflow, but for those of the whole import.
 
     A run with other settings that takes the place of this one sets `superseded` to "true".
+
+    Parameters
+    ----------
+    run : TrackedRun
+
+    Returns
+    -------
+    dict of str
+        Those of `SLOT`, of the run itself, and the hash of its settings.
     """
     # The preset is a tag of the whole import.
     slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
@@ -347,7 +406,13 @@ def tags_of(run: TrackedRun) -> dict[str, str]:
 
 
 def ours_to_explain(error: Exception) -> bool:
-    """Return True if an error comes from the database, the server or the disk, not from a bug."""
+    """Return True if an error comes from the database, the server or the disk, not from a bug.
+
+    Parameters
+    ----------
+    error : Exception
+        What an import raised.
+    """
     # MLflow raises its own errors, those of its database and those of files.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError

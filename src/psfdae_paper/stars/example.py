@@ -186,9 +186,21 @@ def write_field(
 ) -> None:
     """Write an image with header cards, float64 as float32, and a CSV catalogue of its stars.
 
-    The image has a tangential WCS with north up; the catalogue has the columns id,
-    X_IMAGE, Y_IMAGE (1-based, as in SExtractor), ra, dec (degrees), and `columns`.
-    `x`, `y` are 0-based.
+    The image has a tangential WCS with north up, about RA 150°, Dec 2°.
+
+    Parameters
+    ----------
+    path, catalogue : Path
+        Files to write: the image, and its list with the columns id, X_IMAGE, Y_IMAGE (1-based, as
+        in SExtractor), ra and dec (degrees).
+    image : ndarray, shape (h, w)
+    x, y : ndarray, shape (n,)
+        0-based positions of the stars.
+    pixel_scale_arcsec : float
+    columns : mapping of str to ndarray, shape (n,), optional
+        Further columns of the list, by name.
+    **cards
+        Header cards, such as `GAIN=1.6`.
     """
     from astropy.table import Table
     from astropy.wcs import WCS
