@@ -13,6 +13,7 @@ import pytest
 from skimage.metrics import mean_squared_error, structural_similarity
 
 from docs_pages import read
+from psfdae.base.files import write_text
 from psfdae.methods import method
 from psfdae.model.bundle import read_bundle
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
@@ -217,6 +218,22 @@ def test_wrong_config_stops_before_any_job(tmp_path, options, key):
 
 
 @pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"overrides": "seed=3"}, "run with framing.stamp_px=6 and without seed=3; name a folder"),
+        # A folder that is named gives its overrides.
+        nightly({"results": "results/smoke"}, "framing.stamp_px = 6"),
+    ],
+)
+def test_a_finished_run_is_replaced_only_where_its_folder_is_named(tmp_path, options, message):
+    record = tmp_path / "results/smoke/run.yaml"
+    write_text(record, "preset: smoke\nset: framing.stamp_px=6\n")
+    target = "results/smoke/data/seidel/templates.h5"
+    assert message in snakemake(tmp_path, target, check=False, **{"results": "", **options})
+    assert not (record.parent / "data").exists()
+
+
+@pytest.mark.parametrize(
     "word", ["results=$(touch pwned)", nightly("presett=fast"), nightly("preset=a/b")]
 )
 def test_an_unknown_or_no_plain_word_is_refused(tmp_path, word):
@@ -236,7 +253,7 @@ def test_shipped_bundle_is_trained_on_its_stars_and_written_where_it_is_read(tmp
     fits = dict.fromkeys(("train", "bundle", "fit_gmm", "bundle_gmm"), 2)
     assert jobs == {"templates": 2, "stars": 2, **fits}
     snakemake(tmp_path, "shipped")
-    bundle = read_bundle(tmp_path / "src/psfdae/bundles/wfsat.psf.safetensors")
+    bundle = read_bundle(tmp_path / "src/psfdae/model/bundles/wfsat.psf.safetensors")
     assert (bundle.info.name, bundle.info.subpixel) == ("wfsat", True)
     assert bundle.info.config["train"]["noise"]["name"] == "field"
     assert planned(tmp_path, "shipped") == {}

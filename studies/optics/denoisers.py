@@ -21,12 +21,12 @@ import numpy as np
 import pandas as pd
 from skimage.restoration import denoise_nl_means, denoise_tv_chambolle, denoise_wavelet
 
-from psfdae.method import TrainingSet
+from psfdae.base.rng import stream
+from psfdae.base.threads import limit_threads
+from psfdae.methods.interface import TrainingSet
 from psfdae.methods.lmmse import LinearMmse
-from psfdae.metrics import clustered_mean, mse
+from psfdae.methods.metrics import clustered_mean, mse
 from psfdae.model.star_sets import read_stars, training_set
-from psfdae.rng import stream
-from psfdae.threads import limit_threads
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load
 

@@ -4,12 +4,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from psfdae.cli import program
-from psfdae.figures import SERIES_COLORS, new_figure, styled, write_png
-from psfdae.files import ProductError
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled, write_png
+from psfdae.base.files import ProductError
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.commands.cli import program
 from psfdae.methods import method
-from psfdae.options import File
-from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 
 WAYS = {

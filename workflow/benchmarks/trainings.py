@@ -10,16 +10,16 @@ import numpy as np
 from pydantic import Field
 
 from measure import isolated, pareto, write, yes
-from psfdae import fits
-from psfdae.belonging import STARS, require
-from psfdae.cli import program
-from psfdae.files import read_product, write_csv
+from psfdae.base.belonging import STARS, require
+from psfdae.base.files import read_product, write_csv
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table, read_yaml
+from psfdae.base.settings import Group, Reference
+from psfdae.base.threads import limit_threads
+from psfdae.commands.cli import program
+from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
-from psfdae.options import File, Folder
-from psfdae.reading import read_table, read_yaml
-from psfdae.settings import Group, Reference
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import config_dir, decisive_settings, load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -69,9 +69,9 @@ def knee_table(
     """
     import pandas as pd
 
-    from psfdae.method import HISTORY
     from psfdae.methods.dae import Dae
-    from psfdae.metrics import mse
+    from psfdae.methods.interface import HISTORY
+    from psfdae.methods.metrics import mse
 
     limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
@@ -107,7 +107,7 @@ def knee_table(
 
 def settings_of(folder, configured):
     """Return the settings of a training, and whether the configuration uses them."""
-    from psfdae.method import CONFIG
+    from psfdae.methods.interface import CONFIG
 
     tree = decisive_settings(read_yaml(folder / CONFIG))
     has_same_stars = tree["parts"]["test_stars"] > 1
@@ -244,7 +244,7 @@ def methods(
 
 def time_methods(tree, stars):
     """CPU time of each method's fit, stars per second and errors, λ by λ."""
-    from psfdae.metrics import clustered_mean, mse
+    from psfdae.methods.metrics import clustered_mean, mse
 
     config = part(METHODS, tree)
     limit_threads(1)
@@ -263,9 +263,9 @@ def time_methods(tree, stars):
         for level in config.noise.levels:
             noisy = star_sets.noisy_test_images(config, product, test, level)
             # What is made once for a level, such as factorisations, is not of the stars.
-            fitted.restore(noisy[:1], level, position[:1])
+            fitted.estimate(noisy[:1], level, position[:1], False)
             start = process_time()
-            estimate = fitted.restore(noisy, level, position)
+            estimate = fitted.estimate(noisy, level, position, False).psf
             rate = len(noisy) / (process_time() - start)
             row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
             mean, stderr = clustered_mean(mse(estimate, clean), field)
@@ -284,7 +284,7 @@ def seeds(
     out: Annotated[File, "CSV with the mean error of every seed."],
 ) -> None:
     """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
-    from psfdae.metrics import mse
+    from psfdae.methods.metrics import mse
 
     kind, product = method(name), star_sets.read_stars(stars, "template")
     limit_threads(kind.threads(config))
@@ -298,7 +298,7 @@ def seeds(
         for target, fitted in fits.items():
             row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
             for level, images in noisy.items():
-                estimate = fitted.restore(images, level, position)
+                estimate = fitted.estimate(images, level, position, False).psf
                 error = mse(estimate, product[target][test]).mean()
                 rows.append({**row, "noise_level": level, "mse": error})
     write(out, rows)

@@ -10,10 +10,12 @@ from inspect import getdoc
 from snakemake.report.common import data_uri_from_file
 from snakemake.utils import validate
 
-from psfdae import fits
-from psfdae.cli import stage
-from psfdae.fits import suffix_of
-from psfdae.settings import ConfigError
+from psfdae.base.files import ProductError, as_yaml, write_text
+from psfdae.base.reading import read_yaml
+from psfdae.base.settings import ConfigError
+from psfdae.commands.cli import stage
+from psfdae.methods import fit_files, method
+from psfdae.methods.interface import HISTORY
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
@@ -23,21 +25,9 @@ from psfdae_paper.configuration.compose import (
     part,
     write_settings,
 )
-from psfdae.method import HISTORY
-from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
-from psfdae.files import ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
-
-validate(config, "../schemas/command_line.schema.yaml")
-
-PRESET = config["preset"]
-try:
-    GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
-except ValueError as error:
-    sys.exit(f"psfdae: set = {config['set']!r}: {error}")
-RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
 
 
 @contextmanager
@@ -47,6 +37,59 @@ def one_line():
         yield
     except (ConfigError, ProductError, SweepError) as error:
         sys.exit(f"psfdae: {error}")
+
+
+@one_line()
+def finished_run(folder):
+    """Preset and overrides of the run that was finished in a folder; empty if there is none."""
+    record = Path(folder, "run.yaml")
+    if record.is_file():
+        return read_yaml(record)
+    # A whole run of a version that wrote no record.
+    return {"set": ""} if Path(folder, "runtime.csv").is_file() else {}
+
+
+# What the command does not say is as in the folder that it names: further targets of a run.
+CHOSEN_FOLDER = config.get("results")
+config = {
+    **(finished_run(CHOSEN_FOLDER) if CHOSEN_FOLDER else {}),
+    **{key: value for key, value in config.items() if value},
+}
+validate(config, "../schemas/command_line.schema.yaml")
+
+PRESET = config["preset"]
+try:
+    GIVEN = (f"preset={PRESET}", *shlex.split(config["set"]))
+except ValueError as error:
+    sys.exit(f"psfdae: set = {config['set']!r}: {error}")
+RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
+
+
+def keep_finished_run():
+    """Stop before a run with other overrides is replaced in a folder that was not named."""
+    run = finished_run(RESULTS)
+    # Points of sweeps are named by their content, and replace none.
+    if CHOSEN_FOLDER or config["sweep"] or not run:
+        return
+    finished_words, words = shlex.split(run.get("set") or ""), GIVEN[1:]
+    lost = " ".join(word for word in finished_words if word not in words)
+    added = " ".join(word for word in words if word not in finished_words)
+    if lost or added:
+        difference = " and ".join(
+            [f"with {lost}"] * bool(lost) + [f"without {added}"] * bool(added)
+        )
+        purpose = "to replace it" if words else "to go on with it"
+        sys.exit(
+            f"psfdae: {RESULTS} holds a finished run {difference}; name a folder for this one, "
+            f"RESULTS={RESULTS}/NAME, or RESULTS={RESULTS} {purpose} (snakemake: --config results=…)"
+        )
+
+
+def record_finished_run():
+    """Write preset and overrides of a run into its folder."""
+    if not config["sweep"]:
+        record = {"preset": PRESET, "set": shlex.join(GIVEN[1:])}
+        write_text(Path(RESULTS, "run.yaml"), as_yaml(record))
 
 
 @one_line()
@@ -242,7 +285,7 @@ def products_of_scene(experiment):
 
 def model_of(method, dataset, split, reference):
     """Folder or file of a fit."""
-    return f"{RESULTS}/{fits.place_of(method, dataset, split, reference)}"
+    return f"{RESULTS}/{fit_files.place_of(method, dataset, split, reference)}"
 
 
 def names_of(dataset):
@@ -259,7 +302,7 @@ def files_of(method, dataset, split, reference):
     """All files of a fit."""
     return [
         str(p)
-        for p in fits.outputs(method, model_of(method, dataset, split, reference))
+        for p in fit_files.outputs(method, model_of(method, dataset, split, reference))
     ]
 
 
@@ -284,7 +327,7 @@ def model_options(dataset, split, reference, drawn=False):
 def bundles_of(dataset, networks):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
-        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{suffix_of(m)}.psf.safetensors"
+        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{fit_files.suffix_of(m)}.psf.safetensors"
         for m in methods_of(dataset)
         if m.packing
         for split, reference in networks
@@ -308,7 +351,7 @@ def histories_of(dataset):
     trained = [m for m in methods_of(dataset) if HISTORY in m.storage.diagnostics]
     return {
         str(
-            fits.path_beside(m, model_of(m, dataset, split, reference), HISTORY)
+            fit_files.path_beside(m, model_of(m, dataset, split, reference), HISTORY)
         ): ", ".join([dataset, split, reference] + [m.look.label] * (len(trained) > 1))
         for m in trained
         for split, reference in networks_of(dataset)

@@ -14,17 +14,26 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.method import Estimate, FitError, Look, Method, Needs, Packing, Storage, TrainingSet
+from psfdae.base.settings import Count, Group, Positive
+from psfdae.methods.interface import (
+    Estimate,
+    FitError,
+    Look,
+    Method,
+    Needs,
+    Packing,
+    Storage,
+    TrainingSet,
+)
+from psfdae.methods.mixing import FLUX_SIGMA
 from psfdae.methods.mixture_densities import cluster_weights, star_batches
 from psfdae.methods.mixture_fit import best_on_validation, k_means, mixture_arrays
 from psfdae.methods.mixture_law import MixtureLaw
 from psfdae.methods.mixture_posterior import flux_factor, posterior_mean
-from psfdae.mixing import FLUX_SIGMA
-from psfdae.noise import NoiseModel
-from psfdae.settings import Count, Group, Positive
+from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:
-    from psfdae.bundle_info import BundleInfo
+    from psfdae.methods.bundle_info import BundleInfo
 
 
 class Gmm(Group):
@@ -239,19 +248,13 @@ class GaussianMixture(MixtureLaw, Method):
             flux[part] = flux_factor(self, batch, weight)
         return flux, is_near
 
-    def predict(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return the PSFs of `estimate`, which has parameters and errors, but no σ."""
-        return self.estimate(noisy, level, position, with_sigma=False).psf
-
     def estimate(
         self,
         noisy: np.ndarray,
         level: float | np.ndarray,
         position: np.ndarray | None = None,
-        near_clusters: np.ndarray | None = None,
         with_sigma: bool = True,
+        near_clusters: np.ndarray | None = None,
     ) -> Estimate:
         """Return PSFs, float32, their standard deviation, and the evidence of every image.
 

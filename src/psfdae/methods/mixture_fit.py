@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfdae.method import Method, TrainingSet
-from psfdae.progress import task
-from psfdae.rng import stream
+from psfdae.base.progress import task
+from psfdae.base.rng import stream
+from psfdae.methods.interface import Method, TrainingSet
 
 Number = TypeVar("Number", bound=float)
 
@@ -260,7 +260,7 @@ def best_on_validation(
         fitted = replace(cached_mixture(k, used), shrinkage=np.array([nu]))
         advance(1)
         errors = [
-            np.square(fitted.restore(images, level, position) - truth).mean()
+            np.square(fitted.estimate(images, level, position, False).psf - truth).mean()
             for images, level in zip(noisy, data.levels, strict=True)
         ]
         return float(np.exp(np.mean(np.log(errors))))

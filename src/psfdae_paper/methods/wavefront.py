@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from psfdae.method import Estimate, FitError, Look, Method, Needs, TrainingSet
+from psfdae.base.rng import stream
 from psfdae.methods.gmm import GaussianMixture, Gmm
-from psfdae.rng import stream
+from psfdae.methods.interface import Estimate, FitError, Look, Method, Needs, TrainingSet
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.modes import Modes
@@ -103,7 +103,11 @@ class Wavefront(Method):
         return mixture
 
     def estimate(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None = None,
+        with_sigma: bool = True,
     ) -> Estimate:
         """Estimate the PSFs of images (n, d, d) of one noise level λ.
 

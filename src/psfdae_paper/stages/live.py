@@ -1,8 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
-A training logs where the environment asks for it (`psfdae.networks.training.listener`). Its run
-lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which says
-whose training it is, and a function of the rows of the history comes out.
+A training logs where the environment asks for it (`psfdae.methods.networks.training.listener`).
+Its run lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which
+says whose training it is, and a function of the rows of the history comes out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from psfdae_paper.stages.track import (
 from psfdae_paper.tracking import epoch_metrics
 
 if TYPE_CHECKING:
-    from psfdae.networks.training import Row
+    from psfdae.methods.networks.training import Row
 
 
 def logger(checkpoint: Path) -> Callable[[Row], None]:
@@ -59,7 +59,7 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
                     experiment = experiment_of(client, LIVE, uri, database)
                     # A run of an earlier attempt would stay beside the new one.
                     delete_live(client, source)
-                    tags = {"source": source, "preset": os.environ["PRESET"]}
+                    tags = {"source": source, "preset": os.environ["PRESET"] or "fast"}
                     run_id = client.create_run(experiment, start_ms, tags, source).info.run_id
                 log_metrics(client, run_id, epoch_metrics([row], start_ms))
                 last_epoch = row["epoch"]
