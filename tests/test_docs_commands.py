@@ -39,7 +39,7 @@ DRY = {
     "make reproduce TARGETS=dataset3 SET=train.lr=2e-3 telescope=wfsat_literal",
     "make reproduce TARGETS=dataset3 SET=$(psfdae best dae_width)",
     *(f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")),
-    *(f"make {t}" for t in ("benchmark", "stability", "bounds", "training_knee", "report")),
+    *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
     "snakemake sweep --cores all --config sweep=dae_width",
     "snakemake tracking --forcerun track track_alignment",
     *(
