@@ -1,17 +1,14 @@
 """Numbers of README and docs, from the run of record and the configuration.
 
-A page keeps numbers between two comments, `<!-- SOURCE where … by …: TEXT -->…<!-- end -->`. SOURCE
-is a table of `results/reference` or of `studies`, or a function below with words for arguments;
-`where` picks rows and `by` sorts them. TEXT is an f-string over the columns. A comment at the end
-of its line makes a line of each row, below the head of the table that the page has; within a line
-(never at its start) the columns of several rows are arrays. Without TEXT, the source itself is put
-in. TEXT is evaluated as Python: fill in only pages that you trust.
+A page has a number between two comments, `<!--n:KEY-->…<!--/-->`; `docs/numbers.yaml` says where
+the number of each key comes from, and in which form it is written.
 
 Numbers of an earlier record (`kept` in its provenance) or of a study (its columns `date` and
 `commit`) get their date and commit beside them: a line below a table; words behind the first
 number of a section that has no such table. Files of two commits are not joined.
 
-`python docs/tables.py` fills in all pages; `--check` names what has drifted.
+`python docs/tables.py` fills in all pages; `--check` names what has drifted. Both refuse a key of a
+page that the YAML does not have, and one of the YAML that its page does not use.
 """
 
 from __future__ import annotations
@@ -45,12 +42,7 @@ from psfdae_paper.stars.example import FieldRecipe
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
-MARK = re.compile(
-    r"<!-- (?P<name>[\w./]+)(?P<words>(?: [^\s:]+)*?)"
-    r"(?: where (?P<where>[^\n]+?))?(?: by (?P<by>-?\w+))?(?:: (?P<text>[^\n]+?))? -->"
-    r"(?P<line>\n?)(?P<old>(?:(?!<!--).)*)<!-- end -->",
-    re.S,
-)
+MARK = re.compile(r"<!--n:(?P<key>\w+)-->(?P<line>\n?)(?P<old>(?:(?!<!--).)*)<!--/-->", re.S)
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
 ALIGNERS = {
@@ -82,19 +74,38 @@ READ: set[str] = set()
 """Files of the run of record that the source in hand has read."""
 
 
-def filled(page, drifted):
+def number_sources():
+    """By page and key: the table of a number, its rows and their order, and the text."""
+    entries = yaml.safe_load((ROOT / "docs/numbers.yaml").read_text(encoding="utf-8"))
+    return {
+        page: {
+            key: {"where": None, "by": None, **entry, "text": text}
+            for entry in tables
+            for key, text in entry["numbers"].items()
+        }
+        for page, tables in entries.items()
+    }
+
+
+def filled(page, sources, drifted):
     """Text of a page with today's numbers; what has drifted is added to a list."""
+    text = page.read_text(encoding="utf-8")
+    # Each key of the page is one of its entry in the YAML, and the other way round.
+    name = page.relative_to(ROOT).as_posix()
+    if odd := {mark["key"] for mark in MARK.finditer(text)} ^ set(sources):
+        sys.exit(f"{name}, docs/numbers.yaml: only one of both has {', '.join(sorted(odd))}")
     # The reference of all keys is one mark; headings of its groups, `…`, do not part it.
-    sections = re.split(r"^(?=##+ (?!`))", page.read_text(encoding="utf-8"), flags=re.M)
-    return "".join(_section(page.relative_to(ROOT), text, drifted) for text in sections)
+    sections = re.split(r"^(?=##+ (?!`))", text, flags=re.M)
+    return "".join(_section(name, section, sources, drifted) for section in sections)
 
 
-def _section(page, text, drifted):
+def _section(page, text, sources, drifted):
     """A section with today's numbers, and marks at what is of an earlier record."""
     marks, new = list(MARK.finditer(text)), []
     for mark in marks:
         READ.clear()
-        new.append((mark, _new(**mark.groupdict()), _since(*sorted(READ), where=page)))
+        filled_in = _new(sources[mark["key"]], mark["line"], mark["old"])
+        new.append((mark, filled_in, _since(*sorted(READ), where=page)))
     said = {since for mark, _, since in new if mark["line"]}
     for figure in re.findall(r"results/reference/([\w/.-]+\.png)\)", text):
         if (since := _since(figure, where=page)) and since not in said:
@@ -108,8 +119,8 @@ def _section(page, text, drifted):
             beside = f" (recorded {since})"
             said.add(since)
         if filled_in + beside != mark["old"]:
-            drifted.append(f"{page}: {mark['name']}{mark['words']}")
-        parts += [text[end : mark.start("old")], filled_in, beside, "<!-- end -->"]
+            drifted.append(f"{page}: {mark['key']}")
+        parts += [text[end : mark.start("old")], filled_in, beside, "<!--/-->"]
         end = mark.end()
     return "".join([*parts, text[end:]])
 
@@ -125,12 +136,15 @@ def _since(*names, where):
     return "".join(f"{of['date']} at commit {of['commit']:.12}" for of in found.values() if of)
 
 
-def _new(name, words, where, by, text, line, old):
-    table = globals()[name](*words.split()) if name in globals() else csv(name)
-    if where:
-        table = table.query(where)
-    if by:
+def _new(source, line, old):
+    """The text of a number, or, where its mark ends a line, a line for each row of its table."""
+    name, *words = source["table"].split()
+    table = globals()[name](*words) if name in globals() else csv(name)
+    if source["where"]:
+        table = table.query(source["where"])
+    if by := source["by"]:
         table = table.sort_values(by.lstrip("-"), ascending=by[0] != "-", kind="stable")
+    text = source["text"]
     if text is None:
         return line and f"{table}\n"
     rows = table.to_dict("records") if isinstance(table, pd.DataFrame) else [table]
@@ -594,11 +608,15 @@ def over_lmmse():
 def main():
     """Fill in the pages, or name what has drifted."""
     drifted: list[str] = []
+    sources = number_sources()
     pages = (ROOT / "README.md", ROOT / "config/README.md", *sorted((ROOT / "docs").glob("*.md")))
     for page in filter(Path.is_file, pages):
-        text = filled(page, drifted)
+        of_page = sources.pop(page.relative_to(ROOT).as_posix(), {})
+        text = filled(page, of_page, drifted)
         if "--check" not in sys.argv:
             page.write_text(text, encoding="utf-8")
+    if sources:
+        sys.exit(f"docs/numbers.yaml: no page {', '.join(sources)}")
     if "--check" in sys.argv and drifted:
         sys.exit("\n".join(drifted))
 

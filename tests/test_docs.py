@@ -46,12 +46,20 @@ def test_a_typed_number_is_named_and_renewed_with_its_record(
     (record / "provenance.json").write_text(json.dumps({"commit": "3" * 40, "kept": kept}))
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     monkeypatch.setattr(tables, "REFERENCE", record)
-    page.write_text(f"Of <!-- {name}.csv: {{a}} -->2<!-- end --> stars.\n")
-    with pytest.raises(SystemExit, match=rf"README\.md: {name}\.csv"):
+    sources = tmp_path / "docs/numbers.yaml"
+    sources.parent.mkdir()
+    sources.write_text(f"README.md: [{{table: {name}.csv, numbers: {{stars: '{{a}}'}}}}]")
+    page.write_text("Of <!--n:stars-->2<!--/--> stars.\n")
+    with pytest.raises(SystemExit, match=r"README\.md: stars"):
         tables.main()
     monkeypatch.setattr(sys, "argv", ["tables.py"])
     tables.main()
-    assert page.read_text() == f"Of <!-- {name}.csv: {{a}} -->1{mark}<!-- end --> stars.\n"
+    assert page.read_text() == f"Of <!--n:stars-->1{mark}<!--/--> stars.\n"
+    # A key of the page alone, or of the file of all keys alone, is refused.
+    for text in ("No number.\n", "<!--n:stars-->1<!--/--> of <!--n:all-->2<!--/-->"):
+        page.write_text(text)
+        with pytest.raises(SystemExit, match="only one of both has"):
+            tables.main()
 
 
 @pytest.mark.slow

@@ -42,18 +42,8 @@ DRY = {
     *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
     "snakemake sweep --cores all --config sweep=dae_width",
     "snakemake tracking --forcerun track track_alignment",
-    *(
-        f"make {t}"
-        for t in (
-            "mlflow",
-            "mlflow PORT=5001",
-            "reference",
-            "test",
-            "test-all",
-            "test-docs",
-            "test-pythons",
-        )
-    ),
+    *(f"make {t}" for t in ("mlflow", "mlflow PORT=5001", "reference")),
+    *(f"make test{t}" for t in ("", "-all", "-docs", "-pythons")),
 }
 """Commands that take over 10 minutes, need a run that does, or would run this test: planned."""
 
