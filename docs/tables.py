@@ -30,7 +30,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from psfdae.cli import as_click, command_modules, sections, stage
+from psfdae.commands.cli import as_click, command_modules, sections, stage
 from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.image_input import ImageStatements
 from psfdae.methods import all_methods

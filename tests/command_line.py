@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from click.testing import CliRunner
 
-from psfdae.cli import main
+from psfdae.commands.cli import main
 
 
 def psfdae(*words):

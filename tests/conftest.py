@@ -14,8 +14,8 @@ from job_server import job_server
 from prediction_stars import fresh_psfs, gaussians, with_network
 from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
-from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import annular_pupil
+from psfdae.stars.noise import NoiseModel
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     StateTracer,

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from psfdae import load_model
-from psfdae.cli import main
+from psfdae.commands.cli import main
 from psfdae.model import calibration
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, example_field

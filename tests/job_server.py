@@ -47,7 +47,7 @@ def job_server():
 
 def import_stages() -> None:
     """Import what the stages need, and what their first call imports."""
-    from psfdae.cli import command_modules
+    from psfdae.commands.cli import command_modules
 
     for module, _ in command_modules().values():
         import_module(module)
@@ -60,7 +60,7 @@ def import_stages() -> None:
 
 def run_job(connection: socket.socket) -> None:
     """Run one job in this fork, with the files, folder and environment of who asks for it."""
-    from psfdae.cli import main
+    from psfdae.commands.cli import main
 
     size, files, _, _ = socket.recv_fds(connection, 4, 3)
     text = b""

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from psfdae.networks.training import train
+from psfdae.methods.networks.training import train
 from psfdae_paper.alignment.emulator import StampEmulator
 from psfdae_paper.alignment.likelihood import (
     StateLikelihood,

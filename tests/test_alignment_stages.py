@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from command_line import psfdae
-from psfdae.files import ProductError, read_product
+from psfdae.base.files import ProductError, read_product
 from psfdae_paper.configuration.aligners import ALIGNERS, aligners_of, trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load_stage

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psfdae.base.settings import ConfigError
 from psfdae.optics.wavefronts import zernike_images
-from psfdae.settings import ConfigError
 from psfdae.telescope.raytracing import (
     RayTracingError,
     annulus_points,

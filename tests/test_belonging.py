@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from command_line import psfdae, refused
-from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import stage
-from psfdae.files import Column, ProductError, write_product
+from psfdae.base.belonging import STARS, STATIC, require
+from psfdae.base.files import Column, ProductError, write_product
+from psfdae.commands.cli import stage
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.stages.alignment_results import products_of_one_test

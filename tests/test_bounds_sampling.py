@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
+from psfdae.base.rng import stream
 from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.rng import stream
 from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.mode_search import climb, find_twins, recentre
 from psfdae_paper.bounds.modes import Knowledge, Modes

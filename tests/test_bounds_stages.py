@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.files import ProductError, read_product
-from psfdae.method import Needs
+from psfdae.base.files import ProductError, read_product
 from psfdae.methods import method
+from psfdae.methods.interface import Needs
 from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.bounds.tables import POSTERIOR_MEANS

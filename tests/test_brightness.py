@@ -12,14 +12,14 @@ from scipy.ndimage import gaussian_filter
 import psfdae
 from image_training import SIZES
 from psfdae import PsfModel, StarFlag
-from psfdae.bright_stars import BrightStars, magnitude
 from psfdae.image.image_input import ImageInput
-from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
 from psfdae.methods.field_spline import FieldModel
+from psfdae.methods.interface import TrainingSet
 from psfdae.model.image_prediction import other_instrument
-from psfdae.noise import NoiseModel
+from psfdae.stars.bright_stars import BrightStars, magnitude
+from psfdae.stars.noise import NoiseModel
 
 SIDE, SPACING = 12, 0.5
 RANGES = {"magnitude": (-13.0, -8.0), "colour": (-0.2, 1.6)}

@@ -13,6 +13,7 @@ import torch
 from safetensors.numpy import save
 
 import command_line
+from psfdae.methods.networks.dae import build_dae, run_network
 from psfdae.model import packing
 from psfdae.model.bundle import (
     BundleError,
@@ -22,7 +23,6 @@ from psfdae.model.bundle import (
     write_bundle,
 )
 from psfdae.model.flux_model import FluxModel, robust_flux
-from psfdae.networks.dae import build_dae, run_network
 
 
 @pytest.fixture(scope="module")

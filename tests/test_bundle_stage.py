@@ -11,8 +11,8 @@ import pytest
 from command_line import psfdae, refused
 from prediction_stars import gaussians
 from psfdae import StarFlag
-from psfdae.belonging import write_origin
-from psfdae.files import Column, ProductError, read_product, write_product
+from psfdae.base.belonging import write_origin
+from psfdae.base.files import Column, ProductError, read_product, write_product
 from psfdae.methods import groups_of
 from psfdae.model.bundle import (
     BundleError,
@@ -26,8 +26,8 @@ from psfdae.model.error_model import at_noise, brightest, mahalanobis
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
-from psfdae.noise import NoiseModel
-from psfdae.splits import random_split
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle as stage
 from psfdae_paper.stages.evaluate import Models

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.bright_stars import BrightStars
+from psfdae.base.rng import stream
 from psfdae.image.stamps import cut, sky_around
 from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, stamp_snr
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
-from psfdae.moments import shift_stamps, windowed_centres
-from psfdae.noise import NoiseModel, noise_equivalent_px
-from psfdae.rng import stream
-from psfdae.splits import held_out_fields
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import shift_stamps, windowed_centres
+from psfdae.stars.noise import NoiseModel, noise_equivalent_px
+from psfdae.stars.splits import held_out_fields
 
 FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from command_line import psfdae, refused
-from psfdae.files import write_text
+from psfdae.base.files import write_text
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import (
     compare_evaluations,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
+from psfdae.base.settings import ConfigError, as_overrides, deciding
 from psfdae.methods import groups_of
-from psfdae.networks.settings import DaeSettings, Train
-from psfdae.networks.training import fingerprint
-from psfdae.settings import ConfigError, as_overrides, deciding
+from psfdae.methods.networks.settings import DaeSettings, Train
+from psfdae.methods.networks.training import fingerprint
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION

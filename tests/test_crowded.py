@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
-from psfdae.files import read_product
+from psfdae.base.files import read_product
 from psfdae.image.camera import CameraValue
 from psfdae.image.image_input import ImageInput
 from psfdae.image.stamps import cut_image

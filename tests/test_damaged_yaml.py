@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from command_line import refused as refusal
-from psfdae.files import ProductError
-from psfdae.reading import read_yaml
+from psfdae.base.files import ProductError
+from psfdae.base.reading import read_yaml
 
 GOOD = b"# One.\nepochs: 12\nbatch: 32"
 TRAIN = "train/onecycle.yaml"

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
-from psfdae.metrics import (
+from psfdae.methods.metrics import (
     all_metrics,
     clustered_mean,
     clustered_ratio,

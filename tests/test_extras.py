@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from command_line import refused
-from psfdae import errors, load_model
-from psfdae.cli import refusal
-from psfdae.errors import MissingExtraError
+from psfdae import load_model
+from psfdae.base import errors
+from psfdae.base.errors import MissingExtraError
+from psfdae.commands.cli import refusal
 from psfdae.model.bundle import write_bundle
 from workflow_runs import ROOT, captured
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import psfdae
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.image.image_input import ImageInput
 from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag

@@ -17,17 +17,17 @@ from photutils.psf import GriddedPSFModel, PSFPhotometry
 from command_line import psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
-from psfdae.bright_stars import BrightStars
-from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import PosteriorLimits
 from psfdae.methods.field_nodes import node_step
 from psfdae.methods.field_posterior import log_node_prior
 from psfdae.methods.field_search import fit_field
+from psfdae.methods.interface import TrainingSet
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError
-from psfdae.moments import measure_shapes
-from psfdae.noise import NoiseModel
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import measure_shapes
+from psfdae.stars.noise import NoiseModel
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stars.example import add_stamps, write_field
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from command_line import psfdae, refused
-from psfdae import progress
-from psfdae.files import (
+from psfdae.base import progress
+from psfdae.base.files import (
     Column,
     ProductError,
     atomic_path,
@@ -81,7 +81,7 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("old")
     code = (
-        "import os, sys; from psfdae.files import atomic_path\n"
+        "import os, sys; from psfdae.base.files import atomic_path\n"
         "with atomic_path(sys.argv[1]) as new: new.write_text('half'); os.kill(os.getpid(), 9)"
     )
     assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
@@ -119,7 +119,7 @@ def done(step, *unwanted):
     found[step] = [name for name in unwanted if name in sys.modules]
 
 from click.testing import CliRunner
-from psfdae.cli import main
+from psfdae.commands.cli import main
 assert CliRunner().invoke(main, ["--help"]).exit_code == 0
 done("--help", "torch", "mlflow", "hydra", "snakemake", "numpy", "pandas")
 

@@ -19,10 +19,10 @@ from command_line import psfdae, refused
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
-from psfdae.bright_stars import BrightStars
+from psfdae.base.files import read_product, write_product
+from psfdae.base.rng import stream
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import locked_folder
-from psfdae.files import read_product, write_product
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
@@ -32,10 +32,10 @@ from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
 from psfdae.model.star_sets import split_stars
 from psfdae.model.validation import Report
-from psfdae.moments import shift_stamps
-from psfdae.noise import NoiseModel, OwnNoise
-from psfdae.rng import stream
-from psfdae.splits import held_out_fields
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import shift_stamps
+from psfdae.stars.noise import NoiseModel, OwnNoise
+from psfdae.stars.splits import held_out_fields
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import FieldRecipe, example_field, star_images

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from psfdae.networks.training import listener
+from psfdae.methods.networks.training import listener
 from test_track import HISTORY, site  # noqa: F401
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psfdae.settings import ConfigError
+from psfdae.base.settings import ConfigError
 from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 from psfdae_paper.configuration.compose import load

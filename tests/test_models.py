@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.files import ProductError
-from psfdae.method import Method, TrainingSet
+from psfdae.base.files import ProductError
 from psfdae.methods import all_methods
 from psfdae.methods.dae import Dae as Fitted
+from psfdae.methods.interface import Method, TrainingSet
 from psfdae.methods.lmmse import LinearMmse
-from psfdae.metrics import mse
-from psfdae.networks import dae as dae_network
-from psfdae.networks import training as loop
-from psfdae.networks.dae import (
+from psfdae.methods.metrics import mse
+from psfdae.methods.networks import dae as dae_network
+from psfdae.methods.networks import training as loop
+from psfdae.methods.networks.dae import (
     DaeTraining,
     SingleChannelConv,
     build_dae,
 )
-from psfdae.networks.settings import DaeSettings, Train
-from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal
-from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
+from psfdae.methods.networks.settings import DaeSettings, Train
+from psfdae.methods.networks.training import DeadNetworkError, TrainingError, orthogonal
+from psfdae.methods.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae_paper.methods import pca_som
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 

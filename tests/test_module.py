@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from docs_pages import blocks, read
-from psfdae.files import read_product
+from psfdae.base.files import read_product
 from workflow_runs import NO_CLUSTER, ROOT, captured, environment
 
 pytestmark = pytest.mark.workflow

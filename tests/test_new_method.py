@@ -26,8 +26,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from psfdae.method import Look, Method, Storage
-from psfdae.settings import Group
+from psfdae.methods.interface import Look, Method, Storage
+from psfdae.base.settings import Group
 
 
 class Settings(Group):
@@ -60,8 +60,8 @@ STAGE = '''
 
 from typing import Annotated
 
-from psfdae.files import write_text
-from psfdae.options import File
+from psfdae.base.files import write_text
+from psfdae.base.options import File
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 

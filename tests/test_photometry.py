@@ -14,7 +14,7 @@ from psfdae.model import flux_model as module
 from psfdae.model.flux_model import FluxModel, robust_flux
 from psfdae.model.leading_modes import LeadingModes, clipped_rms
 from psfdae.model.photometry import Photometer
-from psfdae.moments import measure_shapes
+from psfdae.stars.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
 

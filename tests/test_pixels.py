@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 import psfdae
 from command_line import refused
-from psfdae.bright_stars import BrightStars
 from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
@@ -23,6 +22,7 @@ from psfdae.model import crowded
 from psfdae.model.fitting import fitted_to
 from psfdae.model.neighbours import _Field
 from psfdae.model.stars import Stars
+from psfdae.stars.bright_stars import BrightStars
 from small_field import CAMERA, SKY, drawn, moffat, noisy
 
 SIDE = 320

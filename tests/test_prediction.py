@@ -10,7 +10,7 @@ import pytest
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import PredictionError, StarFlag
 from psfdae.image.stamps import cut
-from psfdae.method import Packing
+from psfdae.methods.interface import Packing
 from psfdae.model import restoration
 from psfdae.model.prediction import CUBES
 from psfdae.model.psf_model import PsfModel

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from psfdae.files import ProductError
+from psfdae.base.files import ProductError
 from psfdae_paper import source
 from psfdae_paper.stages import record
 

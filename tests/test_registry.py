@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from image_training import few_draws
-from psfdae import fits, load_model
-from psfdae.files import Column, write_product
+from psfdae import load_model
+from psfdae.base.files import Column, write_product
+from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle, track

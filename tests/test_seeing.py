@@ -8,11 +8,11 @@ from scipy.integrate import quad
 from scipy.signal import fftconvolve
 from scipy.special import j0
 
+from psfdae.base.settings import ConfigError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, Profile
 from psfdae.optics.wavefronts import zernike_images
-from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import template_wavefronts

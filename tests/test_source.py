@@ -50,10 +50,10 @@ def changed(before, tmp_path, monkeypatch):
 
 def test_code_that_draws_reads_images_or_is_new_trains_nothing(changed):
     paths = [
-        *("psfdae/metrics.py", "psfdae/figure_style.py", "psfdae/strip.py"),
+        *("psfdae/methods/metrics.py", "psfdae/figure_style.py", "psfdae/strip.py"),
         *("psfdae/image/observation.py", "psfdae/image/fits_file.py", "psfdae/image/catalogue.py"),
         *("psfdae/model/report.py", "psfdae/model/validation.py", "psfdae/model/plot.py"),
-        *("psfdae/commands/predict.py", "psfdae/cli.py"),
+        *("psfdae/commands/predict.py", "psfdae/commands/cli.py"),
         *("psfdae/methods/newest.py", "psfdae_paper/methods/newest.py"),
         *("psfdae_paper/evaluation/curves.py", "psfdae_paper/evaluation/figures.py"),
         *("psfdae_paper/bounds/sampling.py", "psfdae_paper/tracking.py"),
@@ -63,7 +63,11 @@ def test_code_that_draws_reads_images_or_is_new_trains_nothing(changed):
 
 
 def test_comments_docstrings_and_formatting_change_no_hash(changed):
-    paths = ("psfdae/method.py", "psfdae/optics/propagation.py", "psfdae/settings.py")
+    paths = (
+        "psfdae/methods/gmm.py",
+        "psfdae/optics/propagation.py",
+        "psfdae/base/settings.py",
+    )
     assert changed(*paths, text='\n# A thought.\n"""A constant\'s docstring."""\n') == set()
 
 
@@ -71,10 +75,10 @@ def test_comments_docstrings_and_formatting_change_no_hash(changed):
     ("path", "repeated"),
     [
         ("psfdae/methods/gmm.py", {"gmm"}),
-        ("psfdae/networks/dae.py", {"dae", *ALIGNERS}),
+        ("psfdae/methods/networks/dae.py", {"dae", *ALIGNERS}),
         ("psfdae_paper/methods/pca_som.py", {"pca_som"}),
         ("psfdae_paper/stars/scenes.py", {"stars"}),
-        ("psfdae/noise.py", {*METHODS, *ALIGNERS, "paper-tables"}),
+        ("psfdae/stars/noise.py", {*METHODS, *ALIGNERS, "paper-tables"}),
         ("psfdae/optics/propagation.py", {"stars", "alignment states", *ALIGNERS}),
         (TABLE, {"paper-tables"}),
     ],

@@ -7,12 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psfdae.files import Product
+from psfdae.base.files import Product
+from psfdae.base.rng import stream
 from psfdae.model.star_sets import noisy_test_images
-from psfdae.noise import mixed_levels
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae.rng import stream
-from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
+from psfdae.stars.noise import mixed_levels
+from psfdae.stars.splits import (
+    draw_jitter,
+    draw_phase,
+    held_out_fields,
+    held_out_split,
+    random_split,
+)
 from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
 from psfdae_paper.stars.framing import (
     FramingError,

@@ -13,7 +13,14 @@ import speed
 from command_line import psfdae
 from measure import cost_of_command, isolated
 from prediction import make_cube
-from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
+from psfdae.base.files import (
+    Column,
+    Empty,
+    ProductError,
+    read_product,
+    stream_product,
+    write_product,
+)
 from psfdae_paper.configuration.compose import compose, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars

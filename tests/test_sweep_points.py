@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.files import Column, write_product
+from psfdae.base.files import Column, write_product
+from psfdae.base.reading import read_json
 from psfdae.methods import groups_of
-from psfdae.reading import read_json
-from psfdae.splits import random_split
+from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.sweep import point_groups

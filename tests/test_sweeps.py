@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.settings import ConfigError
+from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
 from psfdae_paper.sweeps import adaptive

@@ -7,14 +7,14 @@ import pytest
 
 from command_line import psfdae, refused
 from fits_inputs import open_observation
-from psfdae.files import read_product
+from psfdae.base.files import read_product
+from psfdae.base.settings import ConfigError
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import (
     field_coefficients,
     seidel_wavefronts,
     zernike_wavefronts,
 )
-from psfdae.settings import ConfigError
 from psfdae.telescope.field import static_zernikes
 from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae_paper.alignment.telescope import StateTracer

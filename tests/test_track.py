@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.files import Column, write_product
+from psfdae.base.files import Column, write_product
 from psfdae_paper import registry
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import runs_of_datasets

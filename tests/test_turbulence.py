@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import gamma, jv, kv
 
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
 from psfdae.optics.pupil import SamplingError, annular_pupil, pupil_axis
 from psfdae.optics.wavefronts import zernike_images
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.fields import square_grid
 from psfdae_paper.stars.scenes import template_wavefronts

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psfdae.method import TrainingSet
 from psfdae.methods import method
-from psfdae.metrics import mse
+from psfdae.methods.interface import TrainingSet
+from psfdae.methods.metrics import mse
 from psfdae.model.star_sets import noise_model
 from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae_paper.bounds.estimates import fresh_stars, stamp_model

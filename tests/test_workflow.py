@@ -236,7 +236,7 @@ def test_shipped_bundle_is_trained_on_its_stars_and_written_where_it_is_read(tmp
     fits = dict.fromkeys(("train", "bundle", "fit_gmm", "bundle_gmm"), 2)
     assert jobs == {"templates": 2, "stars": 2, **fits}
     snakemake(tmp_path, "shipped")
-    bundle = read_bundle(tmp_path / "src/psfdae/bundles/wfsat.psf.safetensors")
+    bundle = read_bundle(tmp_path / "src/psfdae/model/bundles/wfsat.psf.safetensors")
     assert (bundle.info.name, bundle.info.subpixel) == ("wfsat", True)
     assert bundle.info.config["train"]["noise"]["name"] == "field"
     assert planned(tmp_path, "shipped") == {}

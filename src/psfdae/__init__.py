@@ -21,13 +21,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from psfdae import progress, terminal
-from psfdae.version import __version__
+from psfdae.base import progress
+from psfdae.base.version import __version__
+from psfdae.commands import terminal
 
 progress.show_with(terminal.bar)
 
 if TYPE_CHECKING:
-    from psfdae.errors import Error
+    from psfdae.base.errors import Error
     from psfdae.image.detected_stars import detect
     from psfdae.image.stamps import StarFlag
     from psfdae.model.field_psfs import PredictionError
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from psfdae.telescope.settings import read_telescope
 
 _MODULES = {
-    "Error": "errors",
+    "Error": "base.errors",
     "Prediction": "model.prediction",
     "PredictionError": "model.field_psfs",
     "PsfModel": "model.psf_model",

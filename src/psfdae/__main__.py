@@ -1,5 +1,5 @@
 """`python -m psfdae` is the command line."""
 
-from psfdae.cli import main
+from psfdae.commands.cli import main
 
 main(prog_name="psfdae")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from psfdae.cli import command_modules
+from psfdae.commands.cli import command_modules
 
 SOURCES = Path(__file__).resolve().parents[1]
 """Folder of the packages."""

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from psfdae.bright_stars import BrightStars
 from psfdae.methods.field_residuals import MARGIN_PX
 from psfdae.methods.field_search import fit_field, refit_field
+from psfdae.stars.bright_stars import BrightStars
 from psfdae_paper.source import git_commit
 
 SIZE_PX, STAMP_PX, WIDE_PX, SAMPLES = 1000, 16, 32, 5

@@ -19,12 +19,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from psfdae import fits
-from psfdae.files import read_product
+from psfdae.base.files import read_product
+from psfdae.base.threads import limit_threads
+from psfdae.methods import fit_files as fits
 from psfdae.methods import method
-from psfdae.metrics import clustered_mean, mse
+from psfdae.methods.metrics import clustered_mean, mse
 from psfdae.model.star_sets import field_positions, read_stars, training_set
-from psfdae.threads import limit_threads
 from psfdae_paper.bounds import mode_search
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from psfdae.files import read_product
+from psfdae.base.files import read_product
+from psfdae.base.threads import limit_threads
 from psfdae.methods import method
-from psfdae.metrics import clustered_mean
+from psfdae.methods.metrics import clustered_mean
 from psfdae.model.star_sets import field_positions, training_set
-from psfdae.threads import limit_threads
 from psfdae_paper.bounds.estimates import bounded_stars, true_modes
 from psfdae_paper.bounds.mode_search import climb
 from psfdae_paper.bounds.stamp_model import StarPosteriors

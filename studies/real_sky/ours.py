@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from psfdae.cli import main
+from psfdae.commands.cli import main
 from psfdae.model import stars
 
 split, *words = sys.argv[1:]

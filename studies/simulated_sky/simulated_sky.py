@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 from scipy.stats import sem
 
-from psfdae.cli import program
-from psfdae.files import atomic_path
+from psfdae.base.files import atomic_path
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.base.rng import stream
+from psfdae.commands.cli import program
 from psfdae.image.stamps import central_pixel
-from psfdae.options import File
-from psfdae.reading import read_table
-from psfdae.rng import stream
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
@@ -169,7 +169,7 @@ def errors(
     `flux` and `psf` are the parts of fluxes and pixels within the stated errors, with standard
     errors clustered by star; `flux_pull` is what 68.27 % of the errors of fluxes are below.
     """
-    from psfdae.metrics import clustered_mean
+    from psfdae.methods.metrics import clustered_mean
     from psfdae.model.psf_model import load_model
 
     model, npz, rows = load_model(bundle), np.load(truth), []

@@ -15,7 +15,7 @@ from time import process_time
 import numpy as np
 import pandas as pd
 
-from psfdae.files import read_product
+from psfdae.base.files import read_product
 from psfdae.methods import method
 from psfdae.model.star_sets import (
     field_positions,

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from psfdae.cli import main as psfdae
-from psfdae.files import read_product
+from psfdae.base.files import read_product
+from psfdae.commands.cli import main as psfdae
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load

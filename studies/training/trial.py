@@ -22,11 +22,11 @@ import numpy as np
 import pandas as pd
 from torch.optim.lr_scheduler import OneCycleLR
 
-from psfdae.files import read_product
-from psfdae.method import HISTORY
+from psfdae.base.files import read_product
 from psfdae.methods.dae import Dae
+from psfdae.methods.interface import HISTORY
+from psfdae.methods.networks import dae, training
 from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
-from psfdae.networks import dae, training
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 

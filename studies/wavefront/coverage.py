@@ -22,10 +22,10 @@ import numpy as np
 import pandas as pd
 
 import psfdae
+from psfdae.base.threads import limit_threads
 from psfdae.sensing import stars as engine
 from psfdae.sensing.joint import TelescopePosterior
 from psfdae.telescope.field import telescope_model, terms_of
-from psfdae.threads import limit_threads
 
 TELESCOPE = Path(__file__).parents[2] / "config" / "telescope" / "example_zernike.yaml"
 STAMP_PX, SKY = 16, 1000.0

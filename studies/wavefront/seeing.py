@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 import psfdae
+from psfdae.base.threads import limit_threads
 from psfdae.sensing.stars import StarOptics
 from psfdae.telescope.field import telescope_model, terms_of
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.base import config_dir
 
 STATED, TRUE_FWHM, WIDTH = 1.5, 1.8, 0.15

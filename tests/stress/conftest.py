@@ -16,7 +16,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_limits
 
-from psfdae.files import read_product, write_text
+from psfdae.base.files import read_product, write_text
 from psfdae_paper.configuration.compose import load, load_settings, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from stress.bench import THREADS, Bench, Scene, simulated

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from psfdae.metrics import all_metrics, ssim
+from psfdae.methods.metrics import all_metrics, ssim
 from psfdae_paper.evaluation.alignment_tables import error_correlation
 
 EPS = float(np.finfo(np.float64).eps)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from psfdae.method import FitError, TrainingSet
 from psfdae.methods.gmm import GaussianMixture, Gmm
+from psfdae.methods.interface import FitError, TrainingSet
 
 EPS = float(np.finfo(np.float32).eps)
 

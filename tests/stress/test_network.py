@@ -10,9 +10,9 @@ import pytest
 import torch
 from scipy.stats import binom
 
-from psfdae.networks import training as loop
-from psfdae.networks.dae import DaeNetwork, DaeTraining, run_network
-from psfdae.networks.training import TrainingError
+from psfdae.methods.networks import training as loop
+from psfdae.methods.networks.dae import DaeNetwork, DaeTraining, run_network
+from psfdae.methods.networks.training import TrainingError
 from stress.bench import THREADS
 
 pytestmark = pytest.mark.slow

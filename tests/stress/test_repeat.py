@@ -4,7 +4,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from psfdae.rng import stream
+from psfdae.base.rng import stream
 
 
 def test_streams(bench, record):

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 import psutil
 
-from psfdae.cli import program
-from psfdae.files import write_csv
-from psfdae.metrics import clustered_ratio
-from psfdae.options import File
+from psfdae.base.files import write_csv
+from psfdae.base.options import File
+from psfdae.commands.cli import program
+from psfdae.methods.metrics import clustered_ratio
 from psfdae_paper.configuration.command import command
 
 TARGETS = (*(f"dataset{n}" for n in range(1, 9)), "scene3", "all")

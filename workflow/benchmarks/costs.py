@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Field
 
 from measure import isolated, pareto, write
-from psfdae.belonging import STARS, require
-from psfdae.cli import program
-from psfdae.files import read_product
+from psfdae.base.belonging import STARS, require
+from psfdae.base.files import read_product
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.base.settings import Group
+from psfdae.commands.cli import program
 from psfdae.methods import groups_of, method
-from psfdae.options import File
-from psfdae.reading import read_table
-from psfdae.settings import Group
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import config_dir, load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -103,9 +103,9 @@ def least_errors(bounds, dataset, knows_position):
 
 def time_method(name, tree, stars, bound):
     """Return CPU seconds of the fit, stars per second at the slowest level, and mean errors."""
-    from psfdae.metrics import mse
+    from psfdae.base.threads import limit_threads
+    from psfdae.methods.metrics import mse
     from psfdae.model import star_sets
-    from psfdae.threads import limit_threads
     from psfdae_paper.bounds.estimates import SPLIT, bounded_stars
 
     # Imports are no part of the fit.

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.restoration import denoise_nl_means, denoise_tv_chambolle, denoise_wavelet
 
-from psfdae.method import Look, Method, Needs
-from psfdae.metrics import mse
-from psfdae.rng import stream
+from psfdae.base.rng import stream
+from psfdae.methods.interface import Look, Method, Needs
+from psfdae.methods.metrics import mse
 
 
 def wavelet(image, sigma, strength):

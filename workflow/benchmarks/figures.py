@@ -5,11 +5,11 @@ from typing import Annotated, Literal
 import numpy as np
 
 from costs import method_class
-from psfdae.cli import program
-from psfdae.figures import SERIES_COLORS, new_figure, styled, write_png
-from psfdae.files import ProductError
-from psfdae.options import File
-from psfdae.reading import read_table
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled, write_png
+from psfdae.base.files import ProductError
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.commands.cli import program
 from psfdae_paper.configuration.command import command
 
 WAYS = {

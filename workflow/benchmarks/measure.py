@@ -15,8 +15,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from psfdae.cli import main, stage
-from psfdae.files import write_text
+from psfdae.base.files import write_text
+from psfdae.commands.cli import main, stage
 from psfdae_paper.configuration.compose import write_settings
 from psfdae_paper.stages.record import cpu_model
 

@@ -15,15 +15,15 @@ import click
 import numpy as np
 
 from measure import cost_of_command, isolated, write, yes
-from psfdae.belonging import STARS, require
-from psfdae.cli import program
-from psfdae.files import read_product
+from psfdae.base.belonging import STARS, require
+from psfdae.base.files import read_product
+from psfdae.base.options import File
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
+from psfdae.commands.cli import program
 from psfdae.model import star_sets
-from psfdae.noise import NoiseModel, mixed_levels
-from psfdae.options import File
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
-from psfdae.splits import draw_jitter
+from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.stars.splits import draw_jitter
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -126,8 +126,8 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.networks.dae import run_network
-    from psfdae.threads import one_thread_each, side_by_side
+    from psfdae.base.threads import one_thread_each, side_by_side
+    from psfdae.methods.networks.dae import run_network
 
     side, factor, network = model.stamp_px, model.info.image_scale, model.method.network
     mean = model.bundle.flux_model.mean.reshape(1, side, side).astype(np.float32)

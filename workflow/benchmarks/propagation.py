@@ -13,10 +13,10 @@ from propagators import (
     peers_of,
     time_settings,
 )
-from psfdae.cli import program
-from psfdae.options import Folder
-from psfdae.reading import read_table
-from psfdae.threads import limit_threads
+from psfdae.base.options import Folder
+from psfdae.base.reading import read_table
+from psfdae.base.threads import limit_threads
+from psfdae.commands.cli import program
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from scenes import READS, Scene, build_cases

@@ -16,9 +16,9 @@ from itertools import product
 import numpy as np
 
 from measure import isolated, pareto, time_in_rounds, use_threads, yes
+from psfdae.base.threads import side_by_side
 from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
 from psfdae.optics.pupil import SamplingError
-from psfdae.threads import side_by_side
 from psfdae_paper.stars.framing import normalise_flux
 from scenes import pupil_of
 

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from psfdae.base.rng import stream
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import WavefrontSource
-from psfdae.rng import stream
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Framing, Optics

@@ -14,11 +14,11 @@ import numpy as np
 
 from measure import cost_of_command, isolated, write
 from prediction import make_cube
-from psfdae.cli import program
-from psfdae.fits import rule_of
+from psfdae.base.options import File
+from psfdae.base.rng import stream
+from psfdae.commands.cli import program
 from psfdae.methods import method
-from psfdae.options import File
-from psfdae.rng import stream
+from psfdae.methods.fit_files import rule_of
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.methods import all_groups
@@ -56,7 +56,7 @@ def random_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
-    from psfdae.networks.dae import build_dae, image_scale
+    from psfdae.methods.networks.dae import build_dae, image_scale
 
     widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
@@ -66,7 +66,7 @@ def network(dae, size, threads):
     """`predict` with a random network, as every stage calls it."""
     import torch
 
-    from psfdae.networks.dae import run_network
+    from psfdae.methods.networks.dae import run_network
 
     torch.set_num_threads(threads)
     model, factor = random_network(dae, *size)
@@ -142,13 +142,13 @@ def last_cost(runs):
 
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
-    from psfdae.bundle_info import Architecture, BundleInfo
-    from psfdae.files import read_product
+    from psfdae.base.files import read_product
+    from psfdae.methods.bundle_info import Architecture, BundleInfo
     from psfdae.model.bundle import read_bundle, write_bundle
     from psfdae.model.error_model import ErrorModel
     from psfdae.model.flux_model import FluxModel
     from psfdae.model.packing import leading
-    from psfdae.noise import noise_equivalent_px
+    from psfdae.stars.noise import noise_equivalent_px
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])
@@ -264,7 +264,7 @@ def repeat_stars(stars, count, out):
 
     What the stages cost does not depend on what the stars look like.
     """
-    from psfdae.files import Column, read_product, write_product
+    from psfdae.base.files import Column, read_product, write_product
 
     per_star = ("realisation", "template", "field_index")
     product = read_product(stars, "stars", (*per_star, "grid"))

@@ -8,15 +8,15 @@ from typing import Annotated
 import numpy as np
 
 from measure import write
-from psfdae import fits
-from psfdae.cli import program
-from psfdae.files import write_csv
+from psfdae.base.files import write_csv
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table
+from psfdae.base.settings import Reference
+from psfdae.base.threads import limit_threads
+from psfdae.commands.cli import program
+from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
-from psfdae.options import File, Folder
-from psfdae.reading import read_table
-from psfdae.settings import Reference
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 
@@ -34,7 +34,7 @@ def seeds(
     out: Annotated[File, "CSV with the mean error of every seed."],
 ) -> None:
     """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
-    from psfdae.metrics import mse
+    from psfdae.methods.metrics import mse
 
     kind, product = method(name), star_sets.read_stars(stars, "template")
     limit_threads(kind.threads(config))

@@ -1,7 +1,7 @@
 # A rule for each method whose fit can be packed: bundle (DAE), bundle_gmm, …; a method that is
 # plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage and m.packing):
-    _suffix = suffix_of(_method)
+    _suffix = fit_files.suffix_of(_method)
     _stem = f"{{dataset}}-{{split}}-{{reference}}{_suffix}"
 
     rule:
@@ -56,7 +56,7 @@ rule shipped:
     params:
         config=lambda w: settings("ship", f"dataset={SHIPPED_DATASET}"),
         source=source_hash("ship"),
-        folder="src/psfdae/bundles",
+        folder="src/psfdae/model/bundles",
         bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:
         "Renewing the model that comes with the package"

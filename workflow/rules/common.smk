@@ -10,10 +10,11 @@ from inspect import getdoc
 from snakemake.report.common import data_uri_from_file
 from snakemake.utils import validate
 
-from psfdae import fits
-from psfdae.cli import stage
-from psfdae.fits import suffix_of
-from psfdae.settings import ConfigError
+from psfdae.base.files import ProductError
+from psfdae.base.settings import ConfigError
+from psfdae.commands.cli import stage
+from psfdae.methods import fit_files, method
+from psfdae.methods.interface import HISTORY
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
@@ -23,10 +24,7 @@ from psfdae_paper.configuration.compose import (
     part,
     write_settings,
 )
-from psfdae.method import HISTORY
-from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
-from psfdae.files import ProductError
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
@@ -242,7 +240,7 @@ def products_of_scene(experiment):
 
 def model_of(method, dataset, split, reference):
     """Folder or file of a fit."""
-    return f"{RESULTS}/{fits.place_of(method, dataset, split, reference)}"
+    return f"{RESULTS}/{fit_files.place_of(method, dataset, split, reference)}"
 
 
 def names_of(dataset):
@@ -259,7 +257,7 @@ def files_of(method, dataset, split, reference):
     """All files of a fit."""
     return [
         str(p)
-        for p in fits.outputs(method, model_of(method, dataset, split, reference))
+        for p in fit_files.outputs(method, model_of(method, dataset, split, reference))
     ]
 
 
@@ -284,7 +282,7 @@ def model_options(dataset, split, reference, drawn=False):
 def bundles_of(dataset, networks):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
-        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{suffix_of(m)}.psf.safetensors"
+        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{fit_files.suffix_of(m)}.psf.safetensors"
         for m in methods_of(dataset)
         if m.packing
         for split, reference in networks
@@ -308,7 +306,7 @@ def histories_of(dataset):
     trained = [m for m in methods_of(dataset) if HISTORY in m.storage.diagnostics]
     return {
         str(
-            fits.path_beside(m, model_of(m, dataset, split, reference), HISTORY)
+            fit_files.path_beside(m, model_of(m, dataset, split, reference), HISTORY)
         ): ", ".join([dataset, split, reference] + [m.look.label] * (len(trained) > 1))
         for m in trained
         for split, reference in networks_of(dataset)

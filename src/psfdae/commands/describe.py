@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
-from psfdae.cli import command
+from psfdae.base.options import File
+from psfdae.commands.cli import command
 from psfdae.image.errors import one_line
 from psfdae.methods import method
+from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.model.bundle import Bundle, estimator, read_bundle
-from psfdae.options import File
 
 
 @command("describe")

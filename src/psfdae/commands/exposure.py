@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from psfdae.cli import command
+from psfdae.base.options import File
+from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.psf_model import load_model
-from psfdae.options import File
 
 
 @command("exposure")

@@ -10,12 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from psfdae import fits
-from psfdae.cli import command, typed_words
-from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
-from psfdae.commands.predict import write_list
-from psfdae.errors import Error
-from psfdae.files import (
+from psfdae.base.errors import Error
+from psfdae.base.files import (
     atomic_path,
     check_outputs,
     write_bytes,
@@ -23,11 +19,17 @@ from psfdae.files import (
     write_product,
     write_text,
 )
+from psfdae.base.options import File, Folder
+from psfdae.base.settings import ConfigError, as_overrides
+from psfdae.commands.cli import command, typed_words
+from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
+from psfdae.commands.predict import write_list
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
-from psfdae.method import Method
+from psfdae.methods import fit_files as fits
 from psfdae.methods import method
+from psfdae.methods.interface import Method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
 from psfdae.model.fitting import (
@@ -47,8 +49,6 @@ from psfdae.model.settings import (
 )
 from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
-from psfdae.options import File, Folder
-from psfdae.settings import ConfigError, as_overrides
 
 
 class FolderError(Error, RuntimeError):

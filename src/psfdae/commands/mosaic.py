@@ -15,12 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.cli import refusal
-from psfdae.errors import Error
+from psfdae.base.errors import Error
+from psfdae.base.threads import available_cores
+from psfdae.commands.cli import refusal
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
 from psfdae.image.positions import require_sky
-from psfdae.threads import available_cores
 
 if TYPE_CHECKING:
     from psfdae.image.image_input import ImageStatements

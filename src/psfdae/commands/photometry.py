@@ -6,14 +6,14 @@ from typing import Annotated
 
 import numpy as np
 
-from psfdae.cli import command
+from psfdae.base.files import write_fits
+from psfdae.base.options import File
+from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
-from psfdae.files import write_fits
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import SUFFIXES, write_table
 from psfdae.model.exchange import load_field
 from psfdae.model.image_photometry import PhotometryError, photometry_of_image
-from psfdae.options import File
 
 
 @command("photometry")

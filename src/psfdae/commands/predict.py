@@ -15,10 +15,12 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.cli import command
+from psfdae.base.figures import write_png
+from psfdae.base.files import atomic_path, check_outputs
+from psfdae.base.options import File
+from psfdae.base.progress import silence
+from psfdae.commands.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
-from psfdae.figures import write_png
-from psfdae.files import atomic_path, check_outputs
 from psfdae.image.fits_file import Card
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
@@ -29,8 +31,6 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.image_prediction import notes_on_model, offsets_from_list, open_for_model
 from psfdae.model.prediction import prediction_file
 from psfdae.model.psf_model import PsfModel, load_model
-from psfdae.options import File
-from psfdae.progress import silence
 
 
 def write_list(observation: Observation, path: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.cli import command
+from psfdae.base.options import File
+from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.model import exchange
 from psfdae.model.exchange import load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
-from psfdae.options import File
 
 
 @command("psf")

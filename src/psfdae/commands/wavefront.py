@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import click
 import numpy as np
 
-from psfdae.cli import command
+from psfdae.base.figures import write_png
+from psfdae.base.files import write_fits
+from psfdae.base.options import File
+from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
-from psfdae.figures import write_png
-from psfdae.files import write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import central_pixel
 from psfdae.model.psf_model import SCALE_TOLERANCE
-from psfdae.options import File
 from psfdae.sensing.output import report_lines, wavefront_hdus
 from psfdae.sensing.results import Wavefronts
 from psfdae.sensing.results import wavefront as measure_wavefronts

@@ -16,7 +16,7 @@ import numpy as np
 
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, pixel_noise
-from psfdae.moments import robust_scatter
+from psfdae.stars.moments import robust_scatter
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header

@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, sky_level
 from psfdae.image.source_size import measure_size
-from psfdae.moments import FWHM_OF_SIGMA
+from psfdae.stars.moments import FWHM_OF_SIGMA
 
 
 @dataclass(frozen=True)

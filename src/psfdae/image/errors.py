@@ -11,7 +11,7 @@ from traceback import walk_tb
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 
 
 def one_line(text: object) -> str:

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
-from psfdae.errors import did_you_mean
+from psfdae.base.errors import did_you_mean
+from psfdae.base.options import Extension, File
 from psfdae.image.containers import as_image, in_unit
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import PlainFile
 from psfdae.image.positions import require_sky
-from psfdae.options import Extension, File
 
 if TYPE_CHECKING:
     from astropy.units import Quantity

@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.image.detection import Sky
 from psfdae.image.stamps import central_pixel, cut_image
-from psfdae.moments import robust_scatter, windowed_centres
+from psfdae.stars.moments import robust_scatter, windowed_centres
 
 TOLERANCE_PX = 0.1
 """Largest difference, per axis, of the median offset from 0 (origin 0) or −1 (origin 1); standard

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 
 
 class ColumnError(Error, ValueError):

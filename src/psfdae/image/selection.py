@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut, sky_around
@@ -30,10 +29,11 @@ from psfdae.image.star_criteria import (
     stamp_snr,
     wider_than_stars,
 )
-from psfdae.moments import FWHM_OF_SIGMA, shift_stamps, windowed_centres
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import FWHM_OF_SIGMA, shift_stamps, windowed_centres
 
 if TYPE_CHECKING:
-    from psfdae.settings import CalibrationStars, Stamp
+    from psfdae.base.settings import CalibrationStars, Stamp
 
 
 class CalibrationStarsError(Error, ValueError):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psfdae.image.stamps import cut_image
-from psfdae.moments import FWHM_OF_SIGMA, robust_scatter, windowed_centres
+from psfdae.stars.moments import FWHM_OF_SIGMA, robust_scatter, windowed_centres
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from psfdae.moments import FWHM_OF_SIGMA
+from psfdae.stars.moments import FWHM_OF_SIGMA
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Pixels

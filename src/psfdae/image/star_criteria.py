@@ -12,7 +12,7 @@ from itertools import repeat
 import numpy as np
 
 from psfdae.image.stamps import cut, peaks, softened
-from psfdae.moments import robust_scatter
+from psfdae.stars.moments import robust_scatter
 
 # Brightness.
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.files import atomic_path
+from psfdae.base.files import atomic_path
 from psfdae.image.containers import fits_unit
 from psfdae.image.errors import ascii_line, no_formula, silent
 

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.files import Column
+from psfdae.base.files import Column
 from psfdae.image.stamps import cut
 from psfdae.image.star_criteria import brightest_pixels
-from psfdae.moments import shift_stamps
-from psfdae.splits import draw_jitter, draw_phase
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import shift_stamps
+from psfdae.stars.splits import draw_jitter, draw_phase
 
 if TYPE_CHECKING:
-    from psfdae.settings import Parts, Stamp
+    from psfdae.base.settings import Parts, Stamp
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:

@@ -14,9 +14,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from psfdae.files import ProductError
-from psfdae.joined import joined
-from psfdae.method import Method
+from psfdae.base.files import ProductError
+from psfdae.base.joined import joined
+from psfdae.methods.interface import Method
 
 
 def method(name: str) -> type[Method]:
@@ -60,9 +60,11 @@ def _of_module(module: str) -> type[Method] | None:
     """Return the method that a module defines; None if it defines none, or is absent."""
     if not (module.rpartition(".")[2].isidentifier() and find_spec(module)):
         return None
-    # Classes that it defines itself; those that it imports are of other modules.
+    # Classes that it defines itself; those that it imports are of other modules. The base class of
+    # all methods is none.
     classes = [value for value in vars(import_module(module)).values() if isinstance(value, type)]
-    methods = [c for c in classes if issubclass(c, Method) and c.__module__ == module]
+    classes = [c for c in classes if issubclass(c, Method) and c is not Method]
+    methods = [c for c in classes if c.__module__ == module]
     return methods[0] if methods else None
 
 

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from psfdae.files import as_yaml, write_text
-from psfdae.method import (
+from psfdae.base.files import as_yaml, write_text
+from psfdae.base.reading import from_tree, read_yaml
+from psfdae.base.settings import Config, deciding
+from psfdae.methods.interface import (
     CONFIG,
     HISTORY,
     FitError,
@@ -21,14 +23,12 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
-from psfdae.networks.settings import DaeSettings, Train
-from psfdae.reading import from_tree, read_yaml
-from psfdae.settings import Config, deciding
+from psfdae.methods.networks.settings import DaeSettings, Train
 
 if TYPE_CHECKING:
-    from psfdae.bundle_info import BundleInfo
-    from psfdae.networks.dae import DaeNetwork
-    from psfdae.settings import Evaluation
+    from psfdae.base.settings import Evaluation
+    from psfdae.methods.bundle_info import BundleInfo
+    from psfdae.methods.networks.dae import DaeNetwork
 
 WEIGHTS = "dae.safetensors"
 
@@ -83,13 +83,13 @@ class Dae(Method):
         Raises
         ------
         TrainingError
-            As `psfdae.networks.training.train`.
+            As `psfdae.methods.networks.training.train`.
         FitError
             If it is to go on from a network of another shape or scale of images.
         """
-        from psfdae.networks import training as loop
-        from psfdae.networks.dae import DaeNetwork, DaeTraining
-        from psfdae.networks.weights import channels_last
+        from psfdae.methods.networks import training as loop
+        from psfdae.methods.networks.dae import DaeNetwork, DaeTraining
+        from psfdae.methods.networks.weights import channels_last
 
         # All that decides the result: settings, seed, noise, and the stars themselves.
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
@@ -130,19 +130,19 @@ class Dae(Method):
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
-        from psfdae.networks.dae import run_network
+        from psfdae.methods.networks.dae import run_network
 
         return run_network(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
 
     def factor(self, stamp_px: int) -> float:
         """Return the factor from images of sum 1 to those that the network sees."""
-        from psfdae.networks.dae import image_scale
+        from psfdae.methods.networks.dae import image_scale
 
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
-        from psfdae.networks.weights import save_weights
+        from psfdae.methods.networks.weights import save_weights
 
         # The configuration is part of the weights' file, too, as metadata.
         save_weights(place / WEIGHTS, self.network.state_dict(), described)
@@ -155,9 +155,9 @@ class Dae(Method):
         """Read a network; the two files must be of the same training."""
         import torch
 
-        from psfdae.networks.dae import DaeNetwork
-        from psfdae.networks.weights import with_weights
-        from psfdae.settings import parse_settings
+        from psfdae.base.settings import parse_settings
+        from psfdae.methods.networks.dae import DaeNetwork
+        from psfdae.methods.networks.weights import with_weights
 
         described, batch = cls.described(place), 256
         # The shape of the network is in its configuration, its weights are beside it.
@@ -194,8 +194,8 @@ class Dae(Method):
         """The network of a bundle, which takes as many images at once as memory should hold."""
         import torch
 
-        from psfdae.networks.dae import DaeNetwork
-        from psfdae.networks.weights import channels_last
+        from psfdae.methods.networks.dae import DaeNetwork
+        from psfdae.methods.networks.weights import channels_last
 
         assert info.dae is not None and info.image_scale is not None
         # Copies, because torch would share memory with arrays that may be read-only.

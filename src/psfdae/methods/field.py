@@ -13,8 +13,16 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.method import (
+from psfdae.base.rng import stream
+from psfdae.methods.field_errors import draw_field_stars, flux_error_over_field
+from psfdae.methods.field_fit import FieldFit, FieldUncertainty
+from psfdae.methods.field_law import FieldLaw, FieldSettings
+from psfdae.methods.field_nodes import node_step
+from psfdae.methods.field_pairs import FieldStamps
+from psfdae.methods.field_posterior import log_node_prior, posterior_of_stamps
+from psfdae.methods.field_residuals import MARGIN_PX, residual_covariance
+from psfdae.methods.field_search import fit_field, refit_field
+from psfdae.methods.interface import (
     Estimate,
     FitError,
     Look,
@@ -25,17 +33,9 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
-from psfdae.methods.field_errors import draw_field_stars, flux_error_over_field
-from psfdae.methods.field_fit import FieldFit, FieldUncertainty
-from psfdae.methods.field_law import FieldLaw, FieldSettings
-from psfdae.methods.field_nodes import node_step
-from psfdae.methods.field_pairs import FieldStamps
-from psfdae.methods.field_posterior import log_node_prior, posterior_of_stamps
-from psfdae.methods.field_residuals import MARGIN_PX, residual_covariance
-from psfdae.methods.field_search import fit_field, refit_field
-from psfdae.moments import measure_shapes
-from psfdae.noise import NoiseModel
-from psfdae.rng import stream
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import measure_shapes
+from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
+from psfdae.base.progress import Advance
 from psfdae.methods.field_spline import (
     FieldModel,
     adjust_stars,
@@ -28,8 +28,8 @@ from psfdae.methods.field_spline import (
     solve_splines,
     spacing_of,
 )
-from psfdae.moments import cubic_splines, robust_scatter, windowed_centres
-from psfdae.progress import Advance
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import cubic_splines, robust_scatter, windowed_centres
 
 
 @dataclass(frozen=True)

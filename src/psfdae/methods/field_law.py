@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from psfdae.base.settings import Count, Fraction, Group, Positive
 from psfdae.methods.field_nodes import Node, NodeAxes, Residuals, lattice_nodes
 from psfdae.methods.field_residuals import MARGIN_PX, phase_of, phases_of
 from psfdae.methods.field_spline import STAR_TERMS, FieldModel, spacing_of
-from psfdae.noise import NoiseModel
-from psfdae.settings import Count, Fraction, Group, Positive
+from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.methods.field_law import FieldLaw
-from psfdae.mixing import FLUX_SIGMA
+from psfdae.methods.mixing import FLUX_SIGMA
 
 
 class FieldStamps(NamedTuple):

@@ -23,7 +23,7 @@ import numpy as np
 
 from psfdae.methods.field_law import FieldLaw
 from psfdae.methods.field_pairs import FieldStamps, PairFit, Pairs, fit_pairs, project_pairs
-from psfdae.mixing import FLUX_SIGMA, mixing_weights
+from psfdae.methods.mixing import FLUX_SIGMA, mixing_weights
 
 
 class StarPosterior(NamedTuple):

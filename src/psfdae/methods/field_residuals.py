@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.moments import moving_matrices
-from psfdae.progress import steps
+from psfdae.base.progress import steps
+from psfdae.stars.moments import moving_matrices
 
 MARGIN_PX = 2
 """Width in pixels of the margin around a stamp in which field and residuals are known as well."""

@@ -19,11 +19,11 @@ from functools import partial
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
+from psfdae.base.progress import task
 from psfdae.methods.field_errors import field_uncertainty, left_out_error
 from psfdae.methods.field_fit import FieldFit, FieldFitter, FitOptions, FitSettings
 from psfdae.methods.field_spline import FieldModel, knots_of, spacing_of
-from psfdae.progress import task
+from psfdae.stars.bright_stars import BrightStars
 
 
 def fit_field(

@@ -19,7 +19,7 @@ from math import isqrt
 
 import numpy as np
 
-from psfdae.moments import cubic_splines
+from psfdae.stars.moments import cubic_splines
 
 STAR_TERMS = 2
 """Number of terms, powers from the first on, of the magnitude and of the colour."""

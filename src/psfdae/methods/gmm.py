@@ -14,17 +14,26 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.method import Estimate, FitError, Look, Method, Needs, Packing, Storage, TrainingSet
+from psfdae.base.settings import Count, Group, Positive
+from psfdae.methods.interface import (
+    Estimate,
+    FitError,
+    Look,
+    Method,
+    Needs,
+    Packing,
+    Storage,
+    TrainingSet,
+)
+from psfdae.methods.mixing import FLUX_SIGMA
 from psfdae.methods.mixture_densities import cluster_weights, star_batches
 from psfdae.methods.mixture_fit import best_on_validation, k_means, mixture_arrays
 from psfdae.methods.mixture_law import MixtureLaw
 from psfdae.methods.mixture_posterior import flux_factor, posterior_mean
-from psfdae.mixing import FLUX_SIGMA
-from psfdae.noise import NoiseModel
-from psfdae.settings import Count, Group, Positive
+from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:
-    from psfdae.bundle_info import BundleInfo
+    from psfdae.methods.bundle_info import BundleInfo
 
 
 class Gmm(Group):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from psfdae.method import Look, Needs
 from psfdae.methods.gmm import GaussianMixture
+from psfdae.methods.interface import Look, Needs
 
 
 @dataclass(frozen=True, eq=False)

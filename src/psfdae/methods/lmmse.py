@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.method import Look, Method, Needs, TrainingSet
-from psfdae.noise import NoiseModel
+from psfdae.methods.interface import Look, Method, Needs, TrainingSet
+from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True)

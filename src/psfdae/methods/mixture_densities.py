@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.methods.gaussians import NoisyCovariance
+from psfdae.methods.mixing import mixing_weights
 from psfdae.methods.mixture_law import MixtureLaw
-from psfdae.mixing import mixing_weights
 
 
 class StarBatch(NamedTuple):

@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfdae.method import Method, TrainingSet
-from psfdae.progress import task
-from psfdae.rng import stream
+from psfdae.base.progress import task
+from psfdae.base.rng import stream
+from psfdae.methods.interface import Method, TrainingSet
 
 Number = TypeVar("Number", bound=float)
 

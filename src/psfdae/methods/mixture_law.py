@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from psfdae.base.rng import stream
 from psfdae.methods.clusters import Cluster, ClusterInverses, without_slope
-from psfdae.noise import NoiseModel
-from psfdae.rng import stream
+from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.method import Look, Method, TrainingSet
+from psfdae.methods.interface import Look, Method, TrainingSet
 
 
 class Noisy(Method):

@@ -28,17 +28,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
-from psfdae.errors import Error, needed_by
-from psfdae.files import ProductError, atomic_path
+from psfdae.base.errors import Error, needed_by
+from psfdae.base.files import ProductError, atomic_path
+from psfdae.base.version import __version__
 from psfdae.image.errors import one_line
-from psfdae.method import Method
 from psfdae.methods import method
+from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
+from psfdae.methods.interface import Method
+from psfdae.methods.networks.weights import digest_of
 from psfdae.model.error_model import ErrorModel
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.wings import Wings
-from psfdae.networks.weights import digest_of
-from psfdae.version import __version__
 
 SUFFIX = ".psf.safetensors"
 """End of the name of a bundle."""
@@ -214,7 +214,7 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
 
 def shipped_path() -> Path:
     """Return the file of the bundle that comes with the package."""
-    return Path(str(files("psfdae") / "bundles" / f"wfsat{SUFFIX}"))
+    return Path(str(files("psfdae.model") / "bundles" / f"wfsat{SUFFIX}"))
 
 
 def read_bundle(path: Path | None = None) -> Bundle:

@@ -16,10 +16,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.files import Product
+from psfdae.base.files import Product
+from psfdae.base.progress import steps
+from psfdae.base.rng import stream
 from psfdae.image.stamps import StarFlag
-from psfdae.method import Method
+from psfdae.methods.interface import Method
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import (
     ErrorModel,
@@ -33,9 +34,8 @@ from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.restoration import SNR_TOLERANCE
 from psfdae.model.star_sets import field_positions, own_noise
-from psfdae.noise import NoiseModel
-from psfdae.progress import steps
-from psfdae.rng import stream
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.noise import NoiseModel
 
 NODES = 8
 """Noise levels at which errors are measured, equidistant in the logarithm."""

@@ -18,13 +18,13 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
-from psfdae.files import atomic_path, write_fits
+from psfdae.base.files import atomic_path, write_fits
+from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line, reading
 from psfdae.image.fits_file import BLOCK_BYTES, Card, open_hdus, plain_file
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model
-from psfdae.moments import measure_shapes
-from psfdae.version import __version__
+from psfdae.stars.moments import measure_shapes
 
 
 def load_field(path: Path) -> FieldPsfs:

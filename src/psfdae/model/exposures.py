@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
+from psfdae.base.version import __version__
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
@@ -19,7 +19,7 @@ from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import of_config
 from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
 from psfdae.model.stars import Stars
-from psfdae.version import __version__
+from psfdae.stars.bright_stars import BrightStars
 
 
 def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, str]:

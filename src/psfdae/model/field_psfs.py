@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.model.image_photometry import ImageFluxes
-from psfdae.moments import measure_shapes
+from psfdae.stars.moments import measure_shapes
 
 if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel

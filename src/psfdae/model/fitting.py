@@ -8,11 +8,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfdae.errors import needed_by
-from psfdae.fits import described_by
-from psfdae.method import Method
+from psfdae.base.errors import needed_by
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
+from psfdae.base.threads import fixed_threads
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
+from psfdae.methods.fit_files import described_by
+from psfdae.methods.interface import Method
 from psfdae.model.packing import model_of, with_wings
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
@@ -20,9 +23,6 @@ from psfdae.model.star_choice import ENOUGH_STARS
 from psfdae.model.star_sets import field_positions, fit_apart, noise_model
 from psfdae.model.stars import Stars
 from psfdae.model.wings import Wings, wings_of_stars
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
-from psfdae.threads import fixed_threads
 
 Kind = TypeVar("Kind", bound=Method)
 

@@ -28,7 +28,7 @@ from typing import ClassVar
 import numpy as np
 
 from psfdae.image.stamps import StarFlag, raise_flag
-from psfdae.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD
 
 NOISE_FLOOR = 1e-6
 """Least σ in units of a typical pixel of the star, as images may have no noise."""

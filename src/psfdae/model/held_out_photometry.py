@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.image.tables import table_of_rows
-from psfdae.metrics import clustered_mean
+from psfdae.methods.metrics import clustered_mean
 from psfdae.model.calibration import COVERAGE
 from psfdae.model.flux_model import signal_to_noise
 from psfdae.model.star_sets import field_positions, own_noise, star_area

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.image_input import ImageInput
@@ -322,7 +322,7 @@ def measure_zero_point(
     """
     from scipy.spatial import cKDTree
 
-    from psfdae.moments import robust_scatter
+    from psfdae.stars.moments import robust_scatter
 
     # Stars of the image with a flux above 0, and reference stars with position and magnitude.
     stars = measured.stars

@@ -17,7 +17,7 @@ import numpy as np
 
 from psfdae.image.stamps import border_pixels
 from psfdae.model.flux_model import NOISE_FLOOR, FluxModel
-from psfdae.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD
 
 
 class ModesFit(NamedTuple):

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut_image

@@ -15,10 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.bundle_info import BundleInfo
-from psfdae.files import Product, ProductError
-from psfdae.method import Method
-from psfdae.metrics import all_metrics
+from psfdae.base.files import Product, ProductError
+from psfdae.base.rng import stream
+from psfdae.base.settings import OfTest
+from psfdae.base.version import __version__
+from psfdae.methods.bundle_info import BundleInfo
+from psfdae.methods.interface import Method
+from psfdae.methods.metrics import all_metrics
 from psfdae.model.bundle import Bundle, BundleError, creation_date, estimator
 from psfdae.model.calibration import (
     HeldOutStars,
@@ -41,9 +44,6 @@ from psfdae.model.star_sets import (
     star_area,
 )
 from psfdae.model.wings import Wings
-from psfdae.rng import stream
-from psfdae.settings import OfTest
-from psfdae.version import __version__
 
 
 def model_of(
@@ -289,7 +289,7 @@ def metrics_by_level(
     area : float
         Noise-equivalent area of a typical star, in pixels.
     data_range : float
-        Range of values of the metrics (`psfdae.metrics.all_metrics`).
+        Range of values of the metrics (`psfdae.methods.metrics.all_metrics`).
 
     Returns
     -------

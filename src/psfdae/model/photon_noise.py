@@ -18,7 +18,7 @@ import numpy as np
 
 from psfdae.image.camera import CameraValue
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD
 
 if TYPE_CHECKING:
     from psfdae.image.observation import Observation

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figures import WIDTH_IN, new_figure, styled
+from psfdae.base.figures import WIDTH_IN, new_figure, styled
 from psfdae.image.stamps import StarFlag
 
 if TYPE_CHECKING:

@@ -22,13 +22,13 @@ from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from psfdae.bundle_info import FORMAT_VERSION
-from psfdae.files import atomic_path
+from psfdae.base.files import atomic_path
+from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
 from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import COLUMNS, as_fits, fits_values, html_table, star_table
-from psfdae.version import __version__
+from psfdae.methods.bundle_info import FORMAT_VERSION
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -63,7 +63,7 @@ class Prediction:
         - `distance`: from the training set (`psfdae.model.error_model.mahalanobis`)
         - `outlier_score`: −2 ln of the probability density of the star by the model's own law of
           stars, in its leading components; NaN where it has no law
-        - `fwhm_px`, `ellipticity`, `position_angle_deg`: of the PSF (`psfdae.moments`)
+        - `fwhm_px`, `ellipticity`, `position_angle_deg`: of the PSF (`psfdae.stars.moments`)
         - `x_fit`, `y_fit`: centre of the star, in the image where the star was cut from one, else
           in its stamp; NaN if the model's method measures none, and so are its errors, that of the
           sky, and the correlations `corr_*` of two errors each

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from psfdae.bundle_info import BundleInfo
+from psfdae.base.progress import task
+from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
-from psfdae.method import Method
+from psfdae.methods.bundle_info import BundleInfo
+from psfdae.methods.interface import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.image_prediction import WholeImages
@@ -25,8 +27,6 @@ from psfdae.model.prediction import Prediction
 from psfdae.model.restoration import Restorer
 from psfdae.model.stamp_arrays import stamps_of_arrays
 from psfdae.model.wings import Wings
-from psfdae.progress import task
-from psfdae.threads import available_cores, in_order, one_thread_each, side_by_side
 
 if TYPE_CHECKING:
     pass

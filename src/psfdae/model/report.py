@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.figures import as_png
+from psfdae.base.figures import as_png
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import html_table

@@ -13,7 +13,7 @@ import numpy as np
 
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.methods import method as method_of
-from psfdae.moments import measure_shapes, shift_stamps
+from psfdae.stars.moments import measure_shapes, shift_stamps
 
 if TYPE_CHECKING:
     from astropy.table import Table

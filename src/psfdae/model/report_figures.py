@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled
 from psfdae.model.plot import has_shape
 from psfdae.model.report_checks import MEAN_PSF, method_labels, nearest_snr, size_errors
 

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psfdae.bright_stars import magnitude
 from psfdae.image.stamps import (
     Stamps,
     StarFlag,
@@ -28,14 +27,15 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import Method, Packing
+from psfdae.methods.interface import Method, Packing
 from psfdae.model.bundle import Bundle
 from psfdae.model.error_model import ErrorModel, mahalanobis
 from psfdae.model.flux_model import NOISE_FLOOR, FluxModel, Photometry, is_faint
 from psfdae.model.photometry import Photometer
 from psfdae.model.prediction import Prediction
 from psfdae.model.wings import Wings, outer_shares
-from psfdae.moments import measure_shapes
+from psfdae.stars.bright_stars import magnitude
+from psfdae.stars.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
 """Factor by which a star may be beyond the S/N of the training: its S/N is no better known."""

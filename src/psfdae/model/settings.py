@@ -2,7 +2,7 @@
 
 A word of a command line is `group.key=value`. A word that chooses a file of a configuration, such
 as `train=onecycle` or `preset=smoke`, is read by the extra "paper", by its entry point of the group
-"psfdae.settings".
+"psfdae.base.settings".
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import Any, ClassVar
 
 from pydantic import Field, create_model, model_validator
 
-from psfdae.errors import did_you_mean
-from psfdae.joined import joined
-from psfdae.methods import MethodNames, all_methods
-from psfdae.reading import read_yaml
-from psfdae.settings import (
+from psfdae.base.errors import did_you_mean
+from psfdae.base.joined import joined
+from psfdae.base.reading import read_yaml
+from psfdae.base.settings import (
     CalibrationStars,
     ConfigError,
     Evaluation,
@@ -31,6 +30,7 @@ from psfdae.settings import (
     keys_of,
     parse_settings,
 )
+from psfdae.methods import MethodNames, all_methods
 
 DATASET_CHOICE = "dataset=from_stars"
 """Word that chooses the files of the configuration with the same values as these defaults."""
@@ -137,7 +137,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
 
 @dataclass(frozen=True)
 class SettingsReader:
-    """Reader of the settings of a command; see `psfdae.cli.Reader`."""
+    """Reader of the settings of a command; see `psfdae.commands.cli.Reader`."""
 
     choice: tuple[str, ...] = ()
 

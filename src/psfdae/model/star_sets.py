@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars, places
-from psfdae.files import Product, ProductError, read_product
-from psfdae.fits import learnt
-from psfdae.method import Method, TrainingSet
-from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
-from psfdae.rng import stream
-from psfdae.settings import Config, OfFit, WithNoise
-from psfdae.splits import Split, held_out_split, random_split
+from psfdae.base.files import Product, ProductError, read_product
+from psfdae.base.rng import stream
+from psfdae.base.settings import Config, OfFit, WithNoise
+from psfdae.methods.fit_files import learnt
+from psfdae.methods.interface import Method, TrainingSet
+from psfdae.stars.bright_stars import BrightStars, places
+from psfdae.stars.noise import NoiseModel, OwnNoise, noise_equivalent_px
+from psfdae.stars.splits import Split, held_out_split, random_split
 
 
 def read_stars(path: Path, *references: str) -> Product:

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.files import Column, Product
+from psfdae.base.files import Column, Product
+from psfdae.base.rng import stream
+from psfdae.base.settings import Noise
 from psfdae.image.containers import as_images
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
@@ -33,16 +34,15 @@ from psfdae.model.star_choice import (
     require_unique_names,
 )
 from psfdae.model.star_sets import split_stars, training_set
-from psfdae.rng import stream
-from psfdae.settings import Noise
-from psfdae.splits import Split, held_out_fields
+from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.splits import Split, held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
-    from psfdae.method import Method, TrainingSet
+    from psfdae.methods.interface import Method, TrainingSet
     from psfdae.model.wings import Wings
 
 

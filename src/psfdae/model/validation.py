@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
-from psfdae.files import write_text
+from psfdae.base.figures import StripRow, as_png, restoration_strip, spread_stars
+from psfdae.base.files import write_text
+from psfdae.base.progress import steps
+from psfdae.base.threads import fixed_threads
 from psfdae.image.tables import table_of_rows
-from psfdae.method import Method
 from psfdae.methods import method as method_of
-from psfdae.metrics import all_metrics, mse, quality, summarised
+from psfdae.methods.interface import Method
+from psfdae.methods.metrics import all_metrics, mse, quality, summarised
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.flux_model import signal_to_noise
 from psfdae.model.held_out_photometry import measure_photometry
@@ -42,8 +44,6 @@ from psfdae.model.star_sets import (
     star_area,
 )
 from psfdae.model.stars import Stars
-from psfdae.progress import steps
-from psfdae.threads import fixed_threads
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -29,8 +29,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from psfdae.base.threads import side_by_side
 from psfdae.optics.pupil import Pupil
-from psfdae.threads import side_by_side
 
 if TYPE_CHECKING:
     from torch import Tensor

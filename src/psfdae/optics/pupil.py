@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 
 
 @dataclass(frozen=True)

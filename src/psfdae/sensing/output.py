@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line
 from psfdae.image.tables import fits_values
 from psfdae.sensing.joint import Joint
 from psfdae.sensing.results import Wavefronts
-from psfdae.version import __version__
 
 if TYPE_CHECKING:
     from astropy.io.fits import HDUList

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.figures import WIDTH_IN, new_figure, styled
+from psfdae.base.figures import WIDTH_IN, new_figure, styled
 from psfdae.sensing.results import Wavefronts, flat_modes
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.progress import steps
+from psfdae.base.progress import steps
 
 
 class Chains(NamedTuple):

@@ -17,16 +17,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
-from psfdae.errors import Error
+from psfdae.base.errors import Error
+from psfdae.base.progress import task
+from psfdae.base.rng import stream
 from psfdae.image.stamps import Stamps, border_median, border_scatter
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
-from psfdae.progress import task
-from psfdae.rng import stream
 from psfdae.sensing.climbing import Evaluation, Steps, climb, group_maximum, poisson_information
 from psfdae.sensing.sampling import sample_around
+from psfdae.stars.bright_stars import BrightStars
 from psfdae.telescope.field import Terms
 from psfdae.telescope.settings import OwnTelescope
 

@@ -23,8 +23,8 @@ from pydantic import (
     model_validator,
 )
 
+from psfdae.base.settings import Finite, Group, Name, Positive
 from psfdae.optics.wavefronts import SEIDEL_TERMS
-from psfdae.settings import Finite, Group, Name, Positive
 
 HIGHEST_NOLL = 45
 """Highest Noll index of a term, the last one of radial order 8."""

@@ -17,7 +17,8 @@ from functools import partial
 
 import numpy as np
 
-from psfdae.errors import needed_by
+from psfdae.base.errors import needed_by
+from psfdae.base.settings import ConfigError
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,
     SEIDEL_TERMS,
@@ -28,7 +29,6 @@ from psfdae.optics.wavefronts import (
     noll_to_nm,
     zernike_images,
 )
-from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 from psfdae.telescope.settings import OwnTelescope
 

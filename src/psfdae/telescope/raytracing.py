@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_images
 
 if TYPE_CHECKING:

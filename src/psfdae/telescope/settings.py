@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from psfdae.base.reading import read_yaml
+from psfdae.base.settings import ConfigError, Fraction, Group, Name, Positive, parse_settings
 from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
-from psfdae.reading import read_yaml
-from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, parse_settings
 from psfdae.telescope.aberrations import Jitter, OmitsLateKeys, Raytraced, Seidel, Zernike
 
 

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfdae.noise import NoiseModel
 from psfdae.sensing.climbing import (
     Evaluation,
     Peaks,
@@ -31,6 +30,7 @@ from psfdae.sensing.climbing import (
     combine_images,
     poisson_information,
 )
+from psfdae.stars.noise import NoiseModel
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel, twin_states
 from psfdae_paper.configuration.alignment import Fit

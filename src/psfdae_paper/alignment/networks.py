@@ -21,10 +21,10 @@ import torch
 from scipy.linalg import eigh
 from torch import nn
 
-from psfdae.networks.training import Row, Training
-from psfdae.networks.weights import channels_last
-from psfdae.noise import NoiseModel, mixed_levels
-from psfdae.rng import stream
+from psfdae.base.rng import stream
+from psfdae.methods.networks.training import Row, Training
+from psfdae.methods.networks.weights import channels_last
+from psfdae.stars.noise import NoiseModel, mixed_levels
 from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
 from psfdae_paper.configuration.alignment import Cnn, NetworkTrain, Perceptron
 

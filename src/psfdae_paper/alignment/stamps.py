@@ -13,7 +13,7 @@ from math import prod
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,

@@ -22,7 +22,7 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from psfdae.errors import Error
+from psfdae.base.errors import Error
 from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import RayTracingError, ZernikeTracer, build_optic

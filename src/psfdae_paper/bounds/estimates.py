@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
-from psfdae.files import Column, Product
-from psfdae.metrics import mse
+from psfdae.base.files import Column, Product
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
+from psfdae.methods.metrics import mse
 from psfdae.model.star_sets import noisy_test_images, split_stars
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Seidel
 from psfdae_paper.bounds.mode_search import climb, search
 from psfdae_paper.bounds.modes import Knowledge, Modes, separate

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.metrics import clustered_mean
+from psfdae.methods.metrics import clustered_mean
 
 
 def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from psfdae.noise import NoiseModel
+from psfdae.stars.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.files import Product, ProductError
+from psfdae.base.files import Product, ProductError
 from psfdae.methods import method as method_named
-from psfdae.metrics import clustered_mean, mse
+from psfdae.methods.metrics import clustered_mean, mse
 from psfdae.model.star_sets import noise_model
 from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae_paper.bounds.estimates import (

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.metrics import clustered_mean
+from psfdae.methods.metrics import clustered_mean
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from psfdae.method import Look
+from psfdae.methods.interface import Look
 
 
 @dataclass(frozen=True)

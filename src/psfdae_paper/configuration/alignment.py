@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from psfdae.settings import CheckpointSeconds, Count, Group, Positive
+from psfdae.base.settings import CheckpointSeconds, Count, Group, Positive
 
 
 class Alignment(Group):

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from psfdae.settings import ConfigError
+from psfdae.base.settings import ConfigError
 
 SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)]
 """Search distance in λ/D. Products do not contain it, but the distance in pixels that follows."""

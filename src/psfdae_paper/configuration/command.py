@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from psfdae import cli
-from psfdae.settings import ConfigError
+from psfdae.base.settings import ConfigError
+from psfdae.commands import cli
 
 if TYPE_CHECKING:
     from psfdae_paper.configuration.schema import Config
@@ -79,7 +79,7 @@ def command(
 ) -> Callable[[Function], Function]:
     """Make a function the command `name`; its `config` has groups of the configuration.
 
-    See `psfdae.cli.command`, and `Groups` for `reads` and `choice`.
+    See `psfdae.commands.cli.command`, and `Groups` for `reads` and `choice`.
     """
     # The command line calls `Groups` with the options, the file and the words that are left.
     return cli.command(name, Groups(reads, choice))

@@ -21,10 +21,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from psfdae.errors import did_you_mean
-from psfdae.files import ProductError, write_text
-from psfdae.reading import parse_yaml
-from psfdae.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
+from psfdae.base.errors import did_you_mean
+from psfdae.base.files import ProductError, write_text
+from psfdae.base.reading import parse_yaml
+from psfdae.base.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
 from psfdae_paper.configuration.aligners import trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir

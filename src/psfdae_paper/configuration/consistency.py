@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError, create_model, model_validator
 
-from psfdae.settings import Group
+from psfdae.base.settings import Group
 from psfdae.telescope.settings import Telescope, has_own_aberrations
 from psfdae_paper.configuration.base import search_distance
 

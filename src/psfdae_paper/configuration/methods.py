@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
-from psfdae.files import ProductError
-from psfdae.method import Method
+from psfdae.base.files import ProductError
+from psfdae.base.reading import parse_yaml
+from psfdae.base.settings import ConfigError
 from psfdae.methods import all_methods, method
-from psfdae.reading import parse_yaml
-from psfdae.settings import ConfigError
+from psfdae.methods.interface import Method
 from psfdae_paper.configuration.base import config_dir
 
 

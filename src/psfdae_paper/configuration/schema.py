@@ -15,10 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, create_model, field_validator, model_validator
 
-from psfdae.method import Method
-from psfdae.methods import MethodNames
-from psfdae.networks.settings import DaeSettings, Train
-from psfdae.settings import (
+from psfdae.base.settings import (
     CalibrationStars,
     Count,
     Evaluation,
@@ -32,6 +29,9 @@ from psfdae.settings import (
     SplitKind,
     Stamp,
 )
+from psfdae.methods import MethodNames
+from psfdae.methods.interface import Method
+from psfdae.methods.networks.settings import DaeSettings, Train
 from psfdae.telescope.aberrations import Prescription, Seidel
 from psfdae.telescope.settings import AnyTelescope
 from psfdae_paper.configuration.aligners import trained_networks

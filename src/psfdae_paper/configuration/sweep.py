@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import groups_of, method
-from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from psfdae.settings import Group, Positive
+from psfdae.base.settings import Group, Positive
 
 
 class VonKarman(Group):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation import drawing

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import (
+from psfdae.base.figures import (
     SERIES_COLORS,
     WIDTH_IN,
     StripRow,
@@ -21,8 +21,8 @@ from psfdae.figures import (
     new_figure,
     styled,
 )
-from psfdae.method import Method
 from psfdae.methods import method
+from psfdae.methods.interface import Method
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Panel, Style

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from psfdae.metrics import clustered_mean, clustered_ratio
+from psfdae.methods.metrics import clustered_mean, clustered_ratio
 from psfdae_paper.evaluation.measure import CELL
 
 SIGNIFICANT = 3.0
@@ -47,7 +47,7 @@ def config_differences(
     Parameters
     ----------
     first, second : mapping
-        Flattened configurations, see `psfdae.settings.leaves`. A dash stands for a
+        Flattened configurations, see `psfdae.base.settings.leaves`. A dash stands for a
         setting that one of them does not have.
     """
     # Keys of either configuration; equal values are left out.

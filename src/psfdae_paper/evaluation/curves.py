@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Style
 from psfdae_paper.evaluation.paper import paper_rows

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import new_figure
-from psfdae.method import Method
+from psfdae.base.figures import new_figure
 from psfdae.methods import method
+from psfdae.methods.interface import Method
 from psfdae_paper.configuration.methods import oracles_last
 
 if TYPE_CHECKING:

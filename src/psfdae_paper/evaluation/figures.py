@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.figures import STAMP_MAP, new_figure, styled
+from psfdae.base.figures import STAMP_MAP, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,7 @@ class FieldOfPsfs:
     energy : ndarray, shape (F,)
         Fraction of the light inside the stamp.
     fwhm_arcsec, ellipticity, position_angle_deg : ndarray, shape (F,)
-        See `psfdae.moments.Shapes`.
+        See `psfdae.stars.moments.Shapes`.
     """
 
     psf: np.ndarray

@@ -14,11 +14,11 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from psfdae.files import Product, ProductError
-from psfdae.method import Estimate
-from psfdae.metrics import quality, summarised
+from psfdae.base.files import Product, ProductError
+from psfdae.base.reading import read_table
+from psfdae.methods.interface import Estimate
+from psfdae.methods.metrics import quality, summarised
 from psfdae.model.star_sets import field_positions
-from psfdae.reading import read_table
 
 CELL = ["dataset", "split", "reference", "noise_level"]
 """Columns that identify a column of the paper's tables: methods are compared inside it."""

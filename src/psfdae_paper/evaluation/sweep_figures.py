@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.evaluation.drawing import Style, legend_entry
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.files import Column, write_product
-from psfdae.method import FitError, Look, Method, Needs, Storage, TrainingSet
-from psfdae.rng import stream
-from psfdae.settings import Count, Group, Positive
+from psfdae.base.files import Column, write_product
+from psfdae.base.rng import stream
+from psfdae.base.settings import Count, Group, Positive
+from psfdae.methods.interface import FitError, Look, Method, Needs, Storage, TrainingSet
 
 if TYPE_CHECKING:
     from psfdae_paper.configuration.schema import Config

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from psfdae.method import Estimate, FitError, Look, Method, Needs, TrainingSet
+from psfdae.base.rng import stream
 from psfdae.methods.gmm import GaussianMixture, Gmm
-from psfdae.rng import stream
+from psfdae.methods.interface import Estimate, FitError, Look, Method, Needs, TrainingSet
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.modes import Modes

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from psfdae.method import Look, Needs
 from psfdae.methods.gmm_position import PlacedMixture
+from psfdae.methods.interface import Look, Needs
 from psfdae_paper.methods.wavefront import Wavefront
 
 

@@ -17,13 +17,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import require
-from psfdae.files import Column, Product, read_product, write_csv, write_product
+from psfdae.base.belonging import require
+from psfdae.base.files import Column, Product, read_product, write_csv, write_product
+from psfdae.base.options import File
+from psfdae.base.rng import stream
+from psfdae.base.settings import Group
+from psfdae.base.threads import limit_threads
 from psfdae.optics.wavefronts import FIRST_NOLL
-from psfdae.options import File
-from psfdae.rng import stream
-from psfdae.settings import Group
-from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     QuadraticModel,

@@ -24,18 +24,18 @@ import click
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import require, require_origin, write_origin
-from psfdae.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
-from psfdae.fits import store
-from psfdae.method import CONFIG, HISTORY, TrainingSet
+from psfdae.base.belonging import require, require_origin, write_origin
+from psfdae.base.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
+from psfdae.base.options import AboveZero, File, Folder
+from psfdae.base.reading import from_tree, read_yaml
+from psfdae.base.rng import stream
+from psfdae.base.settings import deciding, parse_settings
+from psfdae.base.threads import limit_threads
 from psfdae.methods.dae import Dae
+from psfdae.methods.fit_files import store
+from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
 from psfdae.model.star_sets import noise_model
-from psfdae.noise import mixed_levels
-from psfdae.options import AboveZero, File, Folder
-from psfdae.reading import from_tree, read_yaml
-from psfdae.rng import stream
-from psfdae.settings import deciding, parse_settings
-from psfdae.threads import limit_threads
+from psfdae.stars.noise import mixed_levels
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of, trained_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
@@ -136,8 +136,8 @@ def train_network(
     units of the range. The folder receives weights, the settings that made them, and the history
     of the loss.
     """
-    from psfdae.networks.training import fingerprint, progress, train
-    from psfdae.networks.weights import save_weights
+    from psfdae.methods.networks.training import fingerprint, progress, train
+    from psfdae.methods.networks.weights import save_weights
     from psfdae_paper.alignment.networks import NetworkTraining, TrainingStates, training_of
 
     # Settings and training data of this kind of network.
@@ -278,7 +278,7 @@ def network_predictor(
     """
     import torch
 
-    from psfdae.networks.weights import with_weights
+    from psfdae.methods.networks.weights import with_weights
     from psfdae_paper.alignment.networks import empty_network, predict_states
     from psfdae_paper.alignment.telescope import mirror_symmetries
 

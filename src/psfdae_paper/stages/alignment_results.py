@@ -15,13 +15,13 @@ from typing import Annotated, NamedTuple, TypedDict
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import require, require_origin
-from psfdae.figures import write_png
-from psfdae.files import Product, ProductError, read_product, write_csv, write_text
+from psfdae.base.belonging import require, require_origin
+from psfdae.base.figures import write_png
+from psfdae.base.files import Product, ProductError, read_product, write_csv, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table
+from psfdae.base.threads import limit_threads
 from psfdae.model.star_sets import noise_model
-from psfdae.options import File, Folder
-from psfdae.reading import read_table
-from psfdae.threads import limit_threads
 from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (

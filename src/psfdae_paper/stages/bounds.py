@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, cast
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import STARS, STATIC, require
-from psfdae.files import ProductError, read_product, write_csv, write_parquet, write_product
+from psfdae.base.belonging import STARS, STATIC, require
+from psfdae.base.files import ProductError, read_product, write_csv, write_parquet, write_product
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.base.threads import limit_threads
 from psfdae.methods import method
 from psfdae.model.star_sets import field_positions, training_set
-from psfdae.options import File
-from psfdae.reading import read_table
-from psfdae.threads import limit_threads
 from psfdae_paper.bounds import tables
 from psfdae_paper.bounds.estimates import SPLIT, bounded_stars, fresh_stars
 from psfdae_paper.bounds.floor import Comparison

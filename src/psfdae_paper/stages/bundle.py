@@ -12,19 +12,19 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from psfdae import fits
-from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require, require_origin
-from psfdae.files import Product
-from psfdae.method import CONFIG, Method
+from psfdae.base.belonging import SAME_IMAGE, SAME_STARS, STARS, require, require_origin
+from psfdae.base.files import Product
+from psfdae.base.options import AboveZero, File, Folder
+from psfdae.base.rng import stream
+from psfdae.base.settings import Reference, SplitKind
+from psfdae.base.threads import limit_threads
+from psfdae.methods import fit_files as fits
 from psfdae.methods import method
+from psfdae.methods.interface import CONFIG, Method
 from psfdae.model import packing
 from psfdae.model.bundle import SUFFIX, Bundle, BundleError, read_bundle, shipped_path, write_bundle
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
-from psfdae.options import AboveZero, File, Folder
-from psfdae.rng import stream
-from psfdae.settings import Reference, SplitKind
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config

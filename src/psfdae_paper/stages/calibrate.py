@@ -14,15 +14,15 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import STATIC, require
-from psfdae.files import Product, read_product, write_csv
-from psfdae.metrics import mse, ssim
-from psfdae.noise import NoiseModel
+from psfdae.base.belonging import STATIC, require
+from psfdae.base.files import Product, read_product, write_csv
+from psfdae.base.options import File, Folder
+from psfdae.base.rng import stream
+from psfdae.base.threads import limit_threads
+from psfdae.methods.metrics import mse, ssim
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import WavefrontSource
-from psfdae.options import File, Folder
-from psfdae.rng import stream
-from psfdae.threads import limit_threads
+from psfdae.stars.noise import NoiseModel
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config

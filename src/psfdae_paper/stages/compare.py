@@ -15,12 +15,12 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from psfdae.errors import Error
-from psfdae.files import ProductError, write_text
-from psfdae.method import CONFIG, HISTORY
+from psfdae.base.errors import Error
+from psfdae.base.files import ProductError, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table, read_yaml
 from psfdae.methods import method
-from psfdae.options import File, Folder
-from psfdae.reading import read_table, read_yaml
+from psfdae.methods.interface import CONFIG, HISTORY
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.evaluation import comparison

@@ -11,7 +11,7 @@ from typing import Annotated
 import click
 import yaml
 
-from psfdae.cli import command_modules, stage
+from psfdae.commands.cli import command_modules, stage
 from psfdae_paper.configuration.command import Groups, command
 from psfdae_paper.configuration.compose import load, load_stage
 

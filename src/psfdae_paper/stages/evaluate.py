@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import pandas as pd
 
-from psfdae import fits
-from psfdae.files import Product, write_csv, write_parquet, write_text
-from psfdae.method import Method
+from psfdae.base.files import Product, write_csv, write_parquet, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.settings import ConfigError, Reference, SplitKind
+from psfdae.base.threads import limit_threads
+from psfdae.methods import fit_files as fits
 from psfdae.methods import method
+from psfdae.methods.interface import Method
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars, training_set
-from psfdae.options import File, Folder
-from psfdae.settings import ConfigError, Reference, SplitKind
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config

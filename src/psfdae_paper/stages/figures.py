@@ -14,15 +14,15 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
-from psfdae.figures import StripRow, restoration_strip, spread_stars, write_png
-from psfdae.files import Product, ProductError, read_product
-from psfdae.method import Method
-from psfdae.metrics import mse
+from psfdae.base.figures import StripRow, restoration_strip, spread_stars, write_png
+from psfdae.base.files import Product, ProductError, read_product
+from psfdae.base.options import AboveZero, File
+from psfdae.base.reading import read_table
+from psfdae.base.settings import Reference
+from psfdae.base.threads import limit_threads
+from psfdae.methods.interface import Method
+from psfdae.methods.metrics import mse
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
-from psfdae.options import AboveZero, File
-from psfdae.reading import read_table
-from psfdae.settings import Reference
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import bound_figures, curves

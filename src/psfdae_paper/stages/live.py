@@ -1,8 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
-A training logs where the environment asks for it (`psfdae.networks.training.listener`). Its run
-lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which says
-whose training it is, and a function of the rows of the history comes out.
+A training logs where the environment asks for it (`psfdae.methods.networks.training.listener`).
+Its run lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which
+says whose training it is, and a function of the rows of the history comes out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from psfdae_paper.stages.track import (
 from psfdae_paper.tracking import epoch_metrics
 
 if TYPE_CHECKING:
-    from psfdae.networks.training import Row
+    from psfdae.methods.networks.training import Row
 
 
 def logger(checkpoint: Path) -> Callable[[Row], None]:

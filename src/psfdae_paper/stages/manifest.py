@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from psfdae.files import sha256_of, write_text
-from psfdae.options import Folder
+from psfdae.base.files import sha256_of, write_text
+from psfdae.base.options import Folder
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.command import command
 

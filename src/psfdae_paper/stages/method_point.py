@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from psfdae import fits
-from psfdae.files import read_product
-from psfdae.method import HISTORY
+from psfdae.base.files import read_product
+from psfdae.base.reading import read_table
+from psfdae.base.threads import limit_threads
+from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
+from psfdae.methods.interface import HISTORY
 from psfdae.model.star_sets import read_stars, training_set
-from psfdae.reading import read_table
-from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Measured, Training, fit_in, measure_images

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from psfdae.belonging import require
-from psfdae.files import read_product, write_csv
-from psfdae.method import CONFIG, HISTORY
-from psfdae.reading import read_table, read_yaml
-from psfdae.threads import limit_threads
+from psfdae.base.belonging import require
+from psfdae.base.files import read_product, write_csv
+from psfdae.base.reading import read_table, read_yaml
+from psfdae.base.threads import limit_threads
+from psfdae.methods.interface import CONFIG, HISTORY
 from psfdae_paper.configuration.aligners import Aligner
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import part

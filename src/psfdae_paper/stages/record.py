@@ -24,9 +24,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psfdae.files import ProductError, write_csv, write_text
-from psfdae.options import File, Folder
-from psfdae.reading import read_table
+from psfdae.base.files import ProductError, write_csv, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 

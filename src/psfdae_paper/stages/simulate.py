@@ -14,9 +14,9 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.errors import Error
-from psfdae.figures import write_png
-from psfdae.files import (
+from psfdae.base.errors import Error
+from psfdae.base.figures import write_png
+from psfdae.base.files import (
     Product,
     atomic_path,
     check_outputs,
@@ -24,12 +24,12 @@ from psfdae.files import (
     write_columns,
     write_fits,
 )
-from psfdae.moments import measure_shapes
-from psfdae.noise import noise_equivalent_px
+from psfdae.base.options import File, Folder
+from psfdae.base.rng import stream
+from psfdae.base.version import __version__
 from psfdae.optics.pupil import SamplingError
-from psfdae.options import File, Folder
-from psfdae.rng import stream
-from psfdae.version import __version__
+from psfdae.stars.moments import measure_shapes
+from psfdae.stars.noise import noise_equivalent_px
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC

@@ -11,12 +11,12 @@ from typing import Annotated
 
 import numpy as np
 
-from psfdae import belonging
-from psfdae.files import Column, Empty, read_product, stream_product, write_product
-from psfdae.options import File
-from psfdae.rng import stream
-from psfdae.splits import draw_jitter, draw_phase
-from psfdae.threads import limit_threads
+from psfdae.base import belonging
+from psfdae.base.files import Column, Empty, read_product, stream_product, write_product
+from psfdae.base.options import File
+from psfdae.base.rng import stream
+from psfdae.base.threads import limit_threads
+from psfdae.stars.splits import draw_jitter, draw_phase
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.configuration.schema import Config

@@ -17,11 +17,11 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from psfdae.files import write_text
-from psfdae.method import FitError
-from psfdae.options import File, Folder
-from psfdae.reading import read_json
-from psfdae.settings import parse_settings
+from psfdae.base.files import write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_json
+from psfdae.base.settings import parse_settings
+from psfdae.methods.interface import FitError
 from psfdae_paper.configuration.aligners import swept_networks
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part

@@ -14,11 +14,11 @@ from typing import Annotated, Any, Literal
 import pandas as pd
 import yaml
 
-from psfdae.figures import write_png
-from psfdae.files import ProductError, as_yaml, write_csv, write_text
-from psfdae.options import File, Folder
-from psfdae.reading import read_json, read_table, read_yaml
-from psfdae.settings import as_overrides
+from psfdae.base.figures import write_png
+from psfdae.base.files import ProductError, as_yaml, write_csv, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_json, read_table, read_yaml
+from psfdae.base.settings import as_overrides
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation import sweep_figures
 from psfdae_paper.sweeps.measured import read_cost

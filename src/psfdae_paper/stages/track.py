@@ -18,11 +18,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from psfdae.errors import Error
-from psfdae.files import as_csv, as_yaml, sha256_of, write_text
-from psfdae.method import CONFIG
-from psfdae.options import File, Folder
-from psfdae.version import __version__
+from psfdae.base.errors import Error
+from psfdae.base.files import as_csv, as_yaml, sha256_of, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.version import __version__
+from psfdae.methods.interface import CONFIG
 from psfdae_paper.configuration.command import command
 from psfdae_paper.registry import choose_best, forget, link, log_model, registered_name
 from psfdae_paper.source import git_commit

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from psfdae.files import atomic_path, write_fits
+from psfdae.base.files import atomic_path, write_fits
+from psfdae.base.rng import stream
 from psfdae.image.stamps import central_pixel
-from psfdae.noise import noise_equivalent_px
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.rng import stream
+from psfdae.stars.noise import noise_equivalent_px
 
 
 @dataclass(frozen=True)

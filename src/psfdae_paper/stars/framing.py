@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from psfdae.errors import Error
-from psfdae.files import Product
+from psfdae.base.errors import Error
+from psfdae.base.files import Product
 from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import (
     Pupil,

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.files import Column
+from psfdae.base.files import Column
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
 from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil
 from psfdae.optics.wavefronts import (
     ModalWavefronts,
@@ -17,8 +19,6 @@ from psfdae.optics.wavefronts import (
     seidel_wavefronts,
     zernike_wavefronts,
 )
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 from psfdae.telescope.field import static_zernikes
 from psfdae.telescope.settings import OwnTelescope, Telescope

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from psfdae.rng import stream
+from psfdae.base.rng import stream
 from psfdae_paper.configuration.sweep import Axis, Value
 from psfdae_paper.sweeps.points import tidy
 

@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from psfdae.files import write_csv
-from psfdae.fits import storage_of
-from psfdae.method import Method
+from psfdae.base.files import write_csv
+from psfdae.base.reading import from_tree, read_json
+from psfdae.base.rng import stream
+from psfdae.base.settings import Reference, SplitKind
+from psfdae.methods.fit_files import storage_of
+from psfdae.methods.interface import Method
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars, split_stars
-from psfdae.reading import from_tree, read_json
-from psfdae.rng import stream
-from psfdae.settings import Reference, SplitKind
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import MeasuredStars
 

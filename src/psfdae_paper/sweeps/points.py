@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.errors import Error
-from psfdae.rng import stream
-from psfdae.settings import ConfigError
+from psfdae.base.errors import Error
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (

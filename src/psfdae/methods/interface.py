@@ -23,17 +23,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from psfdae.errors import Error
-from psfdae.files import Column, read_product, write_product
-from psfdae.noise import NoiseModel, mixed_levels
-from psfdae.settings import Config, Group
+from psfdae.base.errors import Error
+from psfdae.base.files import Column, read_product, write_product
+from psfdae.base.settings import Config, Group
+from psfdae.stars.noise import NoiseModel, mixed_levels
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from psfdae.bright_stars import BrightStars
-    from psfdae.bundle_info import BundleInfo
-    from psfdae.settings import Evaluation
+    from psfdae.base.settings import Evaluation
+    from psfdae.methods.bundle_info import BundleInfo
+    from psfdae.stars.bright_stars import BrightStars
 
 CONFIG, HISTORY = "config.yaml", "history.csv"
 """Resolved configuration and course of a training, in the folder of a network."""
@@ -225,7 +225,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Storage:
-    """Files of a fit, and the names of the rule and runs that make them; see `psfdae.fits`.
+    """Files of a fit, and the names of the rule and runs that make them; see `fit_files`.
 
     Attributes
     ----------

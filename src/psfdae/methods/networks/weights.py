@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from psfdae.files import ProductError, atomic_path
+from psfdae.base.files import ProductError, atomic_path
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.errors import Error
-from psfdae.version import __version__
+from psfdae.base.errors import Error
+from psfdae.base.version import __version__
 
 if TYPE_CHECKING:
     from astropy.io.fits import HDUList

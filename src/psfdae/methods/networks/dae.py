@@ -16,13 +16,13 @@ import torch
 from torch import nn
 from torch.nn.grad import conv2d_weight
 
-from psfdae.method import TrainingSet
-from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError
-from psfdae.networks.weights import channels_last
-from psfdae.rng import stream
+from psfdae.base.rng import stream
+from psfdae.methods.interface import TrainingSet
+from psfdae.methods.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError
+from psfdae.methods.networks.weights import channels_last
 
 if TYPE_CHECKING:
-    from psfdae.networks.settings import DaeSettings, Train
+    from psfdae.methods.networks.settings import DaeSettings, Train
 
 
 class SingleChannelConv(nn.Conv2d):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from psfdae.settings import CheckpointSeconds, Count, Group
+from psfdae.base.settings import CheckpointSeconds, Count, Group
 
 
 class DaeSettings(Group):

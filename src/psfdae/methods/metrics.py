@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from psfdae.method import Estimate
+    from psfdae.methods.interface import Estimate
 
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 A calculation that may take minutes goes through its pieces by `steps`, or reports them to a `task`.
 Nothing is shown before `show_with` says what shows it, as the package does for terminals
-(`psfdae.terminal`). Of tasks within a task, and of those in other threads, nothing is shown.
+(`psfdae.commands.terminal`). Of tasks within a task, and of those in other threads, nothing is
+shown.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from functools import cache
 
 import numpy as np
 
-from psfdae.moments import moving_matrices
+from psfdae.stars.moments import moving_matrices
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ from typing import (
 
 import click
 
-from psfdae.errors import Error, did_you_mean, install_line, missing
-from psfdae.joined import joined
-from psfdae.version import __version__
+from psfdae.base.errors import Error, did_you_mean, install_line, missing
+from psfdae.base.joined import joined
+from psfdae.base.version import __version__
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

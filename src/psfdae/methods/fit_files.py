@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.belonging import TRAINED_ON, require_training, write_origin
-from psfdae.files import Product, as_csv, write_text
-from psfdae.method import Method, Storage
+from psfdae.base.belonging import TRAINED_ON, require_training, write_origin
+from psfdae.base.files import Product, as_csv, write_text
+from psfdae.methods.interface import Method, Storage
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.files import write_bytes
+from psfdae.base.files import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,10 +23,10 @@ import torch
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
-from psfdae.errors import Error
-from psfdae.method import FitError
-from psfdae.networks.weights import load_checkpoint, save_checkpoint
-from psfdae.progress import task
+from psfdae.base.errors import Error
+from psfdae.base.progress import task
+from psfdae.methods.interface import FitError
+from psfdae.methods.networks.weights import load_checkpoint, save_checkpoint
 
 Row = dict[str, float]
 """Values of one epoch in the history of a training, by the names of their columns."""

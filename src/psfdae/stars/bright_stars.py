@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.files import Product
-from psfdae.moments import shift_stamps
+from psfdae.base.files import Product
+from psfdae.stars.moments import shift_stamps
 
 
 def magnitude(flux: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.files import Product, ProductError, as_yaml, write_text
-from psfdae.reading import read_yaml
+from psfdae.base.files import Product, ProductError, as_yaml, write_text
+from psfdae.base.reading import read_yaml
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-from psfdae.progress import Advance
+from psfdae.base.progress import Advance
 
 
 @contextmanager
@@ -15,7 +15,7 @@ def bar(name: str, count: int) -> Iterator[Advance]:
     """Show how far a task of so many steps is, after its first second.
 
     Nothing is shown where standard error is no terminal, and in a process that another one has
-    started: bars of several would mix. `psfdae.progress.show_with` takes it.
+    started: bars of several would mix. `psfdae.base.progress.show_with` takes it.
     """
     from multiprocessing import parent_process
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from psfdae.files import ProductError
+from psfdae.base.files import ProductError
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.rng import stream
+from psfdae.base.rng import stream
 
 
 def draw_jitter(count: int, jitter_px: int, rng: np.random.Generator) -> np.ndarray:

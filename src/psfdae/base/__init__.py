@@ -1,0 +1,1 @@
+"""Foundations of all rooms: refusals, files, settings, random streams, progress, figures."""
