@@ -2,6 +2,8 @@
 #   CORES=n          cores for the workflow (default: all)
 #   PRESET=name      smoke, fast (default) or paper
 #   SET="a.b=1 …"    Hydra overrides for every dataset
+#   RESULTS=folder   folder that is written and read (default: results, or results/PRESET); a finished
+#                    run in it gives PRESET and SET where they are not given
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
 #   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
@@ -14,8 +16,9 @@
 
 PYTHON ?= python3
 CORES ?= all
-PRESET ?= fast
+PRESET ?=
 SET ?=
+RESULTS ?=
 TARGETS ?=
 AGAINST ?=
 TORCH_INDEX ?=
@@ -48,6 +51,7 @@ export PIP_NO_CACHE_DIR := 1
 override CORES := $(value CORES)
 override PRESET := $(value PRESET)
 override SET := $(value SET)
+override RESULTS := $(value RESULTS)
 override TARGETS := $(value TARGETS)
 override AGAINST := $(value AGAINST)
 override PORT := $(value PORT)
@@ -56,9 +60,10 @@ override TORCH_INDEX := $(value TORCH_INDEX)
 override PART := $(value PART)
 override PYTHONS := $(value PYTHONS)
 override RESOLUTION := $(value RESOLUTION)
-PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export CORES PRESET SET TARGETS AGAINST PORT TRACK TORCH_INDEX PART PYTHONS RESOLUTION PSFDAE_RESULTS
-SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
+PSFDAE_RESULTS := $(or $(RESULTS),results$(if $(filter-out fast,$(PRESET)),/$(PRESET)))
+export CORES PRESET SET RESULTS TARGETS AGAINST PORT TRACK TORCH_INDEX PART PYTHONS RESOLUTION PSFDAE_RESULTS
+SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET" \
+  results="$$RESULTS"
 # -f: a target is no pattern of file names.
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
 # Targets on request are in the report where they have been built.
@@ -101,6 +106,13 @@ reproduce: env ## Build everything of the preset: datasets, models, tables, repo
 	@$(MAKE) --no-print-directory report
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
 	  psfdae compare results results/reference || true
+	@show() { [ ! -e "$$1" ] || printf '  %-36s %s\n' "$${3:-$$1}" "$$2"; }; \
+	  mlflow="make mlflow"; [ "$$PSFDAE_RESULTS" = results ] || mlflow="$$mlflow RESULTS=$$PSFDAE_RESULTS"; \
+	  echo "To open:"; \
+	  show "$$PSFDAE_RESULTS/report.html" "all figures, with captions"; \
+	  show "$$PSFDAE_RESULTS/tables/psf_metrics.csv" "mean errors of all methods"; \
+	  show docs/results.md "the run of record beside the paper"; \
+	  show "$$PSFDAE_RESULTS/mlflow.db" "the runs side by side, in a browser" "$$mlflow"
 
 benchmark: env ## Run time against error, on a quiet machine; TARGETS=run AGAINST=commit: that of a whole run
 stability: env ## Stress tests of the whole chain
@@ -108,7 +120,7 @@ bounds: env ## How far each method is from the best possible one
 bundles: env ## Pack each dataset's network as a model that psfdae predict takes
 benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
-	  --against "$$AGAINST" --preset "$$PRESET" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
+	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
 	*) $(LOCKED) -- $@;; esac
 
 shipped: env ## Train the model that comes with the package and renew it

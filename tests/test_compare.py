@@ -102,8 +102,8 @@ def test_the_package_has_the_table_of_the_record():
     )
 
 
-def mean_errors(**scale):
-    """A table of mean errors of dataset d with three methods; keywords multiply their MSE."""
+def mean_errors(n=500, **scale):
+    """Mean errors of n stars of dataset d and three methods, whose MSE the keywords multiply."""
     methods = {"noisy": 4.0, "pca_som": 2.0, "dae": 1.0}
     keys = product(["d"], ["random"], ["realisation"], methods, (1e-3, 2e-3), ("mse", "ssim"))
     names = "dataset split reference method noise_level metric"
@@ -112,7 +112,7 @@ def mean_errors(**scale):
     is_mse = table.metric == "mse"
     # The standard error is half a per cent of what is lost.
     loss = np.where(is_mse, 1e-6 * mse, 1e-2 * mse)
-    return table.assign(value=np.where(is_mse, loss, 1 - loss), stderr=0.005 * loss)
+    return table.assign(value=np.where(is_mse, loss, 1 - loss), stderr=0.005 * loss, n=n)
 
 
 @pytest.fixture
@@ -134,6 +134,7 @@ def recorded(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("scale", "lines"),
     [
+        ({"n": 50}, ["NOT COMPARABLE", "test stars 50 (A), 500 (B)"]),
         ({}, ["- 12 are equal", "in 2 of 2 columns of A and in 2 of B; 0 have"]),
         # 3 standard deviations of the difference of two such fits are 13 % of the error.
         ({"dae": 1.12}, ["- 8 are equal", "- 4 differ within", "- 0 differ by more"]),
@@ -152,8 +153,8 @@ def test_tables_of_a_run_and_of_the_record_are_compared(recorded, scale, lines):
     result = recorded(**scale)
     assert result.exit_code == 0, result.output
     assert "12 mean errors are in both (A has 12, B 24)" in result.output
-    for line in lines:
-        assert line in result.output
+    assert all(line in result.output for line in lines)
+    assert ("NOT COMPARABLE" in result.output) == ("n" in scale)
 
 
 def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
@@ -177,13 +178,16 @@ def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
 @pytest.fixture
 def results(tmp_path):
     """Two folders of results with one network in common."""
-    for name, lr, dae, networks in (
-        ("one", "0.004", 1e-5, ("dataset3/random-realisation",)),
-        ("two", "0.001", 3e-5, ("dataset3/random-realisation", "dataset5/random-template")),
+    for name, lr, n, dae, networks in (
+        ("one", "0.004", 50, 1e-5, ("dataset3/random-realisation",)),
+        ("two", "0.001", 400, 3e-5, ("dataset3/random-realisation", "dataset5/random-template")),
     ):
         for place in networks:
             folder = tmp_path / name / "dae" / place
-            write_text(folder / "config.yaml", f"train:\n  lr: {lr}\nreference: realisation\n")
+            write_text(
+                folder / "config.yaml",
+                f"train.lr: {lr}\nparts.test_stars: {n}\nreference: realisation\n",
+            )
             rows = "epoch,train_mse,validation_mse,seconds\n1,2e-5,1e-5,3\n"
             write_text(folder / "history.csv", rows)
             table = tmp_path / name / "evaluation" / f"{place}.parquet"
@@ -199,7 +203,10 @@ def test_command_compares_networks_and_whole_results(results):
         result = psfdae("compare", *arguments, "--out", out)
         assert result.exit_code == 0, result.output
         assert result.output == out.read_text()
-        assert all(word in result.output for word in ("train.lr", "star by star", "worse"))
+        assert all(
+            word in result.output
+            for word in ("train.lr", "NOT COMPARABLE", "star by star", "worse")
+        )
         assert "dataset5" not in result.output
 
 

@@ -36,8 +36,16 @@ DRY = {
     *(f"make reproduce{more}" for more in ("", " CORES=4", " TRACK=live")),
     *(f"make reproduce PRESET={preset}" for preset in ("smoke", "paper")),
     # Its pixels are small: the brightest one is searched in 239 px, over 10 min for all stars.
-    "make reproduce TARGETS=dataset3 SET=train.lr=2e-3 telescope=wfsat_literal",
-    "make reproduce TARGETS=dataset3 SET=$(psfdae best dae_width)",
+    *(
+        f"make reproduce TARGETS=dataset3 RESULTS=results/{words}"
+        for words in (
+            "trial SET=train.lr=2e-3 telescope=wfsat_literal",
+            "best SET=$(psfdae best dae_width)",
+            "lr2e-3 SET=train.lr=2e-3",
+        )
+    ),
+    "make report RESULTS=results/lr2e-3 TARGETS=dataset3",
+    "make mlflow RESULTS=results/lr2e-3",
     *(f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")),
     *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
     "snakemake sweep --cores all --config sweep=dae_width",
@@ -134,9 +142,9 @@ def test_commands_as_written(page, house, tmp_path):
         folder = house
         if line.words == ("make", "clean"):
             folder = clone(tmp_path / "clean")
-        elif "results/paper" in line.words and not (house / "results/paper").exists():
+        elif "compare" in line.words and not (house / line.words[3]).exists():
             for name in ("dae", "evaluation"):
-                shutil.copytree(house / "results" / name, house / "results/paper" / name)
+                shutil.copytree(house / "results" / name, house / line.words[3] / name)
         if line.words[0] in NOT_RUN:
             continue
         process = shell(folder, typed(line), stdout=PIPE, stderr=STDOUT, text=True)

@@ -97,7 +97,8 @@ def test_a_full_disk_is_named_with_the_file_that_has_no_space(tmp_path):
 
 
 def test_the_manifest_of_a_run_shows_which_files_have_changed(tmp_path):
-    names = ("data/a.h5", "tables/b.csv", "logs/a.log", "smoke/data/c.h5", "reference/b.csv")
+    names = ("data/a.h5", "tables/b.csv", "logs/a.log", "reference/b.csv")
+    names += ("lr2e-3/data/c.h5", "lr2e-3/.settings/fit.yaml")
     for name in (*names, "runtime.csv", "tables/.b.csv.0.tmp"):
         write_text(tmp_path / name, f"content of {name}\n")
     for _ in range(2):  # the second time there is a manifest, which is no product

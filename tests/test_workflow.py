@@ -13,6 +13,7 @@ import pytest
 from skimage.metrics import mean_squared_error, structural_similarity
 
 from docs_pages import read
+from psfdae.base.files import write_text
 from psfdae.methods import method
 from psfdae.model.bundle import read_bundle
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
@@ -214,6 +215,22 @@ def test_wrong_config_stops_before_any_job(tmp_path, options, key):
     assert line.startswith("psfdae: ")
     assert "Traceback" not in out
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"overrides": "seed=3"}, "run with framing.stamp_px=6 and without seed=3; name a folder"),
+        # A folder that is named gives its overrides.
+        nightly({"results": "results/smoke"}, "framing.stamp_px = 6"),
+    ],
+)
+def test_a_finished_run_is_replaced_only_where_its_folder_is_named(tmp_path, options, message):
+    record = tmp_path / "results/smoke/run.yaml"
+    write_text(record, "preset: smoke\nset: framing.stamp_px=6\n")
+    target = "results/smoke/data/seidel/templates.h5"
+    assert message in snakemake(tmp_path, target, check=False, **{"results": "", **options})
+    assert not (record.parent / "data").exists()
 
 
 @pytest.mark.parametrize(

@@ -76,13 +76,13 @@ def shell(folder, line, home=None, **options):
     return subprocess.Popen(["bash", "-c", line], cwd=folder, env=variables, **options)
 
 
-def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
+def command(folder, *arguments, overrides="", preset="smoke", results="results", root=ROOT):
     """The command line of a run in `folder`, of the workflow in `root`."""
     return [
         "snakemake",
         *("--snakefile", str(root / "Snakefile"), "--directory", str(folder)),
         *arguments,
-        *("--config", f"preset={preset}", "results=results", f"set={overrides}"),
+        *("--config", f"preset={preset}", f"results={results}", f"set={overrides}"),
     ]
 
 

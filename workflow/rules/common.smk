@@ -10,7 +10,8 @@ from inspect import getdoc
 from snakemake.report.common import data_uri_from_file
 from snakemake.utils import validate
 
-from psfdae.base.files import ProductError
+from psfdae.base.files import ProductError, as_yaml, write_text
+from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError
 from psfdae.commands.cli import stage
 from psfdae.methods import fit_files, method
@@ -28,15 +29,6 @@ from psfdae_paper.configuration.methods import registered
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
-validate(config, "../schemas/command_line.schema.yaml")
-
-PRESET = config["preset"]
-try:
-    GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
-except ValueError as error:
-    sys.exit(f"psfdae: set = {config['set']!r}: {error}")
-RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
-
 
 @contextmanager
 def one_line():
@@ -45,6 +37,59 @@ def one_line():
         yield
     except (ConfigError, ProductError, SweepError) as error:
         sys.exit(f"psfdae: {error}")
+
+
+@one_line()
+def finished_run(folder):
+    """Preset and overrides of the run that was finished in a folder; empty if there is none."""
+    record = Path(folder, "run.yaml")
+    if record.is_file():
+        return read_yaml(record)
+    # A whole run of a version that wrote no record.
+    return {"set": ""} if Path(folder, "runtime.csv").is_file() else {}
+
+
+# What the command does not say is as in the folder that it names: further targets of a run.
+CHOSEN_FOLDER = config.get("results")
+config = {
+    **(finished_run(CHOSEN_FOLDER) if CHOSEN_FOLDER else {}),
+    **{key: value for key, value in config.items() if value},
+}
+validate(config, "../schemas/command_line.schema.yaml")
+
+PRESET = config["preset"]
+try:
+    GIVEN = (f"preset={PRESET}", *shlex.split(config["set"]))
+except ValueError as error:
+    sys.exit(f"psfdae: set = {config['set']!r}: {error}")
+RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
+
+
+def keep_finished_run():
+    """Stop before a run with other overrides is replaced in a folder that was not named."""
+    run = finished_run(RESULTS)
+    # Points of sweeps are named by their content, and replace none.
+    if CHOSEN_FOLDER or config["sweep"] or not run:
+        return
+    finished_words, words = shlex.split(run.get("set") or ""), GIVEN[1:]
+    lost = " ".join(word for word in finished_words if word not in words)
+    added = " ".join(word for word in words if word not in finished_words)
+    if lost or added:
+        difference = " and ".join(
+            [f"with {lost}"] * bool(lost) + [f"without {added}"] * bool(added)
+        )
+        purpose = "to replace it" if words else "to go on with it"
+        sys.exit(
+            f"psfdae: {RESULTS} holds a finished run {difference}; name a folder for this one, "
+            f"RESULTS={RESULTS}/NAME, or RESULTS={RESULTS} {purpose} (snakemake: --config results=…)"
+        )
+
+
+def record_finished_run():
+    """Write preset and overrides of a run into its folder."""
+    if not config["sweep"]:
+        record = {"preset": PRESET, "set": shlex.join(GIVEN[1:])}
+        write_text(Path(RESULTS, "run.yaml"), as_yaml(record))
 
 
 @one_line()

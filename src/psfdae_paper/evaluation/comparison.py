@@ -223,10 +223,10 @@ def compare_tables(
     Returns
     -------
     rows : DataFrame
-        The keys, value_first, value_second, and verdict: "equal"; "rounding" for differences
-        that are negligible; "within" `SIGNIFICANT` standard deviations of the difference of
-        two fits with different seeds; "beyond" that; "not measured" for rows that differ, but
-        whose scatter is not known.
+        The keys, value_first, value_second, numbers of test stars n_first and n_second, and
+        verdict: "equal"; "rounding" for differences that are negligible; "within" `SIGNIFICANT`
+        standard deviations of the difference of two fits with different seeds; "beyond" that;
+        "not measured" for rows that differ, but whose scatter is not known.
     order : DataFrame
         For each column of the paper's tables: True if errors ascend in the order of the paper in
         the `first` and in the `second` table, and if two methods are `exchanged`, by more than the
@@ -235,7 +235,7 @@ def compare_tables(
     # Rows that both tables have, with the standard errors of both.
     tables = [with_seed_stderr(table, scatter) for table in (first, second)]
     keys = [*CELL, "method", "metric"]
-    columns = [table[[*keys, "value", "stderr", "seed_stderr"]] for table in tables]
+    columns = [table[[*keys, "value", "stderr", "seed_stderr", "n"]] for table in tables]
     rows = columns[0].merge(columns[1], on=keys, suffixes=("_first", "_second"))
     # The first condition that holds decides, from equal to beyond the scatter.
     difference = (rows.value_second - rows.value_first).abs()
@@ -249,7 +249,7 @@ def compare_tables(
             (difference <= limit, "within"),
         ]
     )
-    rows = rows[[*keys, "value_first", "value_second", "verdict"]]
+    rows = rows[[*keys, "value_first", "value_second", "n_first", "n_second", "verdict"]]
     # Signs of the differences between the paper's methods, where both tables have them.
     signs = [_mse_signs(table, ascending) for table in tables]
     signs = [s.reindex(signs[0].index.intersection(signs[1].index)) for s in signs]

@@ -6,7 +6,7 @@ says which settings differ, how the trainings went, and which errors differ by m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -168,16 +168,18 @@ def describe(first: Run, second: Run) -> str:
     # Errors on the same noisy images are paired, which removes most of their scatter.
     paired = comparison.same_noisy_stars(first.errors, second.errors)
     pairing = "star by star on the same noisy images" if paired else "as independent samples"
+    # Settings that are numbers of stars: those of a trial on tiny sizes say nothing of a full run.
+    settings = comparison.config_differences(first.config, second.config)
+    sizes = [row for row in settings if row[0] in ("parts.train_stars", "parts.test_stars")]
     # Errors to templates and to realisations have different truths.
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: their errors are not comparable.\n\n"
     return "\n\n".join(
         [
             f"# {first.name} (A) and {second.name} (B)",
+            *warn_of_sizes(sizes),
             "## Settings that differ",
-            _table(
-                comparison.config_differences(first.config, second.config), ["setting", "A", "B"]
-            ),
+            _table(settings, ["setting", "A", "B"]),
             "## Training",
             _table([(key, curves[0][key], curves[1][key]) for key in curves[0]], ["", "A", "B"]),
             f"## Errors, {pairing}",
@@ -190,15 +192,25 @@ def describe(first: Run, second: Run) -> str:
     )
 
 
-def read_errors(folder: Path) -> pd.DataFrame:
-    """Read the mean errors of all methods in a folder of results; raises ProductError."""
-    columns = [*CELL, "method", "metric", "value", "stderr"]
-    return read_tables(_tables(folder), columns)
+def warn_of_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
+    """Return a paragraph of warning if two runs have other numbers of stars; none if equal.
+
+    Parameters
+    ----------
+    sizes : iterable of tuples
+        Name of a number of stars, and its values in both runs.
+    """
+    differences = [f"{name} {first} (A), {second} (B)" for name, first, second in sizes]
+    return [
+        "> **NOT COMPARABLE: the runs have other numbers of stars**, as those of the preset smoke "
+        f"and of a full run have: {'; '.join(differences)}."
+    ][: len(differences)]
 
 
 def describe_tables(first: Path, second: Path) -> str:
     """Return as Markdown the mean errors of two runs that differ by more than seeds do."""
-    first_errors, second_errors = read_errors(first), read_errors(second)
+    columns = [*CELL, "method", "metric", "value", "stderr", "n"]
+    first_errors, second_errors = (read_tables(_tables(run), columns) for run in (first, second))
     # Another kind of processor rounds differently; nearly all such differences are below a tenth
     # of a standard error. The paper concludes that errors ascend from the DAE to the noisy image.
     negligible, ascending = 0.1, ("dae", "pca_som", "noisy")
@@ -219,6 +231,9 @@ def describe_tables(first: Path, second: Path) -> str:
     }
     # Numbers of rows by verdict; rows that differ are listed.
     lines = [f"# {first} (A) and {second} (B)", ""]
+    other_sizes = rows.loc[rows.n_first != rows.n_second, ["n_first", "n_second"]].head(1)
+    for warning in warn_of_sizes(("test stars", *row) for row in other_sizes.to_numpy()):
+        lines += [warning, ""]
     counts = f"A has {len(first_errors)}, B {len(second_errors)}"
     lines += [f"{len(rows)} mean errors are in both ({counts})."]
     for verdict, text in verdict_texts.items():

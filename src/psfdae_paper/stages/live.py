@@ -59,7 +59,7 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
                     experiment = experiment_of(client, LIVE, uri, database)
                     # A run of an earlier attempt would stay beside the new one.
                     delete_live(client, source)
-                    tags = {"source": source, "preset": os.environ["PRESET"]}
+                    tags = {"source": source, "preset": os.environ["PRESET"] or "fast"}
                     run_id = client.create_run(experiment, start_ms, tags, source).info.run_id
                 log_metrics(client, run_id, epoch_metrics([row], start_ms))
                 last_epoch = row["epoch"]

@@ -6,7 +6,6 @@ from typing import Annotated
 
 from psfdae.base.files import sha256_of, write_text
 from psfdae.base.options import Folder
-from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.command import command
 
 
@@ -18,8 +17,8 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
     Listed are the products; logs, costs and MLflow's copies are not, nor are other runs in folders
     of this one.
     """
-    # Runs with other presets, and the run of record, may lie below that with the preset "fast".
-    other_runs = {"reference", *(path.stem for path in (config_dir() / "preset").glob("*.yaml"))}
+    # Other runs, each with its settings, and the run of record may lie in folders of this one.
+    other_runs = {path.parent for path in results.glob("*/**/.settings")} | {results / "reference"}
     no_products = {"logs", "benchmarks", "benchmarks_on_request", "checkpoints", "mlartifacts"}
     # Lines as `sha256sum` prints them, in the order of the names.
     lines = []
@@ -27,6 +26,7 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
         # Names relative to the run, so that it may be moved.
         place = path.relative_to(results)
         is_hidden = any(part.startswith(".") for part in place.parts)
-        if path.is_file() and not is_hidden and place.parts[0] not in other_runs | no_products:
+        is_product = not is_hidden and place.parts[0] not in no_products
+        if path.is_file() and is_product and other_runs.isdisjoint(path.parents):
             lines.append(f"{sha256_of(path)}  {place.as_posix()}\n")
     write_text(results / "SHA256SUMS", "".join(lines))
