@@ -48,7 +48,7 @@ def seeds(
         for target, fitted in fits.items():
             row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
             for level, images in noisy.items():
-                estimate = fitted.restore(images, level, position)
+                estimate = fitted.estimate(images, level, position, False).psf
                 error = mse(estimate, product[target][test]).mean()
                 rows.append({**row, "noise_level": level, "mse": error})
     write(out, rows)
