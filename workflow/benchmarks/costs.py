@@ -129,7 +129,8 @@ def time_method(name, tree, stars, bound):
         noisy = tested.noisy[level]
 
         def restore(noisy=noisy, level=level):
-            restored["psf"] = fitted.estimate(noisy, level, position[: len(noisy)]).psf
+            place = position[: len(noisy)]
+            restored["psf"] = fitted.estimate(noisy, level, place, with_sigma=False).psf
 
         # What is made once for a level, such as factorisations, is not of the stars.
         restore(noisy[:1])
