@@ -144,7 +144,7 @@ def costs(table):
     panels[-1, 1].set_xlabel("CPU time of a star (ms)")
     looks = [method_class(name).look for name in table["method"].unique()]
     handles = [entry(x.label, color=x.color, marker=x.marker, ls="", ms=8) for x in looks]
-    handles += [entry(label, **style) for label, style in MARKS.values()]
+    handles += [entry(label, **{**style, "ms": 9}) for label, style in MARKS.values()]
     handles.append(entry("least possible error", color="black", lw=1.0))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.suptitle("Error against time: fit (left) and inference (right)")
