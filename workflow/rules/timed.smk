@@ -118,7 +118,7 @@ rule predict_throughput:
     log:
         f"{RESULTS}/logs/benchmark/predict_throughput.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_throughput.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_throughput.tsv"
     threads: workflow.cores
     resources:
         mem_mb=1500,
@@ -144,7 +144,7 @@ rule predict_poppy:
     log:
         f"{RESULTS}/logs/benchmark/predict_poppy.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_poppy.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_poppy.tsv"
     resources:
         mem_mb=1500,
         runtime=20,
@@ -174,7 +174,7 @@ rule predict_coverage:
     log:
         f"{RESULTS}/logs/benchmark/predict_coverage.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_coverage.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_coverage.tsv"
     resources:
         mem_mb=1500,
         runtime=30,
@@ -200,7 +200,7 @@ rule predict_strange:
     log:
         f"{RESULTS}/logs/benchmark/predict_strange.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_strange.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_strange.tsv"
     resources:
         mem_mb=1500,
         runtime=20,
@@ -223,7 +223,7 @@ rule scaling_stages:
     log:
         f"{RESULTS}/logs/benchmark/scaling_stages.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/scaling/scaling_stages.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/scaling_stages.tsv"
     threads: workflow.cores
     resources:
         mem_mb=4000,
