@@ -48,9 +48,10 @@ def timed_points(w):
     ]
 
 
-def timed_modules(name):
-    """Module of a method; that of the denoisers is imported by its program."""
-    return [] if name == "denoisers" else [method(name).__module__]
+def timed_module(name):
+    """Module of a method, or the program of the denoisers."""
+    program = f"workflow/benchmarks/{name}.py"
+    return program if name == "denoisers" else method(name).__module__
 
 
 @cache

@@ -31,7 +31,7 @@ rule cost:
             more=tuple(TIMED.overrides(w.dataset, w.method)[w.point]),
             name=w.method,
         ),
-        source=lambda w: program_code("costs.cost", timed_modules(w.method)),
+        source=lambda w: program_code("costs.cost", [timed_module(w.method)]),
         program=program("costs.cost"),
         inputs=as_options,
     message:
