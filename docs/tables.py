@@ -436,7 +436,7 @@ def costs():
     """CPU time and error of each method and setting, as the benchmark has them, in words."""
     table = csv("tables/benchmark_costs.csv").sort_values(["dataset", "fit_cpu_s"])
     labels = {kind.name: kind.look.label for kind in all_methods()}
-    changes = table.settings.fillna("none").mask(table.point == "paper", "preset `paper`")
+    changes = table.settings.fillna("as configured").mask(table.point == "paper", "preset `paper`")
     return table.assign(label=table.method.replace(labels), changes=changes)
 
 
