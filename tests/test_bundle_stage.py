@@ -21,11 +21,11 @@ from psfdae.model.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.model.calibration import HeldOutStars, StarErrors, crossed_coverage
+from psfdae.model.calibration import StarErrors, crossed_coverage
 from psfdae.model.error_model import at_noise, brightest, mahalanobis
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
-from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
+from psfdae.model.star_sets import HeldOutStars, noise_model, noisy_test_images, read_stars
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.compose import load_stage

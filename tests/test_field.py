@@ -241,7 +241,7 @@ def test_flux_and_sky_that_are_known_are_taken(field):
     assert known.measured.background == pytest.approx(3.0)
     assert (known.measured.covariance[:, 1, 1] == 0).all()
     # A method of flux 1 is that, and the same as other methods see it.
-    restored = field.restore((faint.stamps - 3) / 1000, faint.sigma / 1000, faint.position)
+    restored = field.estimate((faint.stamps - 3) / 1000, faint.sigma / 1000, faint.position).psf
     assert restored == pytest.approx(known.psf, abs=2e-3)
 
 

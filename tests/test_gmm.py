@@ -167,7 +167,7 @@ def test_a_flux_that_is_an_estimate_is_found(same):
     np.testing.assert_allclose(found.psf.sum(axis=(1, 2)), found.flux, atol=2e-3)
     assert np.std(found.flux - flux.ravel()) < 0.5 * np.std(flux)
     truth = images if same else wider
-    errors = [found.psf / found.flux[:, None, None], mixture.predict(noisy, LEVEL / 5)] - truth
+    errors = [found.psf / found.flux[:, None, None], mixture.estimate(noisy, LEVEL / 5).psf] - truth
     assert np.square(errors[0]).mean() < 0.9 * np.square(errors[1]).mean()
     assert (
         free.free_flux().flux_sigma == free.flux_sigma
@@ -196,15 +196,19 @@ def test_one_cluster_is_linear_mmse():
     system = dx.T @ dx / len(x) + s * np.eye(D**2)
     residual = noisy.reshape(20, -1) - x.mean(axis=0)
     wanted = y.mean(axis=0) + (dy.T @ dx / len(x) @ np.linalg.solve(system, residual.T)).T
-    np.testing.assert_allclose(mixture.predict(noisy, LEVEL).reshape(20, -1), wanted, atol=1e-5)
+    np.testing.assert_allclose(
+        mixture.estimate(noisy, LEVEL).psf.reshape(20, -1), wanted, atol=1e-5
+    )
 
 
 def test_levels_of_their_own_are_those_of_all():
     mixture = fitted(12)
     levels = np.repeat(np.geomspace(1e-3, 1e-2, 20), 5)
     noisy = noisy_of(stars(100, seed=2)[0], levels)
-    each = np.concatenate([mixture.predict(z[None], v) for z, v in zip(noisy, levels, strict=True)])
-    error = np.square(mixture.predict(noisy, levels) - each).mean()
+    each = np.concatenate(
+        [mixture.estimate(z[None], v).psf for z, v in zip(noisy, levels, strict=True)]
+    )
+    error = np.square(mixture.estimate(noisy, levels).psf - each).mean()
     assert error < 4e-3 * np.square(each - stars(100, seed=2)[0]).mean()
 
 
@@ -286,7 +290,7 @@ def test_noise_of_the_training_stars_is_no_part_of_the_prior():
     excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, less)]
     assert excess[0] > 0.1 and abs(excess[1]) < 0.2 * excess[0]
     truth = stars(400, seed=2)[0]
-    errors = [np.square(m.predict(noisy_of(truth), LEVEL) - truth).mean() for m in (raw, less)]
+    errors = [np.square(m.estimate(noisy_of(truth), LEVEL).psf - truth).mean() for m in (raw, less)]
     assert errors[1] < errors[0]
 
 
@@ -294,7 +298,9 @@ def test_it_is_stored_and_the_same_again(tmp_path):
     mixture, noisy = fitted(12, same=False), stars(5, seed=2)[0]
     mixture.save(tmp_path / "a.h5", CONFIG)
     again = GaussianMixture.load(tmp_path / "a.h5")
-    np.testing.assert_array_equal(again.predict(noisy, LEVEL), mixture.predict(noisy, LEVEL))
+    np.testing.assert_array_equal(
+        again.estimate(noisy, LEVEL).psf, mixture.estimate(noisy, LEVEL).psf
+    )
     twice = _fitted.__wrapped__(12, False, GaussianMixture)
     for name in GaussianMixture.stored():
         np.testing.assert_array_equal(getattr(twice, name), getattr(mixture, name))
@@ -350,12 +356,14 @@ def test_the_position_is_used_where_it_tells_something():
     truth, place = stars(400, seed=2)[0], where(400, seed=2)
     noisy = noisy_of(truth, 4 * LEVEL)
     told, untold = (kind.fit(data, settings) for kind in (Placed, GaussianMixture))
-    errors = [np.square(m.predict(noisy, 4 * LEVEL, place) - truth).mean() for m in (told, untold)]
+    errors = [
+        np.square(m.estimate(noisy, 4 * LEVEL, place).psf - truth).mean() for m in (told, untold)
+    ]
     assert errors[0] < 0.9 * errors[1]
     # Learnt on one half of the field, it is wrong on the other.
     misled = data.positions.copy()
     misled[data.validation] = misled[data.validation[::-1]] * [-1.0, 3.0]
     kept = Placed.fit(replace(data, positions=misled), settings)
     np.testing.assert_allclose(
-        kept.predict(noisy, LEVEL, place), kept.predict(noisy, LEVEL, -place), atol=1e-7
+        kept.estimate(noisy, LEVEL, place).psf, kept.estimate(noisy, LEVEL, -place).psf, atol=1e-7
     )

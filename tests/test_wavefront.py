@@ -74,7 +74,7 @@ def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
     psf = fitted[name].estimate(noisy, LEVEL, data.positions[-TEST:]).psf
     error = mse(psf, images[-TEST:])
     assert 0.4 < error.mean() / floor.mean() < 1.4
-    mixture = fitted[name].mixture.restore(noisy, LEVEL, data.positions[-TEST:])
+    mixture = fitted[name].mixture.estimate(noisy, LEVEL, data.positions[-TEST:]).psf
     assert np.median(error) < 0.3 * np.median(mse(mixture, images[-TEST:]))
 
 
@@ -85,9 +85,9 @@ def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, n
         position = data.positions[-TEST:][:3]
         psf = kind.estimate(images, LEVEL, position)
         # One image alone: others beside it would round it otherwise.
-        mixture = kind.mixture.restore(images[1:2], LEVEL, position[1:2])[0]
+        mixture = kind.mixture.estimate(images[1:2], LEVEL, position[1:2]).psf[0]
         assert (psf.psf[1] == mixture).all()
-        psfs = kind.mixture.restore(images, LEVEL, position)
+        psfs = kind.mixture.estimate(images, LEVEL, position).psf
         assert np.abs(psf.psf[0] - psfs[0]).max() > 1e-5
         assert psf.explained.tolist() == [True, False, True]
 

@@ -13,14 +13,14 @@ def test_limits(bench, record):
     images = bench.seidel.images
     mixture, truth = fit(bench, images, [8]), images[:40]
     # Stars of the fit: so few span no more than themselves, others would be projected.
-    none, quantity = mixture.predict(truth, 1e-3 * bench.level), "largest change over the peak"
+    none, quantity = mixture.estimate(truth, 1e-3 * bench.level).psf, "largest change over the peak"
     record.close("λ → 0", quantity, none, truth, 1e-4, over=truth.max())
-    mean, without_signal = images.mean(axis=0), mixture.predict(truth, 1e6 * bench.level)
+    mean, without_signal = images.mean(axis=0), mixture.estimate(truth, 1e6 * bench.level).psf
     quantity = "difference from the mean star over its peak"
     record.close("λ → ∞", quantity, without_signal, mean, 100 * EPS, over=mean.max())
     for factor in (1e-2, 1e2):
         noisy = bench.noise.draw(truth, factor * bench.level, bench.stream("mixture"))
-        psf = mixture.predict(noisy, factor * bench.level)
+        psf = mixture.estimate(noisy, factor * bench.level).psf
         ratio = np.square(psf - truth).mean() / np.square(noisy - truth).mean()
         record.at_most(f"λ × {factor:g}", "MSE over that of the noisy images", ratio, 1.02)
 
@@ -29,7 +29,7 @@ def test_few_and_equal_stars(bench, record):
     """Equal stars, a cluster of one star, more clusters than stars."""
     images = bench.seidel.images[:31]
     noisy = bench.noise.draw(images, bench.level, bench.stream("few"))
-    equal = fit(bench, np.repeat(images[:1], 30, axis=0), [1, 4]).predict(noisy, bench.level)
+    equal = fit(bench, np.repeat(images[:1], 30, axis=0), [1, 4]).estimate(noisy, bench.level).psf
     quantity, peak = "difference of all estimates from the star over its peak", images[0].max()
     record.close("equal stars", quantity, equal, images[0], 100 * EPS, over=peak)
     lonely = images.copy()
@@ -53,7 +53,7 @@ def test_broken_stars(bench, record):
     with record.refused(f"{case}'s training set", ValueError):
         fit(bench, images, [4])
     with record.refused(case, ValueError):
-        fitted.predict(images, bench.level)
+        fitted.estimate(images, bench.level)
 
 
 def fit(bench, images, components):

@@ -251,7 +251,7 @@ def refuse(bundle, stars):
 def covered(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
     from psfdae.model.bundle import estimator
-    from psfdae.model.calibration import HeldOutStars, calibrated
+    from psfdae.model.calibration import calibrated
     from psfdae.model.error_model import brightest
     from psfdae.model.psf_model import PsfModel
 
@@ -263,7 +263,10 @@ def covered(bundle, product, seed):
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     is_odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    halves = [HeldOutStars.of(product, reference, noise, test[half]) for half in (is_odd, ~is_odd)]
+    halves = [
+        star_sets.HeldOutStars.of(product, reference, noise, test[half])
+        for half in (is_odd, ~is_odd)
+    ]
     cells = {}
     for judges, judged in (halves, halves[::-1]):
         model = calibrated(bundle, fitted, judges, seed)[0]

@@ -263,9 +263,9 @@ def time_methods(tree, stars):
         for level in config.noise.levels:
             noisy = star_sets.noisy_test_images(config, product, test, level)
             # What is made once for a level, such as factorisations, is not of the stars.
-            fitted.restore(noisy[:1], level, position[:1])
+            fitted.estimate(noisy[:1], level, position[:1], False)
             start = process_time()
-            estimate = fitted.restore(noisy, level, position)
+            estimate = fitted.estimate(noisy, level, position, False).psf
             rate = len(noisy) / (process_time() - start)
             row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
             mean, stderr = clustered_mean(mse(estimate, clean), field)
@@ -298,7 +298,7 @@ def seeds(
         for target, fitted in fits.items():
             row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
             for level, images in noisy.items():
-                estimate = fitted.restore(images, level, position)
+                estimate = fitted.estimate(images, level, position, False).psf
                 error = mse(estimate, product[target][test]).mean()
                 rows.append({**row, "noise_level": level, "mse": error})
     write(out, rows)

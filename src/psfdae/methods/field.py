@@ -179,14 +179,12 @@ class FieldMixture(FieldLaw, Method):
         """Return the form of this method that measures flux and sky."""
         return replace(self, measures_flux=True)
 
-    def predict(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return the PSFs of `estimate`, which has parameters and errors."""
-        return self.estimate(noisy, level, position).psf
-
     def estimate(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None = None,
+        with_sigma: bool = True,
     ) -> Estimate:
         """Return PSFs, their standard deviation, and the evidence of every image.
 
@@ -200,6 +198,8 @@ class FieldMixture(FieldLaw, Method):
             Noise level λ.
         position : ndarray, shape (n, 2) to (n, 4), optional
             NaN where unknown.
+        with_sigma : bool
+            The standard deviations are there in either case: they cost little.
 
         Raises
         ------

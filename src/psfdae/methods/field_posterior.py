@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.methods.field_law import FieldLaw
+from psfdae.methods.field_nodes import NodeAxes
 from psfdae.methods.field_pairs import FieldStamps, PairFit, Pairs, fit_pairs, project_pairs
 from psfdae.methods.mixing import FLUX_SIGMA, mixing_weights
 
@@ -308,28 +309,18 @@ def _mixed_pixels(
     """
     count, pixels = stars.images.shape
     first, second = np.zeros((2, count, pixels))
+    flux, mahalanobis2 = np.empty((2, len(pairs.star)))
     # Stars of flux about 1.
     images, s = stars.images / stars.unit[:, None], stars.noise_variance()
-    sigma, star, factor = stars.prior_sigma(), pairs.star, fit.factor[:, None]
-    # The variance of pixels depends on s and σ alone. It is computed once for all stars whose s
-    # rounds to the same step of 0.1 in ln, which changes a standard deviation by 2.5 % at most.
-    ln_step = 0.1
-    noise_step = np.rint(np.log(s) / ln_step)
-    classes = np.column_stack([noise_step, sigma])
-    _, example, noise_class = np.unique(classes, axis=0, return_index=True, return_inverse=True)
-    class_variance, class_sigma = np.exp(ln_step * noise_step[example]), sigma[example]
-    sigma, sky_free = sigma[star], ~stars.sky_known[star]
+    noise_classes = NoiseClasses.of(s, stars.prior_sigma())
+    star, factor = pairs.star, fit.factor[:, None]
+    sigma, sky_free = stars.prior_sigma()[star], ~stars.sky_known[star]
     nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
-    flux, mahalanobis2 = np.empty((2, len(star)))
     gradient, precision = np.empty((len(star), 3)), fit.precision
     # 2: the star and its change with a; 1 if every flux is known: the star alone.
     row_sets = 2 - (stars.flux > 0).all()
     for k, part in pairs.by_node():
         axes, stars_here = law.node_axes(k, stars.position_known), star[part]
-        # s G⁻¹ beyond the axes, and how much it differs along each.
-        beyond, along_less_beyond = axes.noise_fractions(s[stars_here])
-        # 1/P where the sky is free, else 0: the part of a difference in flux that each pixel gets.
-        w, flat_share = weight[part, None], sky_free[part, None] / pixels
         image, mean = pairs.along[part].transpose(1, 0, 2)
         # Residual r = x − a m − Lᵀ t along the axes, and its score along the leading ones.
         residual = image / stars.unit[stars_here, None] - factor[part] * mean
@@ -339,34 +330,101 @@ def _mixed_pixels(
         )
         # From here on Λ − Λ₁₂ (eq. 16); overwrites fit.precision, which is not used again.
         precision[part] -= leading
-        # The star without noise and sky, x − t_sky − s G⁻¹ r (eq. 13), and its change with a.
-        # Both are sums over the rows of the basis: derivatives, then axes.
-        derivative_rows = np.stack([nuisance[part], nuisance_slope[part]])[:row_sets]
-        residual_slope = along_less_beyond * (mean + nuisance_slope[part] @ axes.derivatives)
-        axis_rows = [-along_less_beyond * residual, residual_slope][:row_sets]
-        combined = np.concatenate([beyond * derivative_rows, axis_rows], axis=2)
-        combined[..., 0] -= derivative_rows[..., 0]
-        restored, *slopes = combined @ axes.basis
+        # The star without noise and sky, and its change with a (eq. 13): t and −r, and their
+        # derivatives.
+        residual_slope = mean + nuisance_slope[part] @ axes.derivatives
+        nuisance_rows = np.stack([nuisance[part], nuisance_slope[part]])[:row_sets]
+        residual_rows = np.stack([-residual, residual_slope])[:row_sets]
+        beyond, along_less_beyond = axes.noise_fractions(s[stars_here])
+        corrections = _corrections(axes, nuisance_rows, residual_rows, beyond, along_less_beyond)
         mean_beyond = beyond * stars.psfs(law, k, stars_here)
+        restored = corrections[0]
         restored += (1.0 - beyond) * images[stars_here] + factor[part] * mean_beyond
         flux[part] = restored.sum(axis=1)
-        # (a − Σstar)/P is added to each pixel; mixed_posterior takes it from the sky.
+        # Where the sky is free, (a − Σstar)/P is added to each pixel, as `mixed_posterior` takes it
+        # from the sky; and likewise for the change, so that its sum is 1.
+        flat_share = sky_free[part, None] / pixels
         restored += flat_share * (factor[part] - flux[part, None])
-        # Variance of its pixels (eq. 14): inside the node, and by the variance of a.
-        used, index = np.unique(noise_class[stars_here], return_inverse=True)
-        second_moment = axes.pixel_variance(class_variance[used], class_sigma[used])[index]
+        # Second moment of the pixels (eq. 14): inside the node, and by the variance of a.
+        second_moment = noise_classes.pixel_variance(axes, stars_here)
         second_moment += restored**2
-        for slope in slopes:
-            change = slope + mean_beyond
+        for correction in corrections[1:]:
+            change = correction + mean_beyond
             change += flat_share * (1.0 - change.sum(axis=1, keepdims=True))
             second_moment += fit.variance[part, None] * change**2
         # Moments of the mixture (eq. 15).
-        first[stars_here] += w * restored
-        second[stars_here] += w * second_moment
+        first[stars_here] += weight[part, None] * restored
+        second[stars_here] += weight[part, None] * second_moment
     # D² = rᵀG⁻¹r + γᵀ(Λ − Λ₁₂)⁻¹γ (eq. 16): (Λ − Λ₁₂)⁻¹ is the covariance of t/σ that the axes
     # beyond the leading ones leave.
     mahalanobis2 += (gradient * np.linalg.solve(precision, gradient[..., None])[..., 0]).sum(axis=1)
     return first, second, flux, mahalanobis2
+
+
+class NoiseClasses(NamedTuple):
+    """Stars of about the same noise, of which the variance of the pixels is computed once.
+
+    The variance inside a node depends on s and σ alone (eq. 14).
+
+    Attributes
+    ----------
+    number : ndarray of int, shape (n,)
+        Class of each star.
+    variance : ndarray, shape (C, 1)
+        s of each class.
+    sigma : ndarray, shape (C, 3)
+        Prior σ of the nuisance parameters of its stars.
+    """
+
+    number: np.ndarray
+    variance: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, s: np.ndarray, sigma: np.ndarray) -> NoiseClasses:
+        """Return the classes of stars by their s, (n, 1), and prior σ, (n, 3)."""
+        # s is rounded to steps of 0.1 in ln, which changes a standard deviation by 2.5 % at most.
+        ln_step = 0.1
+        noise_step = np.rint(np.log(s) / ln_step)
+        classes = np.column_stack([noise_step, sigma])
+        _, example, number = np.unique(classes, axis=0, return_index=True, return_inverse=True)
+        return cls(number, np.exp(ln_step * noise_step[example]), sigma[example])
+
+    def pixel_variance(self, axes: NodeAxes, stars: np.ndarray) -> np.ndarray:
+        """Return the variance (n, P) of the pixels of some stars, by their numbers, in a node."""
+        used, index = np.unique(self.number[stars], return_inverse=True)
+        return np.asarray(axes.pixel_variance(self.variance[used], self.sigma[used])[index])
+
+
+def _corrections(
+    axes: NodeAxes,
+    nuisance: np.ndarray,
+    residual: np.ndarray,
+    beyond: np.ndarray,
+    along_less_beyond: np.ndarray,
+) -> np.ndarray:
+    """Return what takes noise and sky off stars in a node, beside s G⁻¹ (x − a m) beyond the axes.
+
+    That is −t_sky − s G⁻¹ r with r = x − a m − Lᵀ t (eq. 13), as sums over the rows of the basis:
+    derivatives, then axes.
+
+    Parameters
+    ----------
+    axes : NodeAxes
+    nuisance : ndarray, shape (R, n, 3)
+        t of each star; R is 1, or 2 with the derivatives by a.
+    residual : ndarray, shape (R, n, m)
+        −r along the axes.
+    beyond, along_less_beyond : ndarray, shape (n, 1) and (n, m)
+        s G⁻¹ beyond the axes, and how much it differs along each (`NodeAxes.noise_fractions`).
+
+    Returns
+    -------
+    ndarray, shape (R, n, P)
+    """
+    combined = np.concatenate([beyond * nuisance, along_less_beyond * residual], axis=2)
+    combined[..., 0] -= nuisance[..., 0]
+    return np.asarray(combined @ axes.basis)
 
 
 def _second_moments(

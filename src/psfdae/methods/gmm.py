@@ -248,19 +248,13 @@ class GaussianMixture(MixtureLaw, Method):
             flux[part] = flux_factor(self, batch, weight)
         return flux, is_near
 
-    def predict(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return the PSFs of `estimate`, which has parameters and errors, but no σ."""
-        return self.estimate(noisy, level, position, with_sigma=False).psf
-
     def estimate(
         self,
         noisy: np.ndarray,
         level: float | np.ndarray,
         position: np.ndarray | None = None,
-        near_clusters: np.ndarray | None = None,
         with_sigma: bool = True,
+        near_clusters: np.ndarray | None = None,
     ) -> Estimate:
         """Return PSFs, float32, their standard deviation, and the evidence of every image.
 

@@ -7,8 +7,9 @@ of MLflow, bundles and `from-stars` ask the classes for all that they must know:
 looks, what it needs, how a fit is stored, how it is packed.
 
 A method has at least `look`, `fit` and `predict`. All else has a default in the base class: a
-method with a product names its arrays in `storage`, one with uncertainties returns them by
-`estimate`, and two capabilities tell what only some methods can do, `knows_field` and `finds_flux`.
+method with a product names its arrays in `storage`. All ask a method by `estimate`; one that knows
+more than the PSF, such as uncertainties, has it in place of `predict`. Two capabilities tell what
+only some methods can do, `knows_field` and `finds_flux`.
 
 Modules of methods load neither torch nor scipy when they are imported: options of
 commands follow from them.
@@ -301,10 +302,26 @@ class Method:
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
     if TYPE_CHECKING:
+        # Class method: from a `TrainingSet` and the groups of settings to a fitted method.
         fit: Callable[..., Self]
-        """Class method: from a `TrainingSet` and the groups of settings to a fitted method."""
+        # PSFs of flux-normalised noisy images, both of shape (n, d, d); see `estimate`.
         predict: Callable[..., np.ndarray]
-        """PSFs of flux-normalised noisy images, both of shape (n, d, d)."""
+        # `finds_flux`: fluxes of images over those by which they were divided, (n,), and which
+        # clusters are near an image, (n, K): `estimate` and `outlier_score` look at no others.
+        flux: Callable[..., tuple[np.ndarray, np.ndarray]]
+        # `knows_field`, explained in `psfdae.methods.field.FieldMixture`: PSFs at positions (n, 2),
+        # or with magnitudes and colours (n, 4); the posterior of stars on stamps in any unit;
+        # images, positions and centres of stars drawn from their distribution; the error of a flux
+        # on a known sky; and stars of a magnitude or colour outside of the training range.
+        psf_at: Callable[..., np.ndarray]
+        measure: Callable[..., Estimate]
+        draw_stars: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
+        fitted_flux_error: Callable[..., tuple[float, np.ndarray, np.ndarray]]
+        is_out_of_range: Callable[..., np.ndarray]
+
+        @property
+        def order(self) -> int:
+            """Order of the polynomial by which the PSF changes over the field."""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
@@ -350,20 +367,29 @@ class Method:
         return ()
 
     def estimate(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None = None,
+        with_sigma: bool = True,
     ) -> Estimate:
-        """Return the PSFs of noisy images at a noise level λ, or one per image, shape (n,).
+        """Return the PSFs of noisy images (n, d, d), and what else the method knows of them.
 
-        A method that knows their uncertainty, or the images' evidence, adds it here.
+        By default those of `predict`, which gets what the method needs besides the image.
+
+        Parameters
+        ----------
+        noisy : ndarray, shape (n, d, d)
+            Images of flux 1 without sky; estimates of both for the form `free_flux`.
+        level : float or ndarray, shape (n,)
+            Noise level λ.
+        position : ndarray, shape (n, 2) or (n, 4), optional
+            See `Needs.position`.
+        with_sigma : bool
+            False if the standard deviations are not needed, without which some methods are faster.
         """
-        return Estimate(self.restore(noisy, level, position))
-
-    def restore(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return the PSFs by `predict`, which gets what the method needs besides the image."""
         inputs = (level,) * self.needs.level + (position,) * self.needs.position
-        return self.predict(noisy, *inputs)
+        return Estimate(self.predict(noisy, *inputs))
 
     def outlier_score(
         self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
@@ -375,58 +401,6 @@ class Method:
         `estimate`. `near_clusters` is what `flux` returned of these images.
         """
         return None
-
-    # Methods with the capability `finds_flux`.
-
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the fluxes of images (n, d, d), over those by which they were divided, shape (n,).
-
-        The second array tells which clusters are near an image, (n, K): `estimate` and
-        `outlier_score` take it as `near_clusters`, and look at no others.
-        """
-        raise NotImplementedError(f"{self.name}: finds no fluxes")
-
-    # Methods with the capability `knows_field`.
-
-    @property
-    def order(self) -> int:
-        """Order of the polynomial by which the PSF changes over the field."""
-        raise NotImplementedError(f"{self.name}: knows no field")
-
-    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """Return the PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
-        raise NotImplementedError(f"{self.name}: knows no field")
-
-    def measure(
-        self,
-        stamps: np.ndarray,
-        noise: np.ndarray,
-        position: np.ndarray | None = None,
-        centre: np.ndarray | None = None,
-        fixed: bool | np.ndarray = False,
-        flux: np.ndarray | None = None,
-        sky: np.ndarray | None = None,
-        gain: np.ndarray | None = None,
-    ) -> Estimate:
-        """Measure stars on stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
-        raise NotImplementedError(f"{self.name}: does not measure stars")
-
-    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
-        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
-        return np.zeros(len(position), bool)
-
-    def draw_stars(
-        self, count: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw noise-free stars from their distribution, the uncertainty of the fit included.
-
-        Returns images, positions and centres; see `psfdae.methods.field.FieldMixture.draw_stars`.
-        """
-        raise NotImplementedError(f"{self.name}: draws no stars")
-
-    def fitted_flux_error(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
-        raise NotImplementedError(f"{self.name}: knows no field")
 
     # A fit as files, and as part of a bundle.
 

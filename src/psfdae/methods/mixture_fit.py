@@ -260,7 +260,7 @@ def best_on_validation(
         fitted = replace(cached_mixture(k, used), shrinkage=np.array([nu]))
         advance(1)
         errors = [
-            np.square(fitted.restore(images, level, position) - truth).mean()
+            np.square(fitted.estimate(images, level, position, False).psf - truth).mean()
             for images, level in zip(noisy, data.levels, strict=True)
         ]
         return float(np.exp(np.mean(np.log(errors))))

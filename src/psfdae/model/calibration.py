@@ -12,11 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
-from psfdae.base.files import Product
 from psfdae.base.progress import steps
 from psfdae.base.rng import stream
 from psfdae.image.stamps import StarFlag
@@ -33,95 +31,14 @@ from psfdae.model.error_model import (
 from psfdae.model.flux_model import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.restoration import SNR_TOLERANCE
-from psfdae.model.star_sets import field_positions, own_noise
+from psfdae.model.star_sets import HeldOutStars
 from psfdae.stars.bright_stars import BrightStars
-from psfdae.stars.noise import NoiseModel
 
 NODES = 8
 """Noise levels at which errors are measured, equidistant in the logarithm."""
 
 COVERAGE = 0.6827
 """Part of the errors within a half-width; of a normal variable within ± 1 σ."""
-
-
-@dataclass(frozen=True)
-class HeldOutStars:
-    """Noise-free stars of flux 1 that no training has seen.
-
-    Bright stars of an image stand for noise-free ones, but have noise themselves.
-
-    Attributes
-    ----------
-    min_images : int
-        Noisy images per noise node, at least; of fewer stars, each is seen several times.
-    images : ndarray, shape (n, d, d)
-        Noise-free stars, to which noise is added.
-    references : ndarray, shape (n, d, d)
-        What is to be restored of them.
-    noise : NoiseModel
-    position : ndarray, shape (n, 2) or (n, 4)
-        Places; those of an image's stars have magnitudes and colours, too.
-    flux_error : ndarray, shape (n,)
-        Error of the flux, which is taken to be 1, due to noise in the image.
-    own_noise : ndarray, shape (n, d, d)
-        Standard deviation of the noise that is in the pixels already.
-    """
-
-    images: np.ndarray
-    references: np.ndarray
-    noise: NoiseModel
-    position: np.ndarray
-    flux_error: np.ndarray
-    own_noise: np.ndarray
-
-    min_images: ClassVar[int] = 250
-
-    @classmethod
-    def of(
-        cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
-    ) -> HeldOutStars:
-        """Return some stars of a product "stars", by their indices."""
-        truth = stars[reference]
-        flux_error, pixel_noise = own_noise(stars, truth, noise.background)
-        # All stars of the product, of which the test stars are taken.
-        arrays = (stars["realisation"], truth, field_positions(stars), flux_error, pixel_noise)
-        images, references, position, *noise_in_image = (array[test] for array in arrays)
-        return cls(images, references, noise, position, *noise_in_image)
-
-    def draw(self, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Return at least `min_images` noisy images (n, d, d) of flux 1, and their stars (n,)."""
-        # Few stars are repeated, each time with other noise. λ is the noise over the flux and κ.
-        star = np.resize(np.arange(len(self.images)), max(len(self.images), self.min_images))
-        return self.noise.draw(self.images[star], noise / self.noise.kappa, rng), star
-
-    def errors(
-        self,
-        psf: np.ndarray,
-        star: np.ndarray | slice = slice(None),
-        unit: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Return moduli of the errors of PSFs of some stars, less the stars' own noise.
-
-        Parameters
-        ----------
-        psf : ndarray, shape (n, d, d)
-        star : ndarray of int, shape (n,), or slice
-            Star of every PSF.
-        unit : ndarray, shape (n, d, d), optional
-            Unit of the errors, such as the method's σ; by default the flux.
-
-        Returns
-        -------
-        ndarray, shape (n, d, d)
-            At least 0. Quantiles above the own noise are those of errors to noise-free stars; means
-            are larger.
-        """
-        # The own noise s of a pixel is independent of the error e: the difference from the
-        # reference has the mean square e² + s².
-        square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
-        error = np.sqrt(np.maximum(square, 0.0))
-        # Equal stars leave a method no doubt: its σ may be 0.
-        return np.asarray(error if unit is None else error / np.maximum(unit, 1e-12))
 
 
 @dataclass(frozen=True)
@@ -360,7 +277,7 @@ def _scales_at(
     return noise, scale, flux_scale
 
 
-def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> Bundle:
+def with_training_stars(model: PsfModel, bright: BrightStars) -> Bundle:
     """Return the bundle of a model with limits of outliers that training stars are not beyond.
 
     The noise of a training star is in the axes of the training, along which a star of the same
@@ -370,16 +287,13 @@ def with_training_stars(model: PsfModel, stars: Product, train: np.ndarray) -> B
     Parameters
     ----------
     model : PsfModel
-    stars : product "stars"
-        Stars of an image.
-    train : ndarray of int
-        Numbers of the training images.
+    bright : BrightStars
+        Training stars of the image.
     """
     bundle, errors = model.bundle, model.bundle.errors
     if errors.outlier_limit is None:
         return bundle
     # The stars as they are in the image, framed, with the flux 1.
-    bright = BrightStars.of_product(stars).of(np.unique(stars["field_index"][train]))
     images, is_measured = bright.framed(bundle.info.stamp_px)
     images = np.where(is_measured, images, 0.0) / bright.flux[:, None, None]
     noise = bright.noise / bright.flux

@@ -168,7 +168,7 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
             # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):
-                psf = restorer.restore(images, level, positions)
+                psf = restorer.estimate(images, level, positions, with_sigma=False).psf
                 psf = psf / psf.sum(axis=(1, 2), keepdims=True)
                 log_mse.append(np.log(np.square(psf - truth).mean()))
         errors[name] = float(np.exp(np.mean(log_mse)))

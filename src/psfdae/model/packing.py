@@ -24,7 +24,6 @@ from psfdae.methods.interface import Method
 from psfdae.methods.metrics import all_metrics
 from psfdae.model.bundle import Bundle, BundleError, creation_date, estimator
 from psfdae.model.calibration import (
-    HeldOutStars,
     StarErrors,
     calibrated,
     crossed_coverage,
@@ -36,13 +35,7 @@ from psfdae.model.calibration import (
 from psfdae.model.error_model import ErrorModel
 from psfdae.model.flux_model import FluxModel, signal_to_noise
 from psfdae.model.psf_model import PsfModel
-from psfdae.model.star_sets import (
-    noise_model,
-    noisy_test_images,
-    of_image,
-    split_stars,
-    star_area,
-)
+from psfdae.model.star_sets import HeldOutStars, ModelStars, noisy_test_images
 from psfdae.model.wings import Wings
 
 
@@ -77,9 +70,10 @@ def model_of(
     BundleError
         If it cannot be that small.
     """
-    bundle, held_out = uncalibrated(
+    bundle, model_stars = uncalibrated(
         fitted, stars, reference, config, trained, name, licence, largest_mb
     )
+    held_out = model_stars.held_out
     unpacked = estimator(bundle)  # errors are those of the fit as it is packed
     rng = stream(config.seed, "noise", "calibration", "misfit")
     bundle = with_misfit(bundle, unpacked, held_out, rng)
@@ -87,12 +81,11 @@ def model_of(
         bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
     # Errors on test stars; in an image, limits of outliers by its training stars, too.
     bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
-    split = split_stars(stars, trained["split"], config)
-    if of_image(stars):
-        bundle = with_training_stars(PsfModel(bundle, unpacked), stars, split.train)
+    if model_stars.bright is not None:
+        bundle = with_training_stars(PsfModel(bundle, unpacked), model_stars.bright)
     # Metrics of test stars at the noise levels of the configuration.
     noisy = (
-        (level, noisy_test_images(config, stars, split.test, level))
+        (level, noisy_test_images(config, stars, model_stars.test, level))
         for level in config.noise.levels
     )
     area, data_range = bundle.info.noise_equivalent_px, config.evaluation.data_range
@@ -112,8 +105,8 @@ def uncalibrated(
     licence: str,
     largest_mb: float | None = None,
     components: int = 48,
-) -> tuple[Bundle, HeldOutStars]:
-    """Return a fit with all that it takes to apply it, but its errors, and its test stars.
+) -> tuple[Bundle, ModelStars]:
+    """Return a fit with all that it takes to apply it, but its errors, and the stars for these.
 
     Parameters are those of `model_of`; of the settings, seed, noise and parts are enough.
     `components` is the number of leading eigenvectors of the flux model that the bundle stores.
@@ -122,23 +115,18 @@ def uncalibrated(
     -------
     bundle : Bundle
         Its errors are 0, and fluxes are measured as if the method knew every shape.
-    stars : HeldOutStars
-        Test stars, by which the errors are to be calibrated.
+    model_stars : ModelStars
+        Those of the fit, and test stars, by which the errors are to be calibrated.
     """
-    split, noise = split_stars(stars, trained["split"], config), noise_model(config)
-    images, references = stars["realisation"], stars[reference]
-    held_out = HeldOutStars.of(stars, reference, noise, split.test)
-    # The flux model, its variance beyond the leading eigenvectors spread evenly.
-    flux_model = leading(FluxModel.fit(images[split.train]), components)
-    # Range of noise, as pixel RMS over the flux, and of S/N.
-    band, area = noise.kappa * np.asarray(config.noise.levels), star_area(stars, split.train)
-    least_noise, greatest_noise = float(band.min()), float(band.max())
-    # Simulated stars are one image each.
-    training_stars = len(split.train)
-    if of_image(stars):  # each bright star is in several of the images
-        training_stars = len(np.unique(stars["field_index"][split.train]))
     stamp_fields = _stamp_fields(stars)
     stamp_px = stamp_fields["stamp_px"]
+    model_stars = ModelStars.of(stars, trained["split"], reference, config)
+    images, noise = model_stars.images, model_stars.held_out.noise
+    # The flux model, its variance beyond the leading eigenvectors spread evenly.
+    flux_model = leading(FluxModel.fit(images), components)
+    # Range of noise, as pixel RMS over the flux, and of S/N.
+    band, area = noise.kappa * np.asarray(config.noise.levels), model_stars.noise_equivalent_px
+    least_noise, greatest_noise = float(band.min()), float(band.max())
     arrays, method_fields = packed(fitted, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
     # Everything that is needed to apply the method, and to know what it was trained on.
     info = BundleInfo(
@@ -154,8 +142,9 @@ def uncalibrated(
         snr_max=signal_to_noise(least_noise, area),
         noise_equivalent_px=area,
         components=components,
-        training_sha256=checksum(images[split.train], references[split.train]),
-        training_stars=training_stars,
+        training_sha256=checksum(images, model_stars.references),
+        # Simulated stars are one image each.
+        training_stars=len(images if model_stars.bright is None else model_stars.bright),
         method=fitted.name,
         reference=reference,
         **method_fields,
@@ -166,7 +155,7 @@ def uncalibrated(
     nodes = noise_nodes(band)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     bundle = Bundle(info, arrays, flux_model, ErrorModel.uncalibrated(nodes, blank))
-    return bundle, held_out
+    return bundle, model_stars
 
 
 def _stamp_fields(product: Product) -> dict[str, Any]:

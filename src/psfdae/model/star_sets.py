@@ -1,10 +1,14 @@
-"""Sets of stars, products of the kind "stars": split, noise, and training sets of methods."""
+"""Sets of stars, products of the kind "stars": split, noise, and what is made from them.
+
+In go a product and a configuration; out come the `TrainingSet` of a method, the `HeldOutStars` that
+test it, and the `ModelStars` from which a fit becomes a model.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -147,6 +151,124 @@ def own_noise(
     return noise * np.sqrt(pixels + np.pi / 2 * pixels**2 / sky_pixels), np.sqrt(variance)
 
 
+@dataclass(frozen=True)
+class HeldOutStars:
+    """Noise-free stars of flux 1 that no training has seen.
+
+    Bright stars of an image stand for noise-free ones, but have noise themselves.
+
+    Attributes
+    ----------
+    min_images : int
+        Noisy images per noise node, at least; of fewer stars, each is seen several times.
+    images : ndarray, shape (n, d, d)
+        Noise-free stars, to which noise is added.
+    references : ndarray, shape (n, d, d)
+        What is to be restored of them.
+    noise : NoiseModel
+    position : ndarray, shape (n, 2) or (n, 4)
+        Places; those of an image's stars have magnitudes and colours, too.
+    flux_error : ndarray, shape (n,)
+        Error of the flux, which is taken to be 1, due to noise in the image.
+    own_noise : ndarray, shape (n, d, d)
+        Standard deviation of the noise that is in the pixels already.
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    noise: NoiseModel
+    position: np.ndarray
+    flux_error: np.ndarray
+    own_noise: np.ndarray
+
+    min_images: ClassVar[int] = 250
+
+    @classmethod
+    def of(
+        cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
+    ) -> HeldOutStars:
+        """Return some stars of a product "stars", by their indices."""
+        truth = stars[reference]
+        flux_error, pixel_noise = own_noise(stars, truth, noise.background)
+        # All stars of the product, of which the test stars are taken.
+        arrays = (stars["realisation"], truth, field_positions(stars), flux_error, pixel_noise)
+        images, references, position, *noise_in_image = (array[test] for array in arrays)
+        return cls(images, references, noise, position, *noise_in_image)
+
+    def draw(self, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Return at least `min_images` noisy images (n, d, d) of flux 1, and their stars (n,)."""
+        # Few stars are repeated, each time with other noise. λ is the noise over the flux and κ.
+        star = np.resize(np.arange(len(self.images)), max(len(self.images), self.min_images))
+        return self.noise.draw(self.images[star], noise / self.noise.kappa, rng), star
+
+    def errors(
+        self,
+        psf: np.ndarray,
+        star: np.ndarray | slice = slice(None),
+        unit: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return moduli of the errors of PSFs of some stars, less the stars' own noise.
+
+        Parameters
+        ----------
+        psf : ndarray, shape (n, d, d)
+        star : ndarray of int, shape (n,), or slice
+            Star of every PSF.
+        unit : ndarray, shape (n, d, d), optional
+            Unit of the errors, such as the method's σ; by default the flux.
+
+        Returns
+        -------
+        ndarray, shape (n, d, d)
+            At least 0. Quantiles above the own noise are those of errors to noise-free stars; means
+            are larger.
+        """
+        # The own noise s of a pixel is independent of the error e: the difference from the
+        # reference has the mean square e² + s².
+        square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
+        error = np.sqrt(np.maximum(square, 0.0))
+        # Equal stars leave a method no doubt: its σ may be 0.
+        return np.asarray(error if unit is None else error / np.maximum(unit, 1e-12))
+
+
+@dataclass(frozen=True)
+class ModelStars:
+    """Stars to which a model was fitted, and those that test it: all that a bundle is made from.
+
+    Attributes
+    ----------
+    images, references : ndarray, shape (n, d, d)
+        Training images of flux 1, and what is to be restored of them.
+    held_out : HeldOutStars
+        Test stars.
+    test : ndarray of int
+        Their numbers in the product.
+    noise_equivalent_px : float
+        Noise-equivalent area of a typical star.
+    bright : BrightStars or None
+        Training stars of an image, each once; None if the stars are simulated.
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    held_out: HeldOutStars
+    test: np.ndarray
+    noise_equivalent_px: float
+    bright: BrightStars | None
+
+    @classmethod
+    def of(cls, stars: Product, split_kind: str, reference: str, config: OfFit) -> ModelStars:
+        """Return the parts of a product "stars", as `training_set` and `HeldOutStars` do."""
+        parts = split_stars(stars, split_kind, config)
+        held_out = HeldOutStars.of(stars, reference, noise_model(config), parts.test)
+        images, references = stars["realisation"][parts.train], stars[reference][parts.train]
+        area, bright = star_area(stars, parts.train), None
+        if of_image(stars):
+            # Each bright star is in several of the images.
+            bright = BrightStars.of_product(stars).of(np.unique(stars["field_index"][parts.train]))
+        return cls(images, references, held_out, parts.test, area, bright)
+
+
 def training_set(
     config: OfFit, kind: type[Method], stars: Product, split: str, reference: str, **fields: Any
 ) -> TrainingSet:
@@ -173,7 +295,7 @@ def training_set(
 
     # Stars of an image have noise themselves, and some methods measure them in the image; simulated
     # stars have a description of their simulation.
-    parts = split_stars(stars, split, config)
+    parts, positions = split_stars(stars, split, config), field_positions(stars)
     if of_image(stars):
         fields["own_noise"] = star_noise
         if kind.knows_field:
@@ -189,7 +311,7 @@ def training_set(
         noise=noise_model(config),
         seed=config.seed,
         reference=reference,
-        positions=field_positions(stars),
+        positions=positions,
         **fields,
     )
 

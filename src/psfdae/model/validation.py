@@ -372,7 +372,7 @@ class Report:
             if look.drawn:
                 is_model = name == self.model.info.method
                 scale = _level_scale(self.model, self.stars) if is_model else 1.0
-                stamps = method.restore(noisy, scale * levels[snr], place[shown])
+                stamps = method.estimate(noisy, scale * levels[snr], place[shown], False).psf
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.title, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]

@@ -103,7 +103,11 @@ class Wavefront(Method):
         return mixture
 
     def estimate(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None = None,
+        with_sigma: bool = True,
     ) -> Estimate:
         """Estimate the PSFs of images (n, d, d) of one noise level λ.
 

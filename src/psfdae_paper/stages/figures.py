@@ -163,7 +163,8 @@ class DrawnStars:
         for level in levels:
             noisy = noisy_test_images(config, self.product, stars, level)
             for estimator in self.methods.values():
-                look, images = estimator.look, estimator.restore(noisy, level, position)
+                look = estimator.look
+                images = estimator.estimate(noisy, level, position, with_sigma=False).psf
                 label = f"{look.label}\nλ = {level:g}"
                 # Images that are not restored have their own colour scale: noise exceeds the PSF.
                 rows.append(StripRow(label, images, mse(images, truth), not look.restores))
