@@ -233,16 +233,17 @@ def _run_of_fit(
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
-    # Value and standard error of each metric at each noise level λ, then means over the levels.
+    # Means over the noise levels, the first that MLflow compares, then value and standard error of
+    # each metric at each level λ.
     table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
     rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
-    for row in rows.to_dict("records"):
-        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
-        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
     for metric in TrackedRun.averaged:
         if metric in {*rows.metric}:
             metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
+    for row in rows.to_dict("records"):
+        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
+        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
     # Figures of the dataset, without those whose name has another split or reference.
     figures = {}
     folder = results / "figures" / dataset
@@ -261,7 +262,7 @@ def _run_of_fit(
         split=split,
         reference=reference,
         source=fits.place_of(kind, *key),
-        name=" ".join([*key, kind.name]),
+        name=" ".join([kind.name, *key]),
         experiment=from_tree(stars, product.config, "scene", lambda scene: scene["experiment"]),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
         config={**product.config, **settings},

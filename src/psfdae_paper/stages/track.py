@@ -311,10 +311,12 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         origin = {"dataset_name": data.name, "dataset_digest": data.digest}
     if model_id := log_model(client, experiment, run_id, run):
         origin["model_id"] = model_id
-    # Metrics of each epoch, and those of the finished run.
-    metrics = epoch_metrics(run.epochs, run.start_ms)
-    for name, step, value in starmap(tracked_metric, run.metrics.items()):
-        metrics.append(Metric(name, value, run.end_ms, step, **origin))
+    # Metrics of the finished run, then those of each epoch.
+    metrics = [
+        Metric(name, value, run.end_ms, step, **origin)
+        for name, step, value in starmap(tracked_metric, run.metrics.items())
+    ]
+    metrics += epoch_metrics(run.epochs, run.start_ms)
     # MLflow takes 6000 characters of a param.
     params = [Param(key, v[:6000]) for key, v in settings_of(run, tags["preset"]).items()]
     log_metrics(client, run_id, metrics, params)
