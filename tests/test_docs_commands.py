@@ -47,7 +47,7 @@ DRY = {
     "make report RESULTS=results/lr2e-3 TARGETS=dataset3",
     "make mlflow RESULTS=results/lr2e-3",
     *(f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")),
-    *(f"make {t}" for t in ("benchmark", "stability", "bounds", "training_knee", "report")),
+    *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
     "snakemake sweep --cores all --config sweep=dae_width",
     "snakemake tracking --forcerun track track_alignment",
     *(f"make {t}" for t in ("mlflow", "mlflow PORT=5001", "reference")),
