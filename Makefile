@@ -71,7 +71,6 @@ REPORTED = all \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/inference.png),benchmark) \
   $(if $(wildcard $(PSFDAE_RESULTS)/.stability_passed),stability) \
   $(if $(wildcard $(PSFDAE_RESULTS)/tables/psf_efficiency.csv),bounds) \
-  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/training.png),training_knee) \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/own_stars/strip.png),from_stars_example)
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
@@ -82,7 +81,7 @@ FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
 .DEFAULT_GOAL := help
 .PHONY: help env reproduce report mlflow reference docs site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
-  benchmark stability bounds training_knee bundles shipped
+  benchmark stability bounds bundles shipped
 
 help: ## List the targets
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -118,9 +117,8 @@ reproduce: env ## Build everything of the preset: datasets, models, tables, repo
 benchmark: env ## Run time against error, on a quiet machine; TARGETS=run AGAINST=commit: that of a whole run
 stability: env ## Stress tests of the whole chain
 bounds: env ## How far each method is from the best possible one
-training_knee: env ## Test error against training time
 bundles: env ## Pack each dataset's network as a model that psfdae predict takes
-benchmark stability bounds training_knee bundles:
+benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
 	*) $(LOCKED) -- $@;; esac

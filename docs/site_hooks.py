@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = (
     *("*.md", "LICENSE", "CITATION.cff", "config/*.md"),
-    *("docs/*.md", "docs/*.css", "docs/figures/*.png"),
+    *("docs/*.md", "docs/*.css", "docs/*.js", "docs/figures/*.png"),
     *("results/reference/**/*.png", "results/reference/**/*.csv", "studies/*/*.csv"),
     "src/psfdae_paper/configuration/schema.py",
 )
@@ -29,6 +29,20 @@ def on_files(files: Files, config: Any) -> Files:
         uri = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, uri, abs_src_path=str(path)))
     return files
+
+
+SITE_ONLY = re.compile(r"<!--site\n(.*?)-->", re.S)
+MEMBERS = re.compile(r"^::: (\S+) \[(.*)\]$", re.M)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put in the references that only the site has, which pages keep in a comment."""
+
+    def directives(comment: re.Match[str]) -> str:
+        members = r"::: \1\n    options:\n      members: [\2]"
+        return re.sub(r"^(?=:::)", "\n", MEMBERS.sub(members, comment[1]), flags=re.M)
+
+    return SITE_ONLY.sub(directives, markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:

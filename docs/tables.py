@@ -33,7 +33,7 @@ import yaml
 from psfdae.commands.cli import as_click, command_modules, sections, stage
 from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.image_input import ImageStatements
-from psfdae.methods import all_methods, method
+from psfdae.methods import all_methods
 from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose
@@ -230,27 +230,49 @@ def image_statements():
 
 
 def commands():
-    """Heading, usage and first sentence of each command, in the order of `psfdae --help`."""
-    rows = []
+    """Heading, usage, first sentence and options of each command, in the order of `psfdae --help`.
+
+    Options come with their help, those of the image as a link to their table; the paper's stages
+    have the names alone, and stages of two words that begin alike share a row.
+    """
+    statements, rows = image_statements().set_index("option").meaning.to_dict(), {}
     for heading, words in sections(sorted({name.split()[0] for name in command_modules()})).items():
         for name in sorted(command_modules(), key=lambda name: (*words, name).index(name)):
-            if name.split()[0] in words:
-                first_sentence = command_modules()[name][1].partition(". ")[0].removesuffix(".")
-                # Arguments of the command in capitals, as its help has them.
-                command = as_click(stage(name))
-                arguments = [p for p in command.params if isinstance(p, click.Argument)]
-                usage = [
-                    f"psfdae {name}",
-                    *(p.make_metavar(click.Context(command)) for p in arguments),
+            if name.split()[0] not in words:
+                continue
+            first_sentence = command_modules()[name][1].partition(". ")[0].removesuffix(".")
+            command = as_click(stage(name))
+            options = {
+                p.opts[0]: p.help or "" for p in command.params if isinstance(p, click.Option)
+            }
+            # Arguments of the command in capitals, as its help has them.
+            arguments = [p for p in command.params if isinstance(p, click.Argument)]
+            usage = [f"psfdae {name}", *(p.make_metavar(click.Context(command)) for p in arguments)]
+            usage = " ".join(usage).replace("|", r"\|")
+            if heading != "The paper's stages":
+                described = [
+                    f"`{option}`" + f": {' '.join(meaning.split())}" * bool(meaning)
+                    for option, meaning in options.items()
+                    if statements.get(option) != meaning
                 ]
-                rows.append([heading, " ".join(usage).replace("|", r"\|"), first_sentence])
-    return pd.DataFrame(rows, columns=["heading", "usage", "sentence"])
+                if statements.items() <= options.items():
+                    described.append("[statements on the image](python.md#read-the-stars)")
+                rows[name] = [heading, usage, first_sentence, "<br>".join(described)]
+                continue
+            group, *others = name.split()
+            names = ", ".join(f"`{option}`" for option in options)
+            text = first_sentence + f" ({names})" * bool(names)
+            row = rows.setdefault(
+                group, [heading, f"psfdae {group} …" if others else usage, "", ""]
+            )
+            row[2] += "<br>" * bool(row[2]) + f"`{' '.join(others)}`: " * bool(others) + text
+    return pd.DataFrame(rows.values(), columns=["heading", "usage", "sentence", "options"])
 
 
 def public_names():
     """Calls of the names on the reference page of Python, with the first sentence of each."""
     page, rows = (ROOT / "docs/api.md").read_text(encoding="utf-8"), []
-    for path, _, members in re.findall(r"^::: (\S+)(\n.*\n +members: \[(.*)\])?", page, re.M):
+    for path, members in re.findall(r"^::: (\S+)(?: \[(.*)\])?$", page, re.M):
         module, _, name = path.rpartition(".")
         value = getattr(import_module(module), name)
         described = {
@@ -433,11 +455,11 @@ def seeds():
 
 
 def costs():
-    """CPU time of each method's fit, and stars per second at its slowest noise level."""
-    cells = csv("tables/benchmark_methods.csv").groupby(["method", "noise_level"], sort=False)
-    cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
-    table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
-    return table.assign(label=[method(m).look.label for m in table.method])
+    """CPU time and error of each method and setting, as the benchmark has them, in words."""
+    table = csv("tables/benchmark_costs.csv").sort_values(["dataset", "fit_cpu_s"])
+    labels = {kind.name: kind.look.label for kind in all_methods()}
+    changes = table.settings.fillna("as configured").mask(table.point == "paper", "preset `paper`")
+    return table.assign(label=table.method.replace(labels), changes=changes)
 
 
 def errors(name="tables/psf_metrics.csv"):

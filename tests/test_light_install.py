@@ -20,8 +20,8 @@ from workflow_runs import captured
 
 pytestmark = pytest.mark.slow
 
-PAGES = ("README", "docs/first_session", "docs/tutorial", "docs/own_stars", "docs/predict")
-PAGES += ("docs/python",)
+PAGES = ("README", "docs/first_session", "docs/tutorial", "docs/train", "docs/predict")
+PAGES += ("docs/photometry", "docs/exposures", "docs/python")
 
 WITH_EXTRA = ("simulate", "fit")
 """Commands of these pages that need the extra `paper`; another environment runs them."""
@@ -34,7 +34,7 @@ SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
 
 EXAMPLE = "psfdae example-field --out image.fits --catalogue stars.csv"
 PREPARATION = {
-    "README": EXAMPLE,
+    **dict.fromkeys(("README", "docs/exposures"), EXAMPLE),
     "docs/python": f"""{EXAMPLE}
 python - <<'END'
 import numpy as np

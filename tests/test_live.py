@@ -26,8 +26,8 @@ def test_epochs_appear_as_they_are_trained_and_the_finished_run_replaces_them(
         if place.startswith("dae"):
             (run,) = site.runs(experiment="live")
             assert run.info.status == "RUNNING"
-            points = [(p.step, p.value) for p in site.history(run, "train_mse")]
-            assert points == [(row[0], row[1]) for row in HISTORY[:count]]
-    assert site.track() == {"dae": "created", "baseline": "created"}
+            points = [(p.step, p.value / 1e6) for p in site.history(run, "epoch/train_mse_1e-6")]
+            assert points == [pytest.approx((row[0], row[1])) for row in HISTORY[:count]]
+    assert site.track() == {"dae": "created", "pca_som": "created"}
     if place.startswith("dae"):
         assert site.runs(experiment="live") == []

@@ -187,7 +187,7 @@ def test_page_lists_all_flags_and_columns():
     text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
-    other_pages = [ROOT / f"docs/{name}.md" for name in ("own_stars", "python")]
+    other_pages = [ROOT / f"docs/{name}.md" for name in ("train", "photometry", "python")]
     all_text = text + "".join(path.read_text(encoding="utf-8") for path in other_pages)
     for name in COLUMNS:
         assert f"`{name}`" in all_text, name

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.base.files import Column, write_product
+from psfdae.base.files import Column, write_product, write_text
 from psfdae_paper import registry
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import runs_of_datasets
@@ -70,6 +70,8 @@ def write_tree(results):
         for metric, value in (("mse", i * 1e-5), ("ssim", i / 10)):
             rows.append(f"{dataset},random,{reference},{method},0.003,{metric},{value:g},1e-7,50")
     evaluation.write_text("\n".join([*rows, ""]))
+    # What Snakemake says of the job.
+    write_text(results / "benchmarks/baseline/dataset3/random.tsv", "s\tmax_rss\n12.5\t90\n")
     figures = results / f"figures/{dataset}"
     figures.mkdir(parents=True)
     for name in ("curves", f"random-{reference}_strip", "held_out-template_strip"):
@@ -129,10 +131,12 @@ def site(tmp_path, empty_database, monkeypatch):
 
 
 def test_run_holds_what_the_files_say(site):
-    assert site.track() == {"dae": "created", "baseline": "created"}
-    (dae,), (baseline,) = site.runs("dae"), site.runs("baseline")
-    assert (dae.info.run_name, dae.info.status) == ("dataset3 random template dae", "FINISHED")
-    assert dae.info.end_time - dae.info.start_time == 4500
+    assert site.track() == {"dae": "created", "pca_som": "created"}
+    (dae,), (baseline,) = site.runs("dae"), site.runs("pca_som")
+    assert (dae.info.run_name, dae.info.status) == ("dae dataset3 random template", "FINISHED")
+    # The duration is that of the job, or else of the training.
+    durations = [run.info.end_time - run.info.start_time for run in (dae, baseline)]
+    assert durations == [4500, 12500]
     # Those settings are shown that differ from the preset's, and those of dataset and method.
     assert dae.data.params == {
         **{"method": "dae", "split": "random", "reference": "template", "seed": "7"},
@@ -140,11 +144,17 @@ def test_run_holds_what_the_files_say(site):
         **{"parts.train_stars": "30", "parts.test_stars": "10"},
         **{"stars.name": "seidel_10pct", "noise.name": "noise3", "noise.levels": "[0.003]"},
     }
-    assert baseline.data.metrics["test_mse_0.003"] == 2e-5
-    metrics = {"test_mse_0.003": 3e-5, "test_ssim_stderr_0.003": 1e-7, "best_validation_mse": 1e-5}
-    assert metrics.items() <= dae.data.metrics.items()
-    points = site.history(dae, "train_mse")
-    assert [(p.step, p.value) for p in points] == [(1, 3e-5), (2, 2e-5), (3, 1e-5)]
+    assert baseline.data.metrics["test_mse_1e-6"] == pytest.approx(20)
+    metrics = {"test_mse_1e-6": 30, "best_validation_mse_1e-6": 10, "epoch/lr": 1e-3}
+    metrics |= {"lambda_1e-6/test_ssim": 0.3, "lambda_1e-6/test_mse_stderr_1e-6": 0.1}
+    for name, value in metrics.items():
+        assert dae.data.metrics[name] == pytest.approx(value)
+    for name, expected in (
+        ("epoch/train_mse_1e-6", [(1, 30), (2, 20), (3, 10)]),
+        ("lambda_1e-6/test_mse_1e-6", [(3000, 30)]),
+    ):
+        points = [(p.step, p.value) for p in site.history(dae, name)]
+        assert points == [pytest.approx(point) for point in expected]
     (given,) = dae.inputs.dataset_inputs
     digest = hashlib.sha256(site.stars["dataset3"].read_bytes()).hexdigest()
     assert given.dataset.name == "dataset3" and digest.startswith(given.dataset.digest)
@@ -166,7 +176,7 @@ def test_best_is_the_version_that_errs_least_of_the_present_results(site):
     site.track()
     # No bundle holds a baseline.
     assert len(site.client.search_registered_models()) == 1
-    assert best().metrics["test_mse"] == 3e-5
+    assert best().metrics["test_mse_1e-6"] == pytest.approx(30)
     write_config(site.dae / "config.yaml", lr=0.01)  # errs as much, and is the present one
     site.track()
     assert best().params["train.lr"] == "0.01"
@@ -185,20 +195,20 @@ def test_changed_files_replace_a_run_and_another_config_supersedes_it(site):
     site.track()
     before = site.rows(), [run.to_dictionary() for run in site.runs()]
     (site.dae / "dae.safetensors").touch()
-    assert site.track() == {"dae": "unchanged", "baseline": "unchanged"}
+    assert site.track() == {"dae": "unchanged", "pca_som": "unchanged"}
     assert (site.rows(), [run.to_dictionary() for run in site.runs()]) == before
     write_history(site.dae / "history.csv", [(1, 5e-5, 4e-5, 2.0), (2, 4e-5, 6e-5, 3.0)])
-    assert site.track() == {"dae": "updated", "baseline": "unchanged"}
+    assert site.track() == {"dae": "updated", "pca_som": "unchanged"}
     (run,) = site.runs()
-    assert [p.value for p in site.history(run, "train_mse")] == [5e-5, 4e-5]
+    assert [p.value for p in site.history(run, "epoch/train_mse_1e-6")] == pytest.approx([50, 40])
     (version,) = site.client.search_model_versions()
     first = run.info.run_id
     assert version.run_id == first
     write_config(site.dae / "config.yaml", lr=0.006)
-    assert site.track() == {"dae": "created", "baseline": "unchanged"}
+    assert site.track() == {"dae": "created", "pca_som": "unchanged"}
     assert superseded().pop(first) == "true" and len(superseded()) == 2
     write_config(site.dae / "config.yaml")
-    assert site.track() == {"dae": "unchanged", "baseline": "unchanged"}
+    assert site.track() == {"dae": "unchanged", "pca_som": "unchanged"}
     assert superseded().pop(first) == "false"
     assert sorted(superseded().values()) == ["false", "true"]
 
@@ -213,9 +223,9 @@ def test_killed_import_is_repaired(site, monkeypatch):
         patch.setattr(MlflowClient, "log_model_artifacts", killed)
         with pytest.raises(KeyboardInterrupt):
             site.track()
-    assert len(site.runs("baseline")) + len(site.runs("dae")) == 1
+    assert len(site.runs("pca_som")) + len(site.runs("dae")) == 1
     site.track()
-    runs = site.runs("baseline") + site.runs("dae")
+    runs = site.runs("pca_som") + site.runs("dae")
     assert [run.info.status for run in runs] == ["FINISHED", "FINISHED"]
     assert len(site.client.search_model_versions()) == 1
 
@@ -225,10 +235,10 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys):
         server.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{server.getsockname()[1]}"
         monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
-        assert site.track() == {"dae": "not sent", "baseline": "not sent"}
+        assert site.track() == {"dae": "not sent", "pca_som": "not sent"}
     out = capsys.readouterr().out
     assert address in out
-    assert "dataset3 random template baseline, dataset3 random template dae" in out
+    assert "pca_som dataset3 random template, dae dataset3 random template" in out
 
 
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):

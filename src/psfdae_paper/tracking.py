@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import starmap
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -55,11 +56,11 @@ class TrackedRun:
     last_file : Path or None
         File that the run has written last; None while it runs.
     metrics : mapping of str to float
-        Metrics of the finished run.
+        Metrics of the finished run; the name of one at a noise level ends in it.
     epochs : sequence of mappings
         Rows of the training history.
     seconds : float or None
-        Duration of the run; by default that up to the last epoch.
+        Duration of the job that made the run; by default that up to the last epoch.
     status : str
         Status in MLflow.
     parent : str
@@ -124,10 +125,10 @@ class TrackedRun:
     @cached_property
     def content_hash(self) -> str:
         """Hash of files and settings."""
-        # 3 is a version: raise it when other metrics or settings are read from the files, and all
+        # 4 is a version: raise it when other metrics or settings are read from the files, and all
         # runs are imported again.
         contents = {name: sha256_of(path) for name, path in self.files.items()}
-        return hash_of([3, self.config_hash, contents])
+        return hash_of([4, self.config_hash, contents])
 
     @property
     def end_ms(self) -> int:
@@ -142,6 +143,29 @@ class TrackedRun:
         if seconds is None:
             seconds = max((row["seconds"] for row in self.epochs), default=0.0)
         return self.end_ms - int(1000 * seconds)
+
+
+def tracked_metric(name: str, value: float) -> tuple[str, int, float]:
+    """Return a metric as MLflow shows it: name, step and value.
+
+    MLflow prints five decimals: a mean squared error is given in 1e-6, as its name says. The step
+    of a metric at a noise level λ is λ in 1e-6, with which the name begins, so that MLflow draws it
+    against λ in a section of its own. The step of other metrics is 0.
+    """
+    # The noise level at the end of the name.
+    level = re.search(r"_(\d[\d.e-]*)$", name)
+    name = name[: level.start()] if level else name
+    if "mse" in name.split("_"):
+        name, value = f"{name}_1e-6", 1e6 * value
+    return (
+        (f"lambda_1e-6/{name}", round(1e6 * float(level[1])), value) if level else (name, 0, value)
+    )
+
+
+def job_seconds(benchmark: Path) -> float | None:
+    """Return the duration of a job from Snakemake's table of its cost; None without the table."""
+    # A job that was repeated has a row for each time.
+    return read_table(benchmark, "s", sep="\t").s.iloc[-1] if benchmark.is_file() else None
 
 
 def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
@@ -209,16 +233,17 @@ def _run_of_fit(
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
-    # Value and standard error of each metric at each noise level λ, then means over the levels.
+    # Means over the noise levels, the first that MLflow compares, then value and standard error of
+    # each metric at each level λ.
     table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
     rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
-    for row in rows.to_dict("records"):
-        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
-        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
     for metric in TrackedRun.averaged:
         if metric in {*rows.metric}:
             metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
+    for row in rows.to_dict("records"):
+        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
+        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
     # Figures of the dataset, without those whose name has another split or reference.
     figures = {}
     folder = results / "figures" / dataset
@@ -230,14 +255,14 @@ def _run_of_fit(
     # Methods that are trained in epochs have a history.
     storage = fits.storage_of(kind)
     history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
-    run_kind = storage.run or kind.name
+    job = f"{fits.rule_of(kind)}/{fits.stem(kind, *key)}"
     return TrackedRun(
-        kind=run_kind,
+        kind=kind.name,
         dataset=dataset,
         split=split,
         reference=reference,
         source=fits.place_of(kind, *key),
-        name=" ".join([*key, run_kind]),
+        name=" ".join([kind.name, *key]),
         experiment=from_tree(stars, product.config, "scene", lambda scene: scene["experiment"]),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
         config={**product.config, **settings},
@@ -246,6 +271,7 @@ def _run_of_fit(
         data=stars,
         fit=(kind, model) if kind.packing else None,
         epochs=_epochs(history) if history else (),
+        seconds=job_seconds(results / f"benchmarks/{job}.tsv"),
     )
 
 
@@ -306,6 +332,7 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
                 metrics=metrics,
                 data=results / f"data/alignment/{states}.h5",
                 epochs=_epochs(folder / HISTORY),
+                seconds=job_seconds(results / f"benchmarks/alignment/{kind}.tsv"),
             )
         )
     return runs
@@ -352,13 +379,15 @@ def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
         last_file=summary,
         metrics=metrics,
         tags={"best_point": str(best_point.get("point", ""))},
+        # From the start of its first point.
+        seconds=summary.stat().st_mtime - min(point.start_ms for point in points) / 1000,
     )
     return [parent, *points]
 
 
 def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
-    from psfdae_paper.sweeps.measured import fit_in, read_cost
+    from psfdae_paper.sweeps.measured import fit_in
 
     # A point has a folder with all its files.
     folder = results / "sweeps" / name / "points" / point
@@ -390,7 +419,7 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
         last_file=folder / "result.json",
         metrics=result["metrics"],
         epochs=_epochs(history) if history.is_file() else (),
-        seconds=read_cost(folder)["seconds"],
+        seconds=job_seconds(results / f"benchmarks_on_request/sweep/{name}/{point}.tsv"),
         status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
@@ -439,14 +468,15 @@ def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[
 
     # Other columns of the history are counters and times, not metrics.
     metrics = [
-        Metric(name, value, start_ms + int(1000 * row["seconds"]), int(row["epoch"]))
+        Metric(f"epoch/{name}", value, start_ms + int(1000 * row["seconds"]), int(row["epoch"]))
         for row in epochs
-        for name, value in row.items()
+        for name, _, value in starmap(tracked_metric, row.items())
         if name not in ("epoch", "step", "seconds", "cpu_seconds")
     ]
     # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
-    errors = [m for m in metrics if m.key == "validation_mse" and math.isfinite(m.value)]
+    errors = [m for m in metrics if "/validation_mse" in m.key and math.isfinite(m.value)]
     if errors:
         stored = min(errors, key=lambda m: m.value)
-        metrics.append(Metric("best_validation_mse", stored.value, stored.timestamp, stored.step))
+        name = stored.key.replace("epoch/", "best_")
+        metrics.append(Metric(name, stored.value, stored.timestamp, stored.step))
     return metrics

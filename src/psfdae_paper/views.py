@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from psfdae_paper.tracking import TrackedRun
+from psfdae_paper.tracking import TrackedRun, tracked_metric
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -78,6 +78,7 @@ def _view(records: Sequence[TrackedRun], condition: str) -> str:
     ]
     metrics = [name for name in common if any(name in r.metrics for r in records)]
     metrics = metrics or list(records[0].metrics)[:8]
+    metrics = list(dict.fromkeys(tracked_metric(name, 0.0)[0] for name in metrics))
     # Axes of a sweep come first: they are what its points differ in.
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
     columns = [f"params.`{axis}`" for axis in axes] + [f"metrics.`{name}`" for name in metrics]

@@ -4,12 +4,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from costs import method_class
 from psfdae.base.figures import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.base.files import ProductError
 from psfdae.base.options import File
 from psfdae.base.reading import read_table
 from psfdae.commands.cli import program
-from psfdae.methods import method
 from psfdae_paper.configuration.command import command
 
 WAYS = {
@@ -26,9 +26,17 @@ WAYS = {
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
 COLORS = {"simulation": SERIES_COLORS[0], "inference": SERIES_COLORS[1]}
 COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MB)", "disk_mb": "disk (MB)"}
-SIZES = {"components": "components K", "rows": "side of the map", "epochs": "epochs"}
 LOGS = {"xscale": "log", "yscale": "log"}
 USED = {"marker": "*", "ms": 15, "mfc": "#f0e442", "mec": "black", "ls": "", "zorder": 5}
+RING = {"ls": "", "mfc": "none", "mec": "black", "zorder": 5}
+MARKS = {
+    "paper": (
+        "the paper's training",
+        {"ls": "", "marker": "x", "ms": 9, "mew": 2, "mec": "#0072b2"},
+    ),
+    "knee": ("knee of the DAE's training", {**RING, "marker": "o", "ms": 17}),
+    "used": ("training of the preset", {**RING, "marker": "s", "ms": 13}),
+}
 MSE, FLUX = "MSE of normalised stamps", "relative error of the flux, RMS"
 HOT = "excess of the pixel over the star's flux"
 # Title, x and y axes, place of the legend.
@@ -55,9 +63,7 @@ SERIES = (
 
 @command("draw")
 def draw(
-    kind: Literal[
-        *("propagation", "training", "baseline", "methods", "inference", "scaling", "graded")
-    ],
+    kind: Literal[*("propagation", "costs", "inference", "scaling", "graded")],
     table: Annotated[File, "Table of that benchmark."],
     out: Annotated[File, "PNG."],
     scene: Annotated[str | None, "Scene whose rows are drawn."] = None,
@@ -115,80 +121,48 @@ def propagation(table):
     return figure
 
 
-def training(table):
-    """Test MSE of trainings against their CPU time, with Pareto front and knee."""
-    color = SERIES_COLORS[0]
-    figure = new_figure(5.2, layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot(table["cpu_s"], table["mse"], ls="", marker="o", ms=5, color=color, alpha=0.7)
-    marked = {"ls": "", "mfc": "none", "mec": "black"}
-    for column, label, style in (
-        ("pareto", "Pareto front", {"color": color, "lw": 1.2}),
-        ("knee", "knee", {"marker": "*", "ms": 17, **marked}),
-        ("used", "used by the preset", {"marker": "s", "ms": 13, **marked}),
-    ):
-        rows = table[table[column] == "yes"].sort_values("cpu_s")
-        axes.plot(rows["cpu_s"], rows["mse"], label=label, **style)
-    for row in table.itertuples():
-        labelled(axes, row.cpu_s, row.mse, row.point, 6)
-    axes.set(**LOGS, xlabel="CPU time of the training's one thread (s)")
-    axes.set_ylabel("test MSE, geometric mean over λ")
-    axes.set_title("Training on dataset 3: error against time")
-    axes.margins(x=0.12)
-    axes.grid(True, which="both")
-    axes.legend(loc="upper right")
+def costs(table):
+    """Error over the least possible, against the CPU time of the fit (left) and of a star."""
+    # Trials of single settings, which not all datasets have, are in the table alone.
+    everywhere = table.groupby(["method", "point"])["dataset"].transform("size")
+    table = table[everywhere == table["dataset"].nunique()].sort_values("fit_cpu_s")
+    table = table.assign(star_ms=1e3 / table["stars_per_s"], used=table["point"] == "configured")
+    figure = new_figure(1.2 + 2.7 * table["dataset"].nunique(), layout="constrained")
+    panels = figure.subplots(
+        table["dataset"].nunique(), 2, sharex="col", sharey=True, squeeze=False
+    )
+    for row, (dataset, measured) in zip(panels, table.groupby("dataset"), strict=True):
+        for name, points in measured.groupby("method", sort=False):
+            draw_method(*row, points, method_class(name).look)
+        for axes in row:
+            axes.axhline(1.0, color="black", lw=1.0)
+            axes.set(**LOGS)
+            axes.grid(True, which="both")
+            axes.margins(0.08)
+        row[0].set_ylabel(f"{dataset}: MSE over the least possible")
+    panels[-1, 0].set_xlabel("CPU time of the fit (s)")
+    panels[-1, 1].set_xlabel("CPU time of a star (ms)")
+    looks = [method_class(name).look for name in table["method"].unique()]
+    handles = [entry(x.label, color=x.color, marker=x.marker, ls="", ms=8) for x in looks]
+    handles += [entry(label, **{**style, "ms": 9}) for label, style in MARKS.values()]
+    handles.append(entry("least possible error", color="black", lw=1.0))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    figure.suptitle("Error against time: fit (left) and inference (right)")
     return figure
 
 
-def baseline(table):
-    """Test error of PCA+SOM against the time of its fit, one panel per reference."""
-    figure = new_figure(4.0, layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True)
-    used = table[table["used"] == "yes"].iloc[0]
-    for axes, reference in zip(panels, ("realisation", "template"), strict=True):
-        column, single = f"mse_{reference}", table.drop(index=used.name)
-        for (size, label), color in zip(SIZES.items(), SERIES_COLORS, strict=False):
-            other_sizes = [name for name in SIZES if name != size]
-            line = table[(table[other_sizes] == used[other_sizes]).all(axis=1)].sort_values(size)
-            single = single.drop(index=line.index, errors="ignore")
-            style = {"marker": "o", "ms": 4, "lw": 1.2, "color": color}
-            axes.plot(line["fit_s"], line[column], label=f"{label} varied", **style)
-            for row in line.drop(index=used.name).to_dict("records"):
-                labelled(axes, row["fit_s"], row[column], str(row[size]), color=color)
-        axes.plot(single["fit_s"], single[column], ls="", marker="x", color="#4d4d4d")
-        for row in single.to_dict("records"):
-            text = f"K {row['components']}, {row['rows']}×{row['columns']}, {row['epochs']}"
-            # The slow one stands at the right edge.
-            side = {"shift": -4, "ha": "right"} if row["fit_s"] > used["fit_s"] else {}
-            labelled(axes, row["fit_s"], row[column], text, **side)
-        axes.plot(used["fit_s"], used[column], **USED, label="in use")
-        axes.set(**LOGS, xlabel="time of the fit (s)", title=f"against the {reference}")
-        axes.margins(0.16)
-        axes.grid(True)
-    panels[0].set_ylabel("MSE per pixel, mean over the noise levels")
-    panels[0].legend()
-    figure.suptitle("PCA+SOM: test error against the time of the fit")
-    return figure
-
-
-def methods(table):
-    """Test error of all methods against the time of their fit and of a star."""
-    figure = new_figure(4.0, layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    table = table.assign(star_ms=1e3 / table["stars_per_s"], mse=np.log(table["mse"]))
-    for name, rows in table.groupby("method", sort=False):
-        kind, mean = method(name), rows.mean(numeric_only=True)
-        for axes, column in zip(panels, ("fit_cpu_s", "star_ms"), strict=True):
-            style = {"marker": kind.look.marker, "color": kind.look.color, "ls": "", "ms": 9}
-            axes.plot(mean[column], np.exp(mean["mse"]), label=kind.look.label, **style)
-    panels[0].set(**LOGS, xlabel="CPU time of the fit, its choices included (s)")
-    panels[1].set(**LOGS, xlabel="CPU time of a star (ms)")
-    panels[0].set_ylabel("test MSE, geometric mean over λ")
-    for axes in panels:
-        axes.grid(True, which="both")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.suptitle("All methods on dataset 3: error against time")
-    return figure
+def draw_method(fit_axes, star_axes, points, look):
+    """Draw a method's settings against the time of the fit, and that in use against a star's."""
+    style = {"color": look.color, "marker": look.marker, "ms": 8, "lw": 1.2}
+    lengths = points[points["point"] != "paper"]
+    fit_axes.plot(lengths["fit_cpu_s"], lengths["over_least"], **style)
+    star_axes.plot(*points.loc[points["used"], ["star_ms", "over_least"]].to_numpy().T, **style)
+    marked = {"paper": points["point"] == "paper", "knee": points["knee"] == "yes"}
+    marked["used"] = points["used"] & (len(points) > 1)
+    for name, rows in marked.items():
+        fit_axes.plot(points["fit_cpu_s"][rows], points["over_least"][rows], **MARKS[name][1])
+    for row in lengths[lengths["point"].str.startswith("epochs")].itertuples():
+        labelled(fit_axes, row.fit_cpu_s, row.over_least, row.point.removeprefix("epochs"), 6)
 
 
 def inference(table):

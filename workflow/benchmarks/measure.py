@@ -27,13 +27,6 @@ PATIENCE_S = 600.0  # until a process gives up to wait for those beside it
 THREAD_VARIABLES = [f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")]
 
 
-def time_calls(function, repeats, calls=1):
-    """Median seconds of a call after one to warm up, `calls` at a time if it is fast."""
-    timer = Timer(function)
-    timer.timeit(1)
-    return float(np.median(timer.repeat(repeats, calls)) / calls)
-
-
 def time_in_rounds(builders, repeats):
     """Seconds of callables, shape (callables, repeats), timed in turn so that ratios hold.
 

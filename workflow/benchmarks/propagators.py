@@ -80,15 +80,16 @@ def configured_setting(optics, benchmark, samples):
 def kernel_settings(optics, benchmark, samples, backend):
     """Settings that are timed for a wavefront that is given N `samples`.
 
-    The whole product of grid sizes, points and precisions at the configured batch and all
-    threads; then batches and threads around the setting in use.
+    Grid sizes and points in numpy, at the configured precision and batch and on all threads; in
+    either backend precisions, batches and threads around the setting in use.
     """
     used = replace(configured_setting(optics, benchmark, samples), backend=backend)
     grids = candidate_samples(optics, benchmark.peers)
     points = POINTS if benchmark.peers else POINTS[-2:]
     threads, batches = sorted({1, benchmark.threads}), BATCHES if benchmark.peers else (1,)
-    options = (backend, benchmark.threads, used.batch)
-    settings = [Setting("kernel", *point, *options) for point in product(grids, points, PRECISIONS)]
+    options = (used.precision, backend, benchmark.threads, used.batch)
+    shapes = product(grids, points) if backend == "numpy" else ()
+    settings = [Setting("kernel", *shape, *options) for shape in shapes]
     for precision, t, batch in product(PRECISIONS, threads, batches):
         settings.append(replace(used, precision=precision, threads=t, batch=batch))
     return list(dict.fromkeys([*settings, used]))

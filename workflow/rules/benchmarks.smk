@@ -10,7 +10,7 @@ rule propagation:
         f"{RESULTS}/logs/propagation/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/propagation-{{scene}}.tsv"
-    threads: timed_threads
+    threads: workflow.cores
     resources:
         mem_mb=3000,
         runtime=30,
@@ -40,7 +40,6 @@ rule propagation_tables:
         f"{RESULTS}/logs/propagation/tables.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/propagation_tables.tsv"
-    threads: timed_threads
     resources:
         mem_mb=1000,
     params:
@@ -56,11 +55,9 @@ rule propagation_tables:
 
 DRAWN = {
     **{f"propagation_{scene}": f"error against time, {scene}" for scene in SCENES},
-    "baseline": "baseline: error against time",
+    "costs": "all methods: error against time",
     "inference": "speed of the network",
-    "methods": "all methods: error against time",
     "scaling": "growth of the costs",
-    "training": "training error against time",
 }
 
 
@@ -96,109 +93,12 @@ rule figure_benchmark:
 rule benchmark:
     input:
         rules.propagation_tables.output,
-        rules.benchmark_baseline.output,
-        rules.benchmark_methods.output,
+        rules.benchmark_costs.output,
         rules.benchmark_inference.output,
         rules.benchmark_scaling.output,
-        expand(
-            rules.figure_benchmark.output, drawn=[d for d in DRAWN if d != "training"]
-        ),
-    localrule: True
-
-
-KNEE_FOLDER = f"{RESULTS}/knee/{{point}}"
-
-
-use rule stars as fresh_stars with:
-    input:
-        templates=lambda w: templates_of(dataset_config(KNEE_DATASET).stars.name),
-    output:
-        f"{RESULTS}/knee/fresh_stars.h5",
-    log:
-        f"{RESULTS}/logs/knee/fresh_stars.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/training_knee/fresh_stars.tsv"
-    threads: lambda w: dataset_config(KNEE_DATASET).optics.threads
-    resources:
-        mem_mb=3000,
-        runtime=20,
-    params:
-        config=lambda w: settings(
-            "stars",
-            f"dataset={KNEE_DATASET}",
-            # Another name is another random stream.
-            more=("stars.name=fresh", f"stars.count={KNEE.fresh_stars}"),
-        ),
-        source=source_hash("stars"),
-    message:
-        "Simulating other stars for the knee of the training"
-
-
-rule knee_train:
-    input:
-        stars=lambda w: (
-            rules.fresh_stars.output[0] if w.point == FRESH else stars_of(KNEE_DATASET)
-        ),
-    output:
-        multiext(
-            f"{KNEE_FOLDER}/",
-            weights="dae.safetensors",
-            config="config.yaml",
-            trained_on="trained_on.yaml",
-            history="history.csv",
-        ),
-    log:
-        f"{RESULTS}/logs/knee/{{point}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/training_knee/{{point}}.tsv"
-    resources:
-        mem_mb=2000,
-        runtime=60,
-    params:
-        config=lambda w: settings(
-            "fit", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point), name="dae"
-        ),
-        source=source_hash("fit", "psfdae.methods.dae"),
-        folder=subpath(output.weights, parent=True),
-        checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
-    message:
-        "Training point {wildcards.point} of the knee"
-    shell:
-        "psfdae fit dae --config {params.config} --stars {input.stars}"
-        " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
-
-
-rule knee_table:
-    input:
-        expand(rules.knee_train.output, point=KNEE.points),
-        stars=lambda w: stars_of(KNEE_DATASET),
-    output:
-        table=f"{RESULTS}/tables/benchmark_training.csv",
-        stopping=f"{RESULTS}/tables/benchmark_stopping.csv",
-    log:
-        f"{RESULTS}/logs/knee/table.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/training_knee/table.tsv"
-    threads: lambda w: dataset_config(KNEE_DATASET).evaluation.threads
-    resources:
-        mem_mb=1500,
-    params:
-        config=lambda w: settings("trainings.knee_table", f"dataset={KNEE_DATASET}"),
-        source=source_hash("workflow/benchmarks/trainings.py"),
-        program=program("trainings.knee"),
-        points=[f"--point={p}={KNEE_FOLDER.format(point=p)}" for p in KNEE.points],
-    message:
-        "Testing the trainings of the knee"
-    shell:
-        "python {params.program} --config {params.config}"
-        " --stars {input.stars} {params.points:q} --stopping {output.stopping}"
-        " --out {output.table} > {log} 2>&1"
-
-
-rule training_knee:
-    input:
-        rules.knee_table.output,
-        expand(rules.figure_benchmark.output, drawn="training"),
+        rules.prediction.input,
+        rules.scaling.input,
+        expand(rules.figure_benchmark.output, drawn=DRAWN),
     localrule: True
 
 

@@ -2,9 +2,8 @@ from psfdae_paper.configuration.aligners import ALIGNERS, trained_networks
 from psfdae.model.bundle import SUFFIX
 
 with one_line():
-    KNEE = import_module("trainings").load_knee()
-FRESH = "fresh_realisations"
-KNEE_DATASET = TIMED_DATASET = "dataset3"
+    TIMED = import_module("costs").load_points()
+TIMED_DATASET = TIMED.datasets[0]
 # The stars and the training of the model that comes with the package.
 SHIPPED_DATASET = "field"
 PACKED = [("random", "realisation")]
@@ -38,13 +37,21 @@ def bound_figures_of(dataset):
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
 
 
-def knee_overrides(point):
-    """What a point changes; the fresh stars have no test part."""
-    own = list(KNEE.points[point])
-    if point == FRESH:
-        own += [f"parts.train_stars={KNEE.fresh_stars - 1}", "parts.test_stars=1"]
-        own += [f"stars.count={KNEE.fresh_stars}"]
-    return tuple(own)
+def timed_points(w):
+    """Tables of all methods and settings whose error is set against their time."""
+    return [
+        f"{RESULTS}/costs/{dataset}/{name}-{point}.csv"
+        for dataset in TIMED.datasets
+        for name in [*names_of(dataset), *TIMED.further_methods]
+        if name in TIMED.further_methods or method(name).look.restores
+        for point in TIMED.overrides(dataset, name)
+    ]
+
+
+def timed_module(name):
+    """Module of a method, or the program of the denoisers."""
+    program = f"workflow/benchmarks/{name}.py"
+    return program if name == "denoisers" else method(name).__module__
 
 
 @cache
@@ -59,11 +66,6 @@ def strictest_dataset(scene):
         (d for d in ALL_DATASETS if dataset_config(d).scene.name == scene),
         key=strictness,
     )
-
-
-def timed_threads(w):
-    """A timing takes as many cores as it may use, so that no other job disturbs it."""
-    return dataset_config(ALL_DATASETS[0]).benchmark.threads
 
 
 def every_bundle_of_timed(w):

@@ -1,8 +1,8 @@
 # A rule for each method that stores a fit: train (DAE), baseline (PCA+SOM), fit_gmm, fit_gmm_position,
 # … (`Storage.rule` of the method's class). A method that is plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage):
-    _rule = fits.rule_of(_method)
-    _stem = fits.stem(_method, "{dataset}", "{split}", "{reference}")
+    _rule = fit_files.rule_of(_method)
+    _stem = fit_files.stem(_method, "{dataset}", "{split}", "{reference}")
     _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
     _place = model_of(_method, "{dataset}", "{split}", "{reference}")
 
@@ -13,7 +13,7 @@ for _method in (m for m in registered() if m.storage):
             unpack(lambda w, m=_method: start_of(m, w)),
             stars=lambda w: stars_of(w.dataset),
         output:
-            [str(path) for path in fits.outputs(_method, _place)],
+            [str(path) for path in fit_files.outputs(_method, _place)],
         log:
             f"{RESULTS}/logs/{_rule}/{_stem}.log",
         benchmark:
@@ -41,7 +41,7 @@ for _method in (m for m in registered() if m.storage):
             # Not an output: Snakemake would delete it with a failed job's outputs.
             checkpoint=f"{RESULTS}/checkpoints/{_method.name}/{_stem}.pt",
         message:
-            f"Fitting {_method.look.label} to {fits.stem(_method, *_names)}"
+            f"Fitting {_method.look.label} to {fit_files.stem(_method, *_names)}"
         shell:
             "psfdae fit {params.method} --config {params.config} --stars {input.stars}"
             " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"

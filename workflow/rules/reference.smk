@@ -9,10 +9,7 @@ rule reference:
         ],
         ALIGNMENT_PRODUCTS,
         rules.benchmark.input,
-        rules.training_knee.input,
-        rules.scaling.input,
         rules.stability.input,
         rules.bounds.input,
-        rules.prediction.input,
         rules.from_stars_example.output,
     localrule: True

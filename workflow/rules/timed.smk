@@ -1,4 +1,5 @@
-# Timings: each takes all cores, so that no other job disturbs it, and leaves one table.
+# Timings: each takes all cores, so that no other job disturbs it, and leaves one table; others,
+# which measure no time, run side by side.
 # Programs are those of workflow/benchmarks, by file and function.
 TIMED_BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 TIMED_MIXTURE = TIMED_BUNDLE.replace(
@@ -7,59 +8,58 @@ TIMED_MIXTURE = TIMED_BUNDLE.replace(
 OWN_MODEL = f"{RESULTS}/own_stars/example/model"
 
 
-rule benchmark_baseline:
+rule cost:
     input:
-        stars=lambda w: stars_of(TIMED_DATASET),
+        stars=lambda w: stars_of(w.dataset),
+        bounds=rules.dataset_bounds.output.summary,
     output:
-        f"{RESULTS}/tables/benchmark_baseline.csv",
+        f"{RESULTS}/costs/{{dataset}}/{{method}}-{{point}}.csv",
     log:
-        f"{RESULTS}/logs/benchmark/benchmark_baseline.log",
+        f"{RESULTS}/logs/costs/{{dataset}}-{{method}}-{{point}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_baseline.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/{{dataset}}-{{method}}-{{point}}.tsv"
+    wildcard_constraints:
+        method=r"\w+",
     threads: workflow.cores
     resources:
-        mem_mb=1500,
-        runtime=20,
-        disk_mb=2000,
+        mem_mb=2000,
+        runtime=30,
     params:
-        config=lambda w: settings("trainings.baseline", f"dataset={TIMED_DATASET}"),
-        source=program_code("trainings.baseline", []),
-        program=program("trainings.baseline"),
-        inputs=as_options,
-    message:
-        "Measuring for the table benchmark_baseline"
-    shell:
-        "python {params.program} --config {params.config} {params.inputs:q}"
-        " --out {output} > {log} 2>&1"
-
-
-rule benchmark_methods:
-    input:
-        stars=lambda w: stars_of(TIMED_DATASET),
-    output:
-        f"{RESULTS}/tables/benchmark_methods.csv",
-    log:
-        f"{RESULTS}/logs/benchmark/benchmark_methods.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_methods.tsv"
-    threads: workflow.cores
-    resources:
-        mem_mb=1500,
-        runtime=20,
-        disk_mb=2000,
-    params:
-        config=lambda w: settings("trainings.methods", f"dataset={TIMED_DATASET}"),
-        source=program_code(
-            "trainings.methods",
-            [method(name).__module__ for name in names_of(TIMED_DATASET)],
+        config=lambda w: settings(
+            "costs.cost",
+            f"dataset={w.dataset}",
+            more=tuple(TIMED.overrides(w.dataset, w.method)[w.point]),
+            name=w.method,
         ),
-        program=program("trainings.methods"),
+        source=lambda w: program_code("costs.cost", [timed_module(w.method)]),
+        program=program("costs.cost"),
         inputs=as_options,
     message:
-        "Measuring for the table benchmark_methods"
+        "Timing {wildcards.method}, {wildcards.point}, on {wildcards.dataset}"
     shell:
-        "python {params.program} --config {params.config} {params.inputs:q}"
+        "python {params.program} {wildcards.method} --config {params.config}"
+        " --dataset {wildcards.dataset} --point {wildcards.point} {params.inputs:q}"
         " --out {output} > {log} 2>&1"
+
+
+rule benchmark_costs:
+    input:
+        timed_points,
+    output:
+        f"{RESULTS}/tables/benchmark_costs.csv",
+    log:
+        f"{RESULTS}/logs/costs/table.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_costs.tsv"
+    localrule: True
+    params:
+        source=program_code("costs.costs", []),
+        program=program("costs.costs"),
+        points=repr(TIMED),
+    message:
+        "Joining errors and times of all methods"
+    shell:
+        "python {params.program} --out {output} {input} > {log} 2>&1"
 
 
 rule benchmark_inference:
@@ -118,7 +118,7 @@ rule predict_throughput:
     log:
         f"{RESULTS}/logs/benchmark/predict_throughput.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_throughput.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_throughput.tsv"
     threads: workflow.cores
     resources:
         mem_mb=1500,
@@ -144,8 +144,7 @@ rule predict_poppy:
     log:
         f"{RESULTS}/logs/benchmark/predict_poppy.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_poppy.tsv"
-    threads: workflow.cores
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_poppy.tsv"
     resources:
         mem_mb=1500,
         runtime=20,
@@ -175,8 +174,7 @@ rule predict_coverage:
     log:
         f"{RESULTS}/logs/benchmark/predict_coverage.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_coverage.tsv"
-    threads: workflow.cores
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_coverage.tsv"
     resources:
         mem_mb=1500,
         runtime=30,
@@ -202,8 +200,7 @@ rule predict_strange:
     log:
         f"{RESULTS}/logs/benchmark/predict_strange.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/prediction/predict_strange.tsv"
-    threads: workflow.cores
+        f"{RESULTS}/benchmarks_on_request/benchmark/predict_strange.tsv"
     resources:
         mem_mb=1500,
         runtime=20,
@@ -226,7 +223,7 @@ rule scaling_stages:
     log:
         f"{RESULTS}/logs/benchmark/scaling_stages.log",
     benchmark:
-        f"{RESULTS}/benchmarks_on_request/scaling/scaling_stages.tsv"
+        f"{RESULTS}/benchmarks_on_request/benchmark/scaling_stages.tsv"
     threads: workflow.cores
     resources:
         mem_mb=4000,

@@ -226,7 +226,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Storage:
-    """Files of a fit, and the names of the rule and runs that make them; see `fit_files`.
+    """Files of a fit, and the name of the rule that makes them; see `fit_files`.
 
     Attributes
     ----------
@@ -238,8 +238,8 @@ class Storage:
         Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
     per_reference : bool
         Fitted for each reference, or once for both.
-    rule, run : str
-        Name of its rule and of its runs in MLflow; by default they follow from the method's name.
+    rule : str
+        Name of its rule; by default it follows from the method's name.
     """
 
     arrays: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -247,7 +247,6 @@ class Storage:
     diagnostics: tuple[str, ...] = ()
     per_reference: bool = False
     rule: str = ""
-    run: str = ""
 
 
 @dataclass(frozen=True)

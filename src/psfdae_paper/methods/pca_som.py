@@ -125,7 +125,6 @@ class PcaSom(Method):
             "owner": ("1", "number of each node's fit"),
         },
         rule="baseline",
-        run="baseline",
     )
     packing = None
     groups: ClassVar = {"baseline": Baseline}

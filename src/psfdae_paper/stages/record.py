@@ -35,14 +35,8 @@ if TYPE_CHECKING:
 
     from psfdae_paper.configuration.schema import Config
 
-MAY_STAY = re.compile(
-    r"(sweeps|paper|figures/benchmark)/.+"
-    r"|tables/(benchmark_\w+|scaling_stages|predict_poppy\w*)\.csv"
-)
-"""Names of products that may stay from an earlier record.
-
-They take too long, or need a machine without other work, to be made for every record.
-"""
+MAY_STAY = re.compile(r"(sweeps|paper)/.+")
+"""Names of products that may stay from an earlier record: they take too long for every record."""
 
 
 @command("runtime")

@@ -15,6 +15,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,12 +34,13 @@ from psfdae_paper.tracking import (
     runs_of_datasets,
     runs_of_sweep,
     settings_of,
+    tracked_metric,
 )
 from psfdae_paper.views import show
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Metric
+    from mlflow.entities import Metric, Param
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
@@ -287,7 +289,8 @@ def import_run(
         MLflow's id of the run, and what was done.
     """
     # Active runs of the same place in the results folder that this stage has made.
-    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT]
+    # The source tells the method; earlier versions had another name for some.
+    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT if key != "kind"]
     query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
     slot = client.search_runs([experiment], query)
     # Of these, the ones with the same settings, and the one with the same files as well.
@@ -351,14 +354,15 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         origin = {"dataset_name": data.name, "dataset_digest": data.digest}
     if model_id := log_model(client, experiment, run_id, run):
         origin["model_id"] = model_id
-    # Metrics of each epoch, and those of the finished run as epoch 0.
-    metrics = epoch_metrics(run.epochs, run.start_ms)
-    metrics += [Metric(key, v, run.end_ms, 0, **origin) for key, v in run.metrics.items()]
-    log_metrics(client, run_id, metrics)
-    # MLflow takes 100 params at once, and 6000 characters of a param.
+    # Metrics of the finished run, then those of each epoch.
+    metrics = [
+        Metric(name, value, run.end_ms, step, **origin)
+        for name, step, value in starmap(tracked_metric, run.metrics.items())
+    ]
+    metrics += epoch_metrics(run.epochs, run.start_ms)
+    # MLflow takes 6000 characters of a param.
     params = [Param(key, v[:6000]) for key, v in settings_of(run, tags["preset"]).items()]
-    for i in range(0, len(params), 100):
-        client.log_batch(run_id, params=params[i : i + 100], synchronous=True)
+    log_metrics(client, run_id, metrics, params)
     # Files that are not part of the model: tables, figures and settings.
     with tempfile.TemporaryDirectory() as folder:
         side_files = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
@@ -371,19 +375,25 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
     return run_id
 
 
-def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
-    """Log metrics as far as they are finite; MLflow takes 1000 at once.
+def log_metrics(
+    client: MlflowClient, run_id: str, metrics: Sequence[Metric], params: Sequence[Param] = ()
+) -> None:
+    """Log metrics as far as they are finite, and params; MLflow takes 1000 at once.
 
     Parameters
     ----------
     client : MlflowClient
     run_id : str
     metrics : sequence of Metric
+    params : sequence of Param
+        Settings of the run.
     """
     # A training that diverged has infinite errors, which no database takes.
     finite = [metric for metric in metrics if math.isfinite(metric.value)]
-    for i in range(0, len(finite), 1000):
-        client.log_batch(run_id, metrics=finite[i : i + 1000], synchronous=True)
+    # 100 of the 1000 may be params.
+    for i in range(max(len(finite) // 900, len(params) // 100) + 1):
+        rows = finite[900 * i : 900 * (i + 1)], params[100 * i : 100 * (i + 1)]
+        client.log_batch(run_id, *rows, synchronous=True)
 
 
 def tags_of(run: TrackedRun) -> dict[str, str]:

@@ -1,0 +1,184 @@
+"""Error against CPU time, of the fit and of a star: every method, and other settings of some."""
+
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+from timeit import Timer
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from measure import isolated, pareto, write
+from psfdae.base.belonging import STARS, require
+from psfdae.base.files import read_product
+from psfdae.base.options import File
+from psfdae.base.reading import read_table
+from psfdae.base.settings import Group
+from psfdae.commands.cli import program
+from psfdae.methods import groups_of, method
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import config_dir, load_file, part
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Config
+
+PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
+Settings = dict[str, dict[PointName, list[str]]]
+
+
+class Points(Group):
+    """Methods that are timed, and settings other than those in use (`config/knee/points.yaml`).
+
+    Attributes
+    ----------
+    datasets : list of str
+        Datasets on which all methods of the configuration are timed.
+    further_methods : list of str
+        Methods that are timed beside those.
+    settings : dict
+        Overrides of the configuration, by method and by the name of the point.
+    trials : dict
+        The same, on the first dataset alone.
+    """
+
+    datasets: Annotated[list[str], Field(min_length=1)]
+    further_methods: list[str]
+    settings: Settings
+    trials: Settings
+
+    def overrides(self, dataset, name):
+        """Return the overrides of a method by point; "configured" has none."""
+        trials = self.trials.get(name, {}) if dataset == self.datasets[0] else {}
+        return {"configured": [], **self.settings.get(name, {}), **trials}
+
+
+def load_points():
+    """Read and check the file; raises ConfigError."""
+    return load_file(Points, config_dir() / "knee" / "points.yaml")
+
+
+def method_class(name):
+    """Return the class of a method of the package, or of the denoisers."""
+    return import_module(name).Denoisers if name == "denoisers" else method(name)
+
+
+def groups(name, **options):
+    """Return the groups of the configuration that decide error and time of a method."""
+    of_fit = groups_of(name) if name != "denoisers" else ("noise", "parts")
+    return tuple(dict.fromkeys((*SIMULATION, *of_fit, "bounds", "evaluation")))
+
+
+@command("cost", reads=groups)
+def cost(
+    config: Config,
+    name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
+    dataset: Annotated[str, "Name in the table."],
+    point: Annotated[str, "Name of the settings in the table."],
+    stars: Annotated[File, "Product of the stage stars."],
+    bounds: Annotated[File, "CSV of the stage bounds."],
+    out: Annotated[File, "CSV with one row."],
+) -> None:
+    """Time METHOD on one thread: its fit, and the stars whose least possible error is known."""
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
+    bound = least_errors(read_table(bounds), dataset, method_class(name).needs.position)
+    row = isolated(1, time_method, name, config.model_dump(), stars, bound)
+    write(out, [{"dataset": dataset, "method": name, "point": point, **row}])
+
+
+def least_errors(bounds, dataset, knows_position):
+    """Return the least possible error (posterior mean, realisation) by noise level λ.
+
+    Levels are those at which the bounds with and without the position in the field are tight for
+    all stars; all levels if there is none.
+    """
+    rows = bounds.query("dataset == @dataset and reference == 'realisation' and metric == 'mse'")
+    columns = ["value", "tight", "missing"]
+    table = rows.pivot(index="noise_level", columns="method", values=columns)
+    means = ["bayes", "bayes_position"]
+    tight = table.tight[means].eq("yes") & table.missing[means].eq(0)
+    levels = table.index[tight.all(axis=1)] if tight.all(axis=1).any() else table.index
+    return table.value[means[knows_position]][levels].astype(float).to_dict()
+
+
+def time_method(name, tree, stars, bound):
+    """Return CPU seconds of the fit, stars per second at the slowest level, and mean errors."""
+    from psfdae.base.threads import limit_threads
+    from psfdae.methods.metrics import mse
+    from psfdae.model import star_sets
+    from psfdae_paper.bounds.estimates import SPLIT, bounded_stars
+
+    # Imports are no part of the fit.
+    for module in ("torch", "minisom", "sklearn.cluster", "skimage.restoration"):
+        import_module(module)
+    limit_threads(1)
+    config, kind = part(groups(name), tree), method_class(name)
+    product = star_sets.read_stars(stars, "template")
+    tested = bounded_stars(config, product)
+    position = star_sets.field_positions(product)[tested.star]
+    # The fit to the training stars of the random split, its choices by validation stars included.
+    with TemporaryDirectory() as folder:
+        source = config, kind, product, SPLIT, "realisation"
+        data = star_sets.training_set(*source, checkpoint=Path(folder, "checkpoint"))
+        start = process_time()
+        fitted = kind.fit(data, **kind.settings(config))
+        fit_s = process_time() - start
+    # Stars per second of CPU time, and the mean squared error, at each noise level.
+    rates, errors, restored = [], [], {}
+    for level in bound:
+        noisy = tested.noisy[level]
+
+        def restore(noisy=noisy, level=level):
+            place = position[: len(noisy)]
+            restored["psf"] = fitted.estimate(noisy, level, place, with_sigma=False).psf
+
+        # What is made once for a level, such as factorisations, is not of the stars.
+        restore(noisy[:1])
+        # As many calls as last 0.2 s.
+        calls, seconds = Timer(restore, timer=process_time).autorange()
+        rates.append(calls * len(noisy) / seconds)
+        errors.append(mse(restored["psf"], tested.truth["realisation"]).mean())
+    row = {"fit_cpu_s": fit_s, "stars_per_s": min(rates), "mse": np.exp(np.log(errors).mean())}
+    # Geometric mean over the noise levels of the error over the least possible one.
+    ratios = np.array(errors) / [*bound.values()]
+    row |= {"over_least": np.exp(np.log(ratios).mean()), "stars": len(tested.star)}
+    return row | {"noise_levels": " ".join(f"{level:g}" for level in bound)}
+
+
+@command("costs")
+def costs(
+    rows: Annotated[tuple[File, ...], {"argument": True}],
+    out: Annotated[File, "CSV with time and error of every method and setting."],
+) -> None:
+    """Join ROWS, tables of the command cost, and mark the knee of the trainings of each dataset."""
+    import pandas as pd
+
+    table, points = pd.concat(map(read_table, rows), ignore_index=True), load_points()
+    overrides = [points.overrides(row.dataset, row.method)[row.point] for row in table.itertuples()]
+    table.insert(3, "settings", [" ".join(words) for words in overrides])
+    # Trainings of the configured network that differ in nothing but their length.
+    lengths = table[(table.method == "dae") & table.settings.str.fullmatch(r"(train\.epochs=\d+)?")]
+    table["knee"] = "no"
+    for _, trainings in lengths.groupby("dataset"):
+        index = knee(trainings.fit_cpu_s.to_numpy(), trainings.over_least.to_numpy())
+        table.loc[trainings.index[index], "knee"] = "yes"
+    write(out, table)
+
+
+def knee(time, error, worthwhile=0.9):
+    """The point of the Pareto front beyond which more time is not worth it.
+
+    From the cheapest point on, a later point of the front is taken if it lowers the error to
+    `worthwhile` or less per doubling of the time.
+    """
+    front = pareto(time, error)
+    point = front[0]
+    for candidate in front[1:]:
+        doublings = np.log2(time[candidate] / time[point])
+        if error[candidate] / error[point] <= worthwhile**doublings:
+            point = candidate
+    return int(point)
+
+
+if __name__ == "__main__":
+    program(cost, costs)
