@@ -34,5 +34,5 @@ def test_truth_of_a_night_names_what_is_wrong(folder):
     headers = [fits.getheader(path) for path in intact]
     assert np.ptp([header["AIRMASS"] for header in headers]) > 0.3
     assert len({header["DATE-OBS"] for header in headers}) == len(headers)
-    with pytest.raises(TypeError, match="truncated|could not be|buffer"):
+    with pytest.raises(TypeError, match=r"truncated|buffer"):
         fits.getdata(truth[truth.fault == "truncated file"].image.iloc[0])
