@@ -55,14 +55,23 @@ class NightRecipe:
 
     exposures: int = 60
     field: FieldRecipe = field(
-        default=FieldRecipe(side_px=512, bright=90, faint=90, saturated=2, blended=0, seeing_px=1.8)
+        default=FieldRecipe(
+            side_px=512,
+            bright=120,
+            faint=80,
+            saturated=2,
+            blended=0,
+            bright_snr=(150.0, 3000.0),
+            seeing_px=2.1,
+            seidel=(0.1, 0.6, 0.2, 0.2, 0.0),
+        )
     )
     minutes: float = 3.0  # from one exposure to the next
     dither_px: float = 12.0  # largest offset of a pointing along either axis
     # The focus runs away between these parts of the night, by so many waves W020 at the edge of
     # the pupil, and is mended then.
     focus_lost: tuple[float, float] = (0.3, 0.7)
-    focus_waves: float = 0.8
+    focus_waves: float = 0.6
     extinction_mag: float = 0.15  # per airmass
     cloud_transmission: float = 0.06
     trail_px: float = 8.0
