@@ -110,6 +110,7 @@ class PsfModel(WholeImages, FieldPsfs):
 
         # Facts on the file and on conventions are left to the command.
         left_out = {"Name", "Written", "Licence", "SHA-256", "Framing", "Normalisation"}
+        left_out |= {"Noise-equivalent area", "Flagged as unlike"}
         facts = model_facts(self.bundle).items()
         rows = [(name, escape(fact)) for name, fact in facts if name not in left_out]
         tables = [html_table(["PsfModel", self.name], rows)]
