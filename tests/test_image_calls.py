@@ -89,8 +89,9 @@ def test_models_are_copied_and_pickled_and_work_on_images_side_by_side(image, mo
     # The model of photutils, with the values of its parameters.
     grid = model.to_photutils(nodes=3)
     grid.x_0 = 40.0
-    for again in (pickle.loads(pickle.dumps(grid)), copy.deepcopy(grid)):
-        assert type(again) is type(grid) and again.x_0 == 40.0 and again(41, 40) == grid(41, 40)
+    for unpickled in (pickle.loads(pickle.dumps(grid)), copy.deepcopy(grid)):
+        assert type(unpickled) is type(grid) and unpickled.x_0 == 40.0
+        assert unpickled(41, 40) == grid(41, 40)
 
 
 def test_what_a_user_holds_is_shown_in_a_line_and_in_short_numbers(image, stars, model):
