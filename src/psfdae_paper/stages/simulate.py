@@ -416,7 +416,7 @@ def example_night(
     """
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
-    write_columns(reference, {name: stars[name] for name in stars.colnames})
+    write_columns(reference, {name: stars[name] for name in ("ra", "dec", "mag")}, digits=9)
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"

@@ -32,6 +32,7 @@ from psfdae_paper.tracking import (
     epoch_metrics,
     runs_of_alignment,
     runs_of_datasets,
+    runs_of_night,
     runs_of_sweep,
     settings_of,
     tracked_metric,
@@ -63,6 +64,7 @@ def track(
         tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
     ] = (),
     alignment: Annotated[bool, "The networks of scene 3."] = False,
+    night: Annotated[bool, "The images of a night."] = False,
     sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
@@ -74,9 +76,10 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
-    # Methods, networks of scene 3 and sweeps; a sweep before its points.
+    # Methods, networks of scene 3, images of a night and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
+    runs += runs_of_night(results) if night else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
     import_runs(runs, preset, database, out)
 
