@@ -40,11 +40,6 @@ def night_files(part):
     return [file for file in dict.fromkeys(files) if file and os.path.isfile(file)]
 
 
-# A job that is killed costs its images, not the others.
-if config["images"]:
-    workflow.execution_settings.keep_going = True
-
-
 rule night_images:
     input:
         lambda w: night_files(w.part),
