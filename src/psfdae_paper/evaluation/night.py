@@ -79,8 +79,11 @@ def night_figure(night: DataFrame) -> Figure:
             values = night[f"{column}_{place}"]
             axes.plot(x, values, ".-", ms=4, lw=0.7, color=color, label=place.replace("_", " "))
         axes.set_ylabel(label)
-        # An outlier must not flatten all others.
-        axes.set_ylim(0.0, 1.6 * night.filter(like=column).quantile(0.9).max())
+        # The range is that of good images: an outlier must not flatten all others.
+        usual = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
+        low, high = usual.min().min(), usual.max().max()
+        if low < high:
+            axes.set_ylim(low - 0.2 * (high - low), high + 0.3 * (high - low))
     panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
     panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")
     panels[2].set_xlabel("time (UT)" if x is time else "number of the image")

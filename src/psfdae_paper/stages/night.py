@@ -109,7 +109,7 @@ def night_images(
                 stated = row.get("camera"), row.get("filter"), stars.settings.framing.stamp_px
                 groups.setdefault((*camera, *stated), {})[name] = stars
         except Exception as error:
-            row["reason"] = reason_of(error)
+            row["reason"] = reason_of(error, row)
     for stars_by_name in groups.values():
         start: PsfModel | None = None
         for name in from_most_usual(stars_by_name):
@@ -119,7 +119,7 @@ def night_images(
                 results[name]["start"] = start.name if start else ""
                 start = start or model
             except Exception as error:
-                results[name]["reason"] = reason_of(error)
+                results[name]["reason"] = reason_of(error, results[name])
             print(name, results[name]["reason"] or "done", flush=True)
     write_csv(out, DataFrame(list(results.values())))
 
@@ -177,12 +177,14 @@ def night_count(table: Annotated[File, {"argument": True}, "CSV of the night."])
     print(f"{table}: {sentence}")
 
 
-def reason_of(error: Exception) -> str:
+def reason_of(error: Exception, row: Mapping[str, object]) -> str:
     """Return why an image cannot be used, in one line; a bug is printed with its traceback."""
     message = refusal(error)
     if message is None:
         traceback.print_exception(error)
-    return message or f"{type(error).__name__}: {error}"
+        message = f"{type(error).__name__}: {error}"
+    # The row names the image already.
+    return " ".join(message.removeprefix(f"{row['image']}: ").split())
 
 
 def bright_stars(row: Mapping[str, object]) -> Stars:
