@@ -140,16 +140,16 @@ print(json.dumps(found))
 def test_nothing_loads_packages_that_it_does_without():
     """In one interpreter, from what must be lightest to what may load most."""
     line = [sys.executable, "-c", LIGHT]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) == 3
-    assert not any(found.values()), found
+    process = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    loaded = json.loads(process.stdout.splitlines()[-1])
+    assert len(loaded) == 3
+    assert not any(loaded.values()), loaded
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_progress_is_a_bar_in_a_terminal_and_nothing_elsewhere(monkeypatch, is_terminal):
-    """Of tasks within a task nothing is shown; one that needs fewer steps ends at 100 %."""
+    """Tasks within a task are not shown; one that needs fewer steps ends at 100 %."""
     monkeypatch.setattr("time.time", itertools.count(0.0, 0.6).__next__)
     error = io.StringIO()
     error.isatty = lambda: is_terminal

@@ -70,7 +70,7 @@ def light(tmp_path_factory):
 
 
 def run(light, folder, script):
-    """What a bash script prints in a folder, `psfdae` and `python` being the environment's."""
+    """Output of a bash script in a folder, `psfdae` and `python` being the environment's."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment["PATH"] = f"{light}{os.pathsep}{os.environ['PATH']}"
     process = captured(["bash", "-euc", script], cwd=folder, env=environment)
@@ -116,10 +116,10 @@ def test_commands_and_python_lines_of_a_page_run_without_extras(light, page, tmp
         assert models[0].read_bytes() == models[1].read_bytes()
         assert (tmp_path / "page.html").stat().st_size > 10_000
     if page == "docs/first_session":
-        drawn, shown = (
+        figure_files, shown = (
             imread(folder / "first_session.png") for folder in (tmp_path, ROOT / "docs/figures")
         )
-        assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 0.01
+        assert figure_files.shape == shown.shape and np.abs(figure_files - shown).mean() < 0.01
 
 
 def test_environment_is_small_and_holds_no_extra(light, tmp_path):
