@@ -39,24 +39,21 @@ if TYPE_CHECKING:
 class Gmm(Group):
     """Mixture of Gaussians; of several values the validation stars choose."""
 
-    stars: Count | None = Field(None, description="Training stars that are learnt from; null: all")
-    components: Annotated[list[Count], Field(min_length=1)] = Field(
-        [16, 1, 4, 64, 128],
-        description="Clusters K among which a search goes, from the first one, as long as it "
-        "pays; more than stars are not",
-    )
-    shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
-        [10.0, 3.0, 30.0, 100.0],
-        description="Stars ν that the covariance of all clusters counts for in each; searched "
-        "from the first one, too",
-    )
-    principal: Count = Field(40, description="Principal components in which stars are clustered")
-    place: Positive = Field(
-        1.0,
-        description="RMS of the field position beside that of the principal components, "
-        "for methods that are given it",
-    )
-    threads: Count = Field(1, description="Threads of the linear algebra")
+    stars: Count | None = None
+    """Training stars that are learnt from; null: all."""
+    components: Annotated[list[Count], Field(min_length=1)] = Field([16, 1, 4, 64, 128])
+    """Clusters K among which a search goes, from the first one, as long as it pays; more than stars
+    are not."""
+    shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field([10.0, 3.0, 30.0, 100.0])
+    """Stars ν that the covariance of all clusters counts for in each; searched from the first one,
+    too."""
+    principal: Count = 40
+    """Principal components in which stars are clustered."""
+    place: Positive = 1.0
+    """RMS of the field position beside that of the principal components, for methods that are given
+    it."""
+    threads: Count = 1
+    """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True, eq=False)
