@@ -56,7 +56,7 @@ class Gmm(Group):
     """Threads of the linear algebra."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture(MixtureLaw, Method):
     """Fitted Gaussian mixture.
 
