@@ -123,7 +123,7 @@ def test_stated_size_is_taken_as_it_is():
     assert from_words(overrides).calibration_stars.light_min == 0.9
 
 
-@pytest.mark.parametrize("kind", ["wide", "rings"])
+@pytest.mark.parametrize("kind", ["wide_stars", "rings"])
 def test_large_stars_are_found_as_one_source_each(kind, request):
     image, place = request.getfixturevalue(kind)
     detected = ImageInput(image, detect=5.0).open(16).positions
