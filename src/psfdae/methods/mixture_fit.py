@@ -259,9 +259,10 @@ def best_on_validation(
     method_class : type
         Class of the mixtures.
     """
-    # The same noise for all mixtures, so that their errors can be compared. Every second λ is
-    # enough: the errors at those between lie between theirs.
-    rng, levels = stream(data.seed, "noise", "gmm validation"), data.levels[::2]
+    # The same noise for all mixtures, so that their errors can be compared. Of many λ, those
+    # between the least and the greatest stand for all.
+    rng, levels = stream(data.seed, "noise", "gmm validation"), np.sort(data.levels)
+    levels = levels[1:-1] if len(levels) > 2 else levels
     noisy = [data.noise.draw(data.images[judge], level, rng) for level in levels]
     truth, given_position = data.references[judge], method_class.needs.position
     position = data.positions[judge] if given_position else None
