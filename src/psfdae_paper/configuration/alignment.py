@@ -197,13 +197,11 @@ class Fit(Group):
 
     # With more states the fit is slower, and closer to the exact optics.
     neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
-        125,
+        60,
         description="Computed states that a stamp is interpolated from, in all but the last step",
     )
     # Without these states, estimates at the edge of the range would be less accurate.
-    outer_states: Count = Field(
-        1000, description="States beyond the range that are computed for it"
-    )
+    outer_states: Count = Field(400, description="States beyond the range that are computed for it")
     # A fit ends by its tolerance, or here.
     iterations: Count = Field(12, description="Most steps of a fit")
     # After a step of 0.3 standard errors, a few hundredths remain to the maximum.
