@@ -242,8 +242,11 @@ def commands():
                 continue
             first_sentence = command_modules()[name][1].partition(". ")[0].removesuffix(".")
             command = as_click(stage(name))
+            # --quiet is an option of all of them, which the page says once.
             options = {
-                p.opts[0]: p.help or "" for p in command.params if isinstance(p, click.Option)
+                p.opts[0]: p.help or ""
+                for p in command.params
+                if isinstance(p, click.Option) and p.name != "quiet"
             }
             # Arguments of the command in capitals, as its help has them.
             arguments = [p for p in command.params if isinstance(p, click.Argument)]

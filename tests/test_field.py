@@ -80,7 +80,7 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
 
 
 def gridded(path):
-    """A model of photutils, as docs/tutorial.md reads it: `GriddedPSFModel.read` takes 3.1."""
+    """Model of photutils from a grid's file, of any release: `GriddedPSFModel.read` takes 3.1."""
     cube, header = fits.getdata(path, header=True)
     yx = [header[f"DET_YX{k}"].strip("()").split(",") for k in range(len(cube))]
     xy = [(float(x), float(y)) for y, x in yx]

@@ -6,10 +6,13 @@ import errno
 import io
 import itertools
 import json
+import os
+import pty
 import re
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import h5py
 import numpy as np
@@ -25,6 +28,8 @@ from psfdae.base.files import (
     write_product,
     write_text,
 )
+from psfdae.commands.cli import as_click, command_modules, stage
+from psfdae.commands.terminal import bar, bar_or_lines
 
 
 def write(path, values=None):
@@ -147,21 +152,86 @@ def test_nothing_loads_packages_that_it_does_without():
     assert not any(found.values()), found
 
 
-@pytest.mark.parametrize("is_terminal", [False, True])
-def test_progress_is_a_bar_in_a_terminal_and_nothing_elsewhere(monkeypatch, is_terminal):
-    """Of tasks within a task nothing is shown; one that needs fewer steps ends at 100 %."""
+def test_progress_is_a_bar_in_a_terminal(monkeypatch):
+    """A task within a task moves the bar of the outer one; fewer steps than stated end at 100 %."""
     monkeypatch.setattr("time.time", itertools.count(0.0, 0.6).__next__)
     error = io.StringIO()
-    error.isatty = lambda: is_terminal
+    error.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", error)
-    for _ in progress.steps("stars", range(5)):
-        assert list(progress.steps("inner", "abc")) == ["a", "b", "c"]
-    with progress.task("field", 9) as advance:
-        advance(4)
-        advance(1)
+    with progress.displayed_by(bar):
+        for _ in progress.steps("stars", range(4)):
+            assert list(progress.steps("inner", "abcd")) == ["a", "b", "c", "d"]
+        with progress.task("field", 9) as advance:
+            advance(4)
+            advance(1)
     shown = error.getvalue()
-    assert [shown.count(word) > 0 for word in ("stars", "inner")] == [is_terminal, False]
-    assert shown.count("100%") == 2 * is_terminal
+    # The first sixteenths of the stars pass within the first second; then each is shown.
+    percents = [int(p) for p in re.findall(r"(\d+)%", shown.partition("field")[0])]
+    assert percents == sorted(percents)
+    assert {31, 56, 81, 100} <= {*percents}
+    assert shown.count("inner") > 3
+    assert shown.count("100%") >= 2
+
+
+def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):
+    """Of 100 steps of 1 s a log has ten lines, and with them what is left at this pace."""
+    seconds = itertools.count(0.0, 1.0)
+    monkeypatch.setattr("time.time", seconds.__next__)
+    with progress.displayed_by(bar_or_lines), progress.task("training", 100) as advance:
+        for step in range(100):
+            advance(1, f"epoch {step + 1}")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 9
+    assert lines[0] == "training: 10%  about 90 s left  epoch 10"
+
+
+def test_every_command_takes_quiet(tmp_path):
+    """A command says what it did, unless it is told to be quiet; an error is said in any case."""
+    for name in command_modules():
+        assert "--quiet" in {option.opts[0] for option in as_click(stage(name)).params}, name
+    assert psfdae("describe").output
+    assert not psfdae("describe", "--quiet").output
+    assert refused("describe", "none.psf.safetensors", "--quiet")
+
+
+def test_a_command_shows_a_bar_in_a_terminal_and_lines_in_a_log(tmp_path):
+    """The same task in a pseudo-terminal, in a file, and with --quiet in a pseudo-terminal."""
+    text = """
+import time
+from psfdae.base.progress import task
+from psfdae.commands.cli import command, program
+
+time.time = iter(range(0, 1000, 6)).__next__
+
+@command("long")
+def long():
+    with task("field", 4) as advance:
+        for _ in range(4):
+            advance(1)
+    print("finished")
+
+program(long)
+"""
+    program = tmp_path / "long.py"
+    program.write_text(text)
+    shown = {}
+    for words in ((), ("--quiet",)):
+        # What the process writes to its terminal is read from the other end.
+        master, slave = pty.openpty()
+        line = [sys.executable, program, "long", *words]
+        subprocess.run(line, stdout=slave, stderr=slave, stdin=slave, check=True)
+        os.close(slave)
+        with suppress(OSError):  # Linux's way to say that the other end was closed
+            shown[words] = os.read(master, 10**6).decode()
+        os.close(master)
+    assert "100%" in shown[()]
+    assert "finished" in shown[()]
+    assert ("--quiet",) not in shown
+    line = [sys.executable, program, "long"]
+    in_log = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert in_log.stdout == "finished\n"
+    assert in_log.stderr.startswith("field: 50%  about ")
+    assert len(in_log.stderr.splitlines()) == 1
 
 
 def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 
 import joblib
 import numpy as np
@@ -20,16 +21,21 @@ from image_training import few_draws
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
-    """An image of 70 stars."""
+    """An image of 70 stars with a WCS."""
     pixels, _ = small_field.field()
-    return small_field.write(tmp_path_factory.mktemp("image_calls") / "sky.fits", pixels)
+    path = tmp_path_factory.mktemp("image_calls") / "sky.fits"
+    return small_field.write(path, pixels, **small_field.TANGENT.to_header())
 
 
 @pytest.fixture(scope="module")
-def model(image):
+def stars(image):
+    """The bright ones of its stars."""
+    return library.Stars.from_image(image, detect=True, train_stars=120, test_stars=40)
+
+
+@pytest.fixture(scope="module")
+def model(image, stars):
     """The model of its field, as read from the file beside it."""
-    sizes = {"train_stars": 120, "test_stars": 40}
-    stars = library.Stars.from_image(image, detect=True, **sizes)
     with few_draws():
         model = library.fit(stars, method="field", orders=[1], modes=4)
     bundle = image.with_name("sky.psf.safetensors")
@@ -53,6 +59,10 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
     residual = model.residual(image, detect=True)
     assert isinstance(residual, CCDData)
     np.testing.assert_array_equal(residual.data, fits.getdata(without_stars))
+    # A place of the sky is at the same pixel as in the image.
+    sky = small_field.TANGENT.pixel_to_world(10.0, 20.0)
+    for wcs in (residual.wcs, CCDData.read(without_stars).wcs):
+        np.testing.assert_allclose(wcs.world_to_pixel(sky), (10.0, 20.0), atol=1e-6)
 
 
 def test_detected_stars_are_a_star_list(image, model):
@@ -73,3 +83,34 @@ def test_models_are_copied_and_pickled_and_work_on_images_side_by_side(image, mo
     predictions = joblib.Parallel(n_jobs=2)(map(predict, [model, *copies]))
     for prediction in predictions[1:]:
         np.testing.assert_array_equal(prediction.psf, predictions[0].psf)
+    # A bound method as the page on Python has it.
+    (fluxes,) = joblib.Parallel(n_jobs=2)([joblib.delayed(model.photometry)(image, detect=True)])
+    assert len(fluxes) == small_field.COUNT
+    # The model of photutils, with the values of its parameters.
+    grid = model.to_photutils(nodes=3)
+    grid.x_0 = 40.0
+    for unpickled in (pickle.loads(pickle.dumps(grid)), copy.deepcopy(grid)):
+        assert type(unpickled) is type(grid) and unpickled.x_0 == 40.0
+        assert unpickled(41, 40) == grid(41, 40)
+
+
+def test_what_a_user_holds_is_shown_in_a_line_and_in_short_numbers(image, stars, model):
+    report = library.validate(model, stars)
+    prediction = model.predict_image(image, detect=True)
+    parts = stars.observation, stars.candidates, model.info, model.method, model.wings
+    for thing in (stars, model, report, prediction, *parts):
+        assert "\n" not in repr(thing) and len(repr(thing)) < 200, repr(thing)
+    assert f"{len(stars)} stars" in repr(stars) and f"{len(prediction)} stars" in repr(prediction)
+    # In a notebook, each is a table; a report has its picture, too.
+    for thing in (stars, model, report, prediction):
+        assert thing._repr_html_().count("<table>") == thing._repr_html_().count("</table>") > 0
+    assert '<img src="data:image/png;base64,' in report._repr_html_()
+    # No cell has a number of more than nine digits, such as 4.999999999883585; one of degrees has.
+    tables = [report.table, report.evaluation, report.per_star, report.photometry, stars.table]
+    tables += [prediction.to_table(), model.photometry(image, detect=True, zero_point=25.0)]
+    for table in tables:
+        columns = [name for name in table.colnames if name not in ("ra", "dec")]
+        lines = table[columns].pformat(max_lines=-1, max_width=-1)
+        assert not re.findall(r"\d[\d.]{10,}", "\n".join(lines))
+    numbers = [f"{number:.15g}" for number in (model.info.snr_min, model.info.pixel_scale_arcsec)]
+    assert max(map(len, numbers)) <= 10, numbers

@@ -10,9 +10,11 @@ wrong and exit code 2.
 
 from __future__ import annotations
 
+import os
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
@@ -36,7 +38,9 @@ import click
 
 from psfdae.base.errors import Error, did_you_mean, install_line, missing
 from psfdae.base.joined import joined
+from psfdae.base.progress import displayed_by
 from psfdae.base.version import __version__
+from psfdae.commands.terminal import bar_or_lines
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -176,9 +180,25 @@ class Commands(Careful):
 
 
 class SettingsCommand(click.Command):
-    """Command with settings; options of other programs are refused with what does the same."""
+    """Command that shows its progress, or with `--quiet` nothing but errors.
+
+    Options of other programs are refused with what does the same here.
+    """
 
     foreign_options: Mapping[str, str]
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; `--quiet` is no parameter of its function."""
+        if not ctx.params.pop("quiet"):
+            with displayed_by(bar_or_lines):
+                return super().invoke(ctx)
+        # Errors are written to the other stream.
+        with (
+            displayed_by(None),
+            Path(os.devnull).open("w", encoding="utf-8") as null,
+            redirect_stdout(null),
+        ):
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the command line; UsageError says what to type in place of a foreign option."""
@@ -301,6 +321,8 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         parameters.append(click.Option(["--config", "settings"], type=path, help=file_help))
         if not any(p.nargs == -1 for p in parameters):
             parameters.append(click.Argument(["overrides"], nargs=-1))
+    quiet_help = "Print neither progress nor summary."
+    parameters.append(click.Option(["--quiet"], is_flag=True, help=quiet_help))
 
     def run(**values: Any) -> None:
         # Settings come first, because what they are may depend on the other options.

@@ -46,9 +46,6 @@ def photometry_command(
     )
     write_table(out, photometry.table)
     if residual is not None:
-        from astropy.io import fits
-
-        image_without_stars = photometry.measured.residual.astype(np.float32)
-        write_fits(residual, fits.PrimaryHDU(image_without_stars))
+        write_fits(residual, photometry.residual.to_hdu()[0])
     count = np.count_nonzero(np.isfinite(photometry.table["flux"]))
     print(f"{out}: {len(photometry.table)} stars, {count} measured", *photometry.notes, sep="\n")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +17,6 @@ import numpy as np
 from psfdae.base.figures import write_png
 from psfdae.base.files import atomic_path, check_outputs
 from psfdae.base.options import File
-from psfdae.base.progress import silence
 from psfdae.commands.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
 from psfdae.image.fits_file import Card
@@ -64,7 +62,6 @@ def predict_command(
     plot: Annotated[File | None, "PNG with a map of the PSF over the field."] = None,
     overwrite: Annotated[bool, "Replace files that exist."] = False,
     threads: Annotated[int | None, click.IntRange(min=1), "[default: all cores]"] = None,
-    quiet: Annotated[bool, "Neither progress nor summary."] = False,
     *,
     out: Annotated[File, "FITS file for PSFs, residuals, uncertainties and a table of stars."],
 ) -> str:
@@ -85,7 +82,6 @@ def predict_command(
                 "model": bundle_of_image(model, name),
                 "plot": path_of_image(plot, name),
                 "threads": 1,
-                "quiet": True,
                 "out": path_of_image(out, name),
             }
             for name, image_options in options_by_image(stars, options).items()
@@ -105,7 +101,7 @@ def predict_command(
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
         # The FITS file gets its name last: if it exists, everything is done.
-        with atomic_path(out) as unfinished, silence() if quiet else nullcontext():
+        with atomic_path(out) as unfinished:
             flag_counts, unflagged, list_note = write_prediction(
                 loaded, source, observation, unfinished, threads, fixed_positions
             )
@@ -123,8 +119,7 @@ def predict_command(
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
     summary = "\n".join(line for line in lines if line)
-    if not quiet:
-        print(summary)
+    print(summary)
     return summary
 
 

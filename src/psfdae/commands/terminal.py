@@ -1,4 +1,8 @@
-"""Progress bars of click on standard error, where that is a terminal."""
+"""How far tasks are, on standard error: as a bar in a terminal, as lines in a log.
+
+Displays for `psfdae.base.progress.show_with`. They show nothing in a process that another one has
+started: bars of several would mix.
+"""
 
 from __future__ import annotations
 
@@ -6,41 +10,62 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from multiprocessing import parent_process
 
-from psfdae.base.progress import Advance
+from psfdae.base.progress import Show
 
 
 @contextmanager
-def bar(name: str, count: int) -> Iterator[Advance]:
-    """Show how far a task of so many steps is, after its first second.
-
-    Nothing is shown where standard error is no terminal, and in a process that another one has
-    started: bars of several would mix. `psfdae.base.progress.show_with` takes it.
-    """
-    from multiprocessing import parent_process
-
+def bar(name: str) -> Iterator[Show]:
+    """Show a task as a bar of click's after its first second; without a terminal, show nothing."""
     if not sys.stderr.isatty() or parent_process() is not None:
-        yield lambda steps: None
+        yield lambda fraction, text: None
         return
 
     import click
 
-    # The bar begins to be drawn when a second has passed, as of the start.
-    start, completed_steps, is_shown = time.time(), 0, False
-    progress_bar = click.progressbar(length=count, label=name, file=sys.stderr)
+    # The bar has a thousand steps, so that parts of a long step move it, too.
+    start, length, is_shown = time.time(), 1000, False
+    progress_bar = click.progressbar(
+        length=length, label=name, file=sys.stderr, item_show_func=lambda text: text or None
+    )
     with ExitStack() as stack:
 
-        def advance(steps: int) -> None:
-            nonlocal completed_steps, is_shown
-            completed_steps = min(completed_steps + steps, count)
+        def show(fraction: float, text: str) -> None:
+            nonlocal is_shown
+            # It begins to be drawn when a second has passed, as of the start: the time that is
+            # left follows from it.
             if not is_shown and time.time() > start + 1.0:
                 stack.enter_context(progress_bar)
-                # The time that is left follows from both.
                 progress_bar.start = progress_bar.last_eta = start
                 is_shown = True
             if is_shown:
-                progress_bar.update(completed_steps - progress_bar.pos)
+                # Two parts of one step both begin at 0: the bar never goes back.
+                steps = max(round(length * fraction) - progress_bar.pos, 0)
+                progress_bar.update(steps, text)
 
-        yield advance
-        if is_shown:
-            advance(count)  # a task may need fewer steps
+        yield show
+
+
+@contextmanager
+def bar_or_lines(name: str, interval_s: float = 10.0) -> Iterator[Show]:
+    """Show a task as a bar in a terminal, and in a log by a line at most every ten seconds."""
+    if sys.stderr.isatty() or parent_process() is not None:
+        with bar(name) as show_bar:
+            yield show_bar
+        return
+    start = last_line = time.time()
+
+    def show(fraction: float, text: str) -> None:
+        nonlocal last_line
+        now = time.time()
+        # Nothing is left of a task that has ended.
+        if now < last_line + interval_s or fraction >= 1.0:
+            return
+        last_line = now
+        # What is left takes as long as what is done, in proportion.
+        remaining_s = (now - start) * (1.0 / fraction - 1.0)
+        parts = [f"{name}: {fraction:.0%}", f"about {remaining_s:.0f} s left", text]
+        print(*filter(None, parts), sep="  ", file=sys.stderr, flush=True)
+
+    yield show

@@ -129,7 +129,8 @@ def pixel_scale(image: ImageFile) -> CameraValue:
         with reading(image.path):
             scale = float(np.sqrt(proj_plane_pixel_area(image.wcs))) * 3600.0
         if math.isfinite(scale) and scale > 0:
-            return CameraValue(scale, "WCS")
+            # A WCS in degrees has no more digits.
+            return CameraValue(float(f"{scale:.9g}"), "WCS")
     header_scale = header_number(image, HEADER_KEYS["pixel scale"])
     # Amateurs' cameras have the width of a pixel in micrometres, and the focal length in
     # millimetres: angle = width / focal length.

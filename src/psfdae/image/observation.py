@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -39,6 +39,7 @@ from psfdae.image.stamps import (
 
 if TYPE_CHECKING:
     from astropy.table import Table
+    from astropy.wcs import WCS
 
 
 class ListedStars(NamedTuple):
@@ -106,20 +107,21 @@ class Observation:
     shape: tuple[int, ...] | None
     camera: dict[str, CameraValue]
     positions: np.ndarray | None
-    stars: ListedStars = field(repr=False)
+    stars: ListedStars
     header_cards: list[Card]
     catalogue: Path | None
     detections: Catalogue | None
     colour_column: str | None
     remarks: tuple[str, ...]
     # All of the list, also stars that are off the image.
-    _list: Catalogue | None = field(repr=False)
-    _layers: Layers = field(repr=False)
-    neighbour_light: Callable[[slice, int, int], np.ndarray] | None = field(
-        default=None, repr=False
-    )
+    _list: Catalogue | None
+    _layers: Layers
+    neighbour_light: Callable[[slice, int, int], np.ndarray] | None = None
     assumed_scale_arcsec: ClassVar[float] = 1.0
     """Scale of the pixels where nothing says it."""
+
+    def __repr__(self) -> str:
+        return f"Observation({str(self.path)!r}, {self.count} stars)"
 
     @property
     def count(self) -> int:
@@ -175,6 +177,11 @@ class Observation:
         """Return the whole image with its sky; ObservationError if none can be measured."""
         return self._layers.sky()
 
+    @property
+    def wcs(self) -> WCS | None:
+        """Celestial WCS of the image; None without one, and of a cube of stamps."""
+        return None if self.shape is None else self._layers.image.wcs
+
     def on_sky(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return ICRS coordinates in degrees of 0-based pixels (n,).
 
@@ -192,7 +199,7 @@ class Observation:
         """
         from astropy.wcs.utils import pixel_to_skycoord
 
-        if self.shape is None or (wcs := self._layers.image.wcs) is None:
+        if (wcs := self.wcs) is None:
             return None
         # A WCS may have any frame of the sky, such as galactic coordinates.
         with reading(self.path):

@@ -90,6 +90,9 @@ class Candidates:
     verdict: np.ndarray
     bright: BrightStars
 
+    def __repr__(self) -> str:
+        return f"Candidates({self.count()})"
+
     @classmethod
     def joined(cls, several: Sequence[Candidates]) -> Candidates:
         """Return those of several observations, one after the other.

@@ -129,7 +129,18 @@ def table_of_rows(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Ta
     from astropy.table import Table
 
     # Columns stand in the order of the keys of the first row.
-    table = Table({name: [row[name] for row in rows] for name in rows[0]})
+    return with_format(Table({name: [row[name] for row in rows] for name in rows[0]}), form)
+
+
+def with_format(table: Table, form: str = ".4g") -> Table:
+    """Return the table with a format in which its real numbers are shown; all digits are kept.
+
+    Parameters
+    ----------
+    table : Table
+        Its columns get the format.
+    form : str
+    """
     for column in table.itercols():
         if column.dtype.kind == "f":
             column.info.format = form

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -107,6 +108,11 @@ class BundleInfo(_Described):
         description="resolved configuration of all stages, and the wings as Wings.plain gives them"
     )
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
+
+    def __repr_args__(self) -> Iterator[tuple[str, Any]]:
+        """Yield what tells one model from another, with which a description is shown."""
+        for name in ("name", "method", "stamp_px", "pixel_scale_arcsec", "training_stars"):
+            yield name, getattr(self, name)
 
     @model_validator(mode="after")
     def _is_network_or_not(self) -> BundleInfo:

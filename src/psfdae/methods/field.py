@@ -38,7 +38,7 @@ from psfdae.stars.moments import measure_shapes
 from psfdae.stars.noise import NoiseModel
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FieldMixture(FieldLaw, Method):
     """Fitted model of a field, with the residuals of its stars.
 

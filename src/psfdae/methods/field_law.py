@@ -95,7 +95,7 @@ class FieldSettings(Group):
     threads: Count = Field(1, description="Threads of the linear algebra")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FieldLaw:
     """Distribution of the stars of an image: the PSF over the field, and residuals about it.
 

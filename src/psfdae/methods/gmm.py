@@ -59,7 +59,7 @@ class Gmm(Group):
     threads: Count = Field(1, description="Threads of the linear algebra")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture(MixtureLaw, Method):
     """Fitted Gaussian mixture.
 

@@ -8,7 +8,7 @@ from psfdae.methods.gmm import GaussianMixture
 from psfdae.methods.interface import Look, Needs
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlacedMixture(GaussianMixture):
     """A mixture of images, references and positions."""
 

@@ -299,6 +299,9 @@ class Method:
     knows_field: ClassVar[bool] = False
     finds_flux: ClassVar[bool] = False
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.look.title or self.look.label})"
+
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
     if TYPE_CHECKING:

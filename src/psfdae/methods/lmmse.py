@@ -15,7 +15,7 @@ from psfdae.methods.interface import Look, Method, Needs, TrainingSet
 from psfdae.stars.noise import NoiseModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LinearMmse(Method):
     """Second moments of a training set.
 

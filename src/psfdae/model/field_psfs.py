@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from functools import cache
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -227,7 +228,6 @@ class FieldPsfs(ImageFluxes, ABC):
             As `psf_at`.
         """
         from astropy.nddata import NDData
-        from photutils.psf import GriddedPSFModel
 
         from psfdae.model.psf_grid import PsfGrid
 
@@ -235,10 +235,30 @@ class FieldPsfs(ImageFluxes, ABC):
         grid = PsfGrid.of(self, nodes, oversampling)
         positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
         meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
-        # One class for each model: photutils 3.0 fits groups with the first model of a class.
-        class_name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
-        model_class = type(class_name, (GriddedPSFModel,), {})
+        model_class = grid_class(f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}")
         return model_class(NDData(grid.psfs.reshape(-1, *grid.psfs.shape[2:]), meta=meta))
+
+
+@cache
+def grid_class(name: str) -> type[GriddedPSFModel]:
+    """Return a class of photutils' `GriddedPSFModel` with a name of its own.
+
+    photutils 3.0 fits groups with the first model of a class, so that each model has its class.
+    """
+    from photutils.psf import GriddedPSFModel
+
+    # A class that is made at run time is pickled as its name.
+    return type(name, (GriddedPSFModel,), {"__reduce__": pickled_grid})
+
+
+def pickled_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
+    """Return what pickle stores of a grid: how to make one without values, and its values."""
+    return blank_grid, (type(grid).__name__,), vars(grid)
+
+
+def blank_grid(name: str) -> GriddedPSFModel:
+    """Return an object of the class `grid_class(name)` without values, for unpickling."""
+    return object.__new__(grid_class(name))
 
 
 def real_numbers(name: str, values: ArrayLike) -> np.ndarray:

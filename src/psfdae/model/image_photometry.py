@@ -24,6 +24,7 @@ from psfdae.image.tables import star_table
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
     from astropy.table import QTable, Table
+    from astropy.wcs import WCS
 
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
@@ -50,18 +51,22 @@ class ImagePhotometry:
         model, and has the zero point.
     notes : tuple of str
         Sentences on the image, its list, the zero point and the light that fluxes contain.
+    wcs : WCS or None
+        That of the image.
     """
 
     measured: CrowdedPhotometry
     table: QTable
     notes: tuple[str, ...]
+    wcs: WCS | None
 
     @property
     def residual(self) -> CCDData:
-        """Image without its sky and stars, in the unit of the image."""
+        """Image without its sky and stars, in the unit of the image and with its WCS."""
         from astropy.nddata import CCDData
 
-        return CCDData(self.measured.residual.astype(np.float32), unit=self.table["flux"].unit)
+        pixels, unit = self.measured.residual.astype(np.float32), self.table["flux"].unit
+        return CCDData(pixels, unit=unit, wcs=self.wcs)
 
 
 class ImageFluxes:
@@ -211,7 +216,7 @@ def photometry_of_image(
         **({} if zero_point is None else {"ZEROPT": zero_point}),
     }
     notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
-    return ImagePhotometry(measured, table, tuple(filter(None, notes)))
+    return ImagePhotometry(measured, table, tuple(filter(None, notes)), observation.wcs)
 
 
 def measure_stars(

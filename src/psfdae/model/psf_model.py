@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,7 @@ from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
+from psfdae.image.tables import html_table
 from psfdae.methods.bundle_info import BundleInfo
 from psfdae.methods.interface import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
@@ -27,9 +29,6 @@ from psfdae.model.prediction import Prediction
 from psfdae.model.restoration import Restorer
 from psfdae.model.stamp_arrays import stamps_of_arrays
 from psfdae.model.wings import Wings
-
-if TYPE_CHECKING:
-    pass
 
 SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
@@ -104,6 +103,21 @@ class PsfModel(WholeImages, FieldPsfs):
             f"PsfModel({info.name!r}, {info.stamp_px}×{info.stamp_px} px of "
             f'{info.pixel_scale_arcsec:g}", S/N {info.snr_min:.3g} … {info.snr_max:.3g})'
         )
+
+    def _repr_html_(self) -> str:
+        """Return what `psfdae describe` says of use and training, for a notebook."""
+        from psfdae.model.description import error_table, model_facts
+
+        # Facts on the file and on conventions are left to the command.
+        left_out = {"Name", "Written", "Licence", "SHA-256", "Framing", "Normalisation"}
+        left_out |= {"Noise-equivalent area", "Flagged as unlike"}
+        facts = model_facts(self.bundle).items()
+        rows = [(name, escape(fact)) for name, fact in facts if name not in left_out]
+        tables = [html_table(["PsfModel", self.name], rows)]
+        # Errors of the test stars, if there were any.
+        if (errors := error_table(self.info)) is not None:
+            tables.append(html_table(errors.colnames, [tuple(row) for row in errors]))
+        return "".join(tables)
 
     @property
     def info(self) -> BundleInfo:

@@ -83,15 +83,15 @@ def quality_page(
         checks=checks_html([*checks, *check_stars(stars), held_out_check]),
         errors=_errors_table(report.table, name),
         truth_mse=f"{report.table['truth_mse'][0]:.1e}",
-        errors_figure=_image_tag(errors_figure(report.table, name)),
-        strip=_image_tag(report.strip_png),
+        errors_figure=image_tag(errors_figure(report.table, name)),
+        strip=image_tag(report.strip_png),
         photometry=_photometry_table(report.photometry),
         facts="".join(f"<p>{escape(fact)}.</p>\n" for fact in facts),
-        field_map=_image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
-        error_maps=_image_tag(error_maps(images)),
-        residuals=_image_tag(residuals) if residuals else "",
-        shapes=_image_tag(shapes_figure(stars, degraded_rows, images)),
-        chi2=_image_tag(chi2_figure(stars)),
+        field_map=image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
+        error_maps=image_tag(error_maps(images)),
+        residuals=image_tag(residuals) if residuals else "",
+        shapes=image_tag(shapes_figure(stars, degraded_rows, images)),
+        chi2=image_tag(chi2_figure(stars)),
         verdicts=html_table(
             ("selection for the training", "stars"),
             [(escape(verdict), str(count)) for verdict, count in verdict_counts if count],
@@ -103,7 +103,7 @@ def quality_page(
     )
 
 
-def _image_tag(picture: Figure | bytes) -> str:
+def image_tag(picture: Figure | bytes) -> str:
     """Return an HTML image with a figure, or the bytes of a PNG file, inside.
 
     Parameters

@@ -17,7 +17,7 @@ from psfdae.base.figures import StripRow, as_png, restoration_strip, spread_star
 from psfdae.base.files import write_text
 from psfdae.base.progress import steps
 from psfdae.base.threads import fixed_threads
-from psfdae.image.tables import table_of_rows
+from psfdae.image.tables import table_of_rows, with_format
 from psfdae.methods import method as method_of
 from psfdae.methods.interface import Method
 from psfdae.methods.metrics import all_metrics, mse, quality, summarised
@@ -27,7 +27,7 @@ from psfdae.model.held_out_photometry import measure_photometry
 from psfdae.model.packing import checksum
 from psfdae.model.plot import psf_map
 from psfdae.model.psf_model import PsfModel
-from psfdae.model.report import checks_html, quality_page
+from psfdae.model.report import checks_html, image_tag, quality_page
 from psfdae.model.report_checks import (
     MEAN_PSF,
     Check,
@@ -202,7 +202,7 @@ def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
         name: [np.broadcast_to(block.get(name, np.nan), block["star"].shape) for block in blocks]
         for name in names
     }
-    return Table({name: np.concatenate(values) for name, values in columns.items()})
+    return with_format(Table({name: np.concatenate(values) for name, values in columns.items()}))
 
 
 def _error_table(
@@ -301,8 +301,9 @@ class Report:
         return f"Report({self.model.name!r}, {self})"
 
     def _repr_html_(self) -> str:
-        """Return the summary and the checks on held-out stars, for a notebook."""
-        return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
+        """Return summary, checks on held-out stars, and the picture of some, for a notebook."""
+        summary, checks = f"<p>{escape(str(self))}</p>", checks_html(self.checks())
+        return summary + checks + image_tag(as_png(self.strip(), dpi=80))
 
     def checks(self) -> list[Check]:
         """Check the model on the stars held out: question, answer, and True if it is passed.

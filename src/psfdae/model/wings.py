@@ -131,6 +131,9 @@ class Wings:
             ("INMODEL", 1.0 / (1.0 + self.light()[0]), "part of it in the model, usual star"),
         ]
 
+    def __repr__(self) -> str:
+        return f"Wings({self})"
+
     def __str__(self) -> str:
         light, error = self.light()
         sentence = (

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -381,27 +380,17 @@ def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
 
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
-    """Provide the function that a training calls after each epoch.
-
-    It shows a progress bar in a terminal, and prints a line otherwise.
-    """
-    # In a terminal the bar is enough; a log gets a line after every epoch.
+    """Provide the function that a training calls with the errors of each epoch."""
     headings = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
-    is_terminal = sys.stderr.isatty()
 
     def report(row: Row) -> None:
-        advance(1)
-        if not is_terminal:
-            # Not every epoch is validated, and networks have different losses.
-            errors = [
-                f"{heading} {row[key]:.3e}"
-                for key, heading in headings.items()
-                if np.isfinite(row.get(key, np.nan))
-            ]
-            # As long for each of the other epochs as for those that are done.
-            remaining_s = row["seconds"] * (epochs / row["epoch"] - 1)
-            times = f"{row['seconds']:.0f} s, about {remaining_s:.0f} s left"
-            print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, times, sep="  ", flush=True)
+        # Not every epoch is validated, and networks have different losses.
+        errors = [
+            f"{heading} {row[key]:.3e}"
+            for key, heading in headings.items()
+            if np.isfinite(row.get(key, np.nan))
+        ]
+        advance(1, "  ".join([f"epoch {row['epoch']:.0f}/{epochs}", *errors]))
 
     with task("training", epochs) as advance:
         yield report
