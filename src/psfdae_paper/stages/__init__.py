@@ -9,7 +9,7 @@ GROUPS = {
 """Help of the first words of commands of two and three words."""
 
 SECTIONS = {
-    "Your images": ("example-field",),
+    "Your images": ("example-field", "example-night"),
     "Telescopes": ("simulate",),
 }
 """Headings of `psfdae --help` with the commands below each; all others are "The paper's stages"."""

@@ -1,8 +1,8 @@
-"""Stages `simulate`, `figure telescope`, `example-field`: PSFs of a telescope, simulated images.
+"""Stages `simulate`, `figure telescope`, `example-field`, `example-night`: simulated PSFs, images.
 
 In go the settings of a telescope; out come its static PSFs over the field as a product, a figure,
 a table and, if asked for, a FITS cube and an image with a star per field. `example-field` makes the
-image of a star field with which the pages try the library.
+image of a star field with which the pages try the library, `example-night` many of them.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from psfdae.base.files import (
     atomic_path,
     check_outputs,
     read_product,
+    write_bytes,
     write_columns,
     write_fits,
 )
@@ -36,9 +37,16 @@ from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae_paper.stages.stars import templates
-from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
+from psfdae_paper.stars.example import (
+    ExampleField,
+    FieldRecipe,
+    add_stamps,
+    write_cube,
+    write_field,
+)
 from psfdae_paper.stars.example import example_field as simulate_field
 from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux, without_margin
+from psfdae_paper.stars.nights import NightRecipe, reference_stars, simulated_night
 from psfdae_paper.stars.scenes import template_wavefronts
 
 
@@ -392,3 +400,30 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
         SATURATE=float(recipe.saturation),
     )
     return field
+
+
+@command("example-night")
+def example_night(
+    out: Annotated[Folder, "Folder for images, truth.csv and reference.csv."],
+    seed: Annotated[int, click.IntRange(min=0)] = 1,
+    exposures: Annotated[int, click.IntRange(min=12), "Images."] = NightRecipe.exposures,
+) -> None:
+    """Simulate a night of a telescope, with bad images among them, as an example.
+
+    truth.csv has a row for each image: what is wrong with it, and FWHM and ellipticity of its PSF
+    in the middle and in the corners, without clouds or trail. reference.csv has the stars with
+    their magnitudes. The same seed gives the same images.
+    """
+    recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
+    stars = reference_stars(recipe, seed)
+    write_columns(reference, {name: stars[name] for name in stars.colnames})
+    rows: list[dict[str, object]] = []
+    for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
+        path = out / f"exposure_{number:03d}.fits"
+        write_cube(path, counts, **cards)
+        # Half of the file is lost, as when a disk is full.
+        if truth["fault"] == "truncated file":
+            write_bytes(path, path.read_bytes()[: path.stat().st_size // 2])
+        rows.append({"image": path, "reference": reference, **truth})
+    write_columns(out / "truth.csv", {name: [row[name] for row in rows] for name in rows[0]}, 6)
+    print(f"next: snakemake night --config images='{out}/*.fits'")

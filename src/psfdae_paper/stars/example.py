@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +21,11 @@ from psfdae.base.rng import stream
 from psfdae.image.stamps import central_pixel
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.wavefronts import MONOMIALS, seidel_wavefronts
 from psfdae.stars.noise import noise_equivalent_px
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class FieldRecipe:
     pixel: float = 2.0  # width in λ/D
     # W040, W131, W222, W220, W311 in waves at the middle of an edge.
     seidel: tuple[float, ...] = (0.1, 1.6, 0.5, 0.5, 0.0)
+    defocus_waves: float = 0.0  # W020 ρ² over the whole field
     sky_e: float = 300.0  # electrons per pixel in the middle
     sky_slope: float = 0.1  # relative rise from left to right
     read_noise_e: float = 6.0  # electrons per pixel
@@ -91,19 +96,25 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     starlight = np.zeros((recipe.side_px,) * 2)
     source_flux = np.concatenate([flux, flux[kind == "blended"] / 3.0])
     add_stamps(starlight, source_flux[:, None, None] * psf, *source_position.T)
-    # Camera: a sky that rises from left to right, photon noise, read noise, whole counts, and
-    # clipping at the saturation level or the largest number of 16 bits.
-    ramp = 1.0 + recipe.sky_slope * np.linspace(-0.5, 0.5, recipe.side_px)
-    expected_e = recipe.sky_e * np.broadcast_to(ramp, starlight.shape) + starlight
-    photo_electrons = rng.poisson(expected_e)
-    electrons = photo_electrons + recipe.read_noise_e * rng.standard_normal(expected_e.shape)
-    image = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, 65535))
+    image = expose(recipe, starlight, rng)
     # Centres of light from the first moments of the noise-free stamps, whose sum is 1.
     psf = psf[: kind.size]
     axis = np.arange(recipe.stamp_px) - recipe.stamp_px // 2
     centre_in_stamp = np.stack([psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis], axis=1)
     centroid = np.rint(position) + centre_in_stamp
-    return ExampleField(image.astype(np.uint16), position, centroid, flux, psf, kind)
+    return ExampleField(image, position, centroid, flux, psf, kind)
+
+
+def expose(recipe: FieldRecipe, starlight: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the counts (h, w), uint16, that the camera reads of light (h, w) in electrons."""
+    # Camera: a sky that rises from left to right, photon noise, read noise, whole counts, and
+    # clipping at the saturation level or the largest number of 16 bits.
+    ramp = 1.0 + recipe.sky_slope * np.linspace(-0.5, 0.5, starlight.shape[1])
+    expected_e = recipe.sky_e * np.broadcast_to(ramp, starlight.shape) + starlight
+    photo_electrons = rng.poisson(expected_e)
+    electrons = photo_electrons + recipe.read_noise_e * rng.standard_normal(expected_e.shape)
+    counts = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, 65535))
+    return np.asarray(counts, np.uint16)
 
 
 def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
@@ -124,6 +135,7 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
     fine = oversampling * side
     field = position / (0.5 * recipe.side_px) - 1.0  # −1 … 1 along either axis
     source = seidel_wavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
+    source.coefficients[:, [MONOMIALS.index("xx"), MONOMIALS.index("yy")]] += recipe.defocus_waves
     pupil = annular_pupil(128, 0.35)
     propagate = StampPropagator(pupil, fine, recipe.pixel / oversampling, precision="complex64")
     # Seeing: a Moffat profile (1 + r²/α²)^(−3) of sum 1, which falls to 1/2 at
@@ -166,6 +178,20 @@ def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarr
     np.add.at(image, (rows[inside], columns[inside]), stamps[inside])
 
 
+def tangent_plane(
+    shape: tuple[int, ...], pixel_scale_arcsec: float, centre_deg: tuple[float, float] = (150, 2)
+) -> WCS:
+    """Return the WCS of an image (h, w), north up, about (RA, Dec) in its middle."""
+    from astropy.wcs import WCS
+
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = centre_deg
+    wcs.wcs.crpix = [(shape[1] + 1) / 2, (shape[0] + 1) / 2]
+    wcs.wcs.cdelt = [-pixel_scale_arcsec / 3600.0, pixel_scale_arcsec / 3600.0]
+    return wcs
+
+
 def write_cube(path: Path, stamps: np.ndarray, **cards: str | float) -> None:
     """Write an array, such as stamps, as a FITS image, float64 as float32, with header cards."""
     from astropy.io import fits
@@ -203,13 +229,8 @@ def write_field(
         Header cards, such as `GAIN=1.6`.
     """
     from astropy.table import Table
-    from astropy.wcs import WCS
 
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = (150.0, 2.0)
-    wcs.wcs.crpix = [(image.shape[1] + 1) / 2, (image.shape[0] + 1) / 2]
-    wcs.wcs.cdelt = [-pixel_scale_arcsec / 3600.0, pixel_scale_arcsec / 3600.0]
+    wcs = tangent_plane(image.shape, pixel_scale_arcsec)
     # A card of the caller replaces one of the coordinates.
     write_cube(path, image, **{**wcs.to_header(), **cards})
     ra, dec = wcs.all_pix2world(x, y, 0)

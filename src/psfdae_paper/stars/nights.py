@@ -1,0 +1,191 @@
+"""A simulated night of a telescope with its truth, and the places at which PSFs are measured.
+
+In go a recipe and a seed; out come exposures of two fields, some minutes apart. The seeing follows
+the airmass and wanders; the focus runs away until the observer mends it; each exposure is pointed a
+little differently. Five exposures are bad: two through clouds, one trailed, one with the shutter
+closed, and one of which the file is cut short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.base.rng import stream
+from psfdae.stars.moments import measure_shapes
+from psfdae_paper.stars.example import (
+    FieldRecipe,
+    add_stamps,
+    example_field,
+    expose,
+    star_images,
+    tangent_plane,
+)
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+PLACES = {
+    "centre": (0.5, 0.5),
+    "lower_left": (0.1, 0.1),
+    "lower_right": (0.9, 0.1),
+    "upper_left": (0.1, 0.9),
+    "upper_right": (0.9, 0.9),
+}
+"""Places where the PSF of an image is measured: x and y over the numbers of columns and rows."""
+
+FAULTS = {
+    0.14: "clouds",
+    0.37: "trailed",
+    0.55: "truncated file",
+    0.74: "clouds",
+    0.87: "no stars",
+}
+"""What is wrong with the exposure after this part of the night."""
+
+
+@dataclass(frozen=True)
+class NightRecipe:
+    """Exposures of a simulated night, and how the telescope changes in it."""
+
+    exposures: int = 60
+    field: FieldRecipe = field(
+        default=FieldRecipe(
+            side_px=512,
+            bright=120,
+            faint=80,
+            saturated=2,
+            blended=0,
+            bright_snr=(150.0, 3000.0),
+            seeing_px=2.1,
+            seidel=(0.1, 0.6, 0.2, 0.2, 0.0),
+        )
+    )
+    minutes: float = 3.0  # from one exposure to the next
+    dither_px: float = 12.0  # largest offset of a pointing along either axis
+    # The focus runs away between these parts of the night, by so many waves W020 at the edge of
+    # the pupil, and is mended then.
+    focus_lost: tuple[float, float] = (0.3, 0.7)
+    focus_waves: float = 0.6
+    extinction_mag: float = 0.15  # per airmass
+    cloud_transmission: float = 0.06
+    trail_px: float = 8.0
+
+
+def shapes_at_places(
+    psf_at: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int], prefix: str = ""
+) -> dict[str, float]:
+    """Return FWHM (px) and ellipticity of the PSF at `PLACES`, by names such as `fwhm_px_centre`.
+
+    Parameters
+    ----------
+    psf_at : callable
+        Returns PSFs (n, d, d) at positions (n, 2), x and y in pixels.
+    shape : tuple of int
+        Rows and columns of the image.
+    prefix : str
+        Begins each name.
+    """
+    # In the middle of a pixel, so that sizes do not depend on a phase.
+    position = np.rint(np.array(list(PLACES.values())) * (shape[1] - 1, shape[0] - 1))
+    shapes = measure_shapes(psf_at(position))
+    return {
+        f"{prefix}{name}_{place}": float(value)
+        for name, values in (("fwhm_px", shapes.fwhm_px), ("ellipticity", shapes.ellipticity))
+        for place, value in zip(PLACES, values, strict=True)
+    }
+
+
+def reference_stars(recipe: NightRecipe, seed: int) -> Table:
+    """Return the stars of the night's two fields.
+
+    Columns are the number of the field, pixel position (x, y) without a dither, sky position (ra,
+    dec) in degrees, and magnitude, that of one count being 25.
+    """
+    from astropy.table import Table, vstack
+
+    fields = []
+    for number in range(2):
+        exposure = example_field(recipe.field, seed + number)
+        wcs = tangent_plane(
+            exposure.image.shape, recipe.field.pixel_scale_arcsec, (150 + number, 2)
+        )
+        ra, dec = wcs.all_pix2world(*exposure.centroid.T, 0)
+        x, y = exposure.position.T
+        magnitude = 25.0 - 2.5 * np.log10(exposure.flux / recipe.field.gain)
+        names = ("field", "x", "y", "ra", "dec", "mag")
+        fields.append(Table([np.full(len(x), number), x, y, ra, dec, magnitude], names=names))
+    return vstack(fields)
+
+
+def simulated_night(
+    recipe: NightRecipe, stars: Table, seed: int
+) -> Iterator[tuple[np.ndarray, dict[str, str | float], dict[str, object]]]:
+    """Yield the exposures of a night; the same recipe and seed give the same pixels.
+
+    Parameters
+    ----------
+    recipe : NightRecipe
+    stars : Table
+        Stars of both fields (`reference_stars`).
+    seed : int
+
+    Yields
+    ------
+    counts : ndarray of uint16, shape (h, w)
+    cards : dict
+        Cards of the header.
+    truth : dict
+        What is wrong with the exposure ("" if nothing is), and the shape of its PSF.
+    """
+    rng, start = stream(seed, "example night"), datetime(2026, 1, 15, 20, tzinfo=UTC)
+    faults = {round(part * recipe.exposures): fault for part, fault in FAULTS.items()}
+    shape, log_seeing = (recipe.field.side_px,) * 2, 0.0
+    for number in range(recipe.exposures):
+        part, fault = number / recipe.exposures, faults.get(number, "")
+        # Each field is followed from 45° off the zenith to the zenith. Seeing grows with the
+        # airmass to the power 0.6 (Roddier 1981, Prog. Opt. 19, 281), and wanders about it.
+        airmass = 1.0 / np.cos(np.deg2rad(45.0 * (1.0 - 2.0 * part % 1.0)))
+        log_seeing = 0.9 * log_seeing + 0.03 * rng.standard_normal()
+        lost, mended = recipe.focus_lost
+        optics = replace(
+            recipe.field,
+            seeing_px=recipe.field.seeing_px * airmass**0.6 * np.exp(log_seeing),
+            defocus_waves=recipe.focus_waves
+            * (part - lost)
+            / (mended - lost)
+            * (lost < part < mended),
+        )
+        # Stars of the field at this pointing, their light dimmed by air and clouds. A trail is the
+        # sum of short exposures along a line.
+        pointed = stars[stars["field"] == int(2 * part)]
+        dither = rng.uniform(-recipe.dither_px, recipe.dither_px, size=2)
+        position = np.stack([pointed["x"], pointed["y"]], axis=1) + dither
+        cloud = {"clouds": recipe.cloud_transmission, "no stars": 0.0}.get(fault, 1.0)
+        magnitude = pointed["mag"] + recipe.extinction_mag * (airmass - 1.0)
+        electrons = optics.gain * cloud * 10 ** (0.4 * (25.0 - np.array(magnitude)))
+        steps = np.linspace(-0.5, 0.5, 9) * recipe.trail_px if fault == "trailed" else np.zeros(1)
+        starlight = np.zeros(shape)
+        for step in steps:
+            place = position + np.array([step, 0.0])
+            stamps = electrons[:, None, None] / len(steps) * star_images(optics, place)
+            add_stamps(starlight, stamps, *place.T)
+        # Header of the exposure: pointing, time and camera.
+        wcs = tangent_plane(shape, optics.pixel_scale_arcsec, (150 + int(2 * part), 2))
+        wcs.wcs.crpix += dither
+        time = start + number * timedelta(minutes=recipe.minutes)
+        cards: dict[str, str | float] = {
+            "DATE-OBS": f"{time:%Y-%m-%dT%H:%M:%S}",
+            "AIRMASS": round(float(airmass), 4),
+            "FILTER": "r",
+            "INSTRUME": "example camera",
+            "GAIN": optics.gain,
+        }
+        cards |= {"SATURATE": float(optics.saturation), **wcs.to_header()}
+        truth = shapes_at_places(partial(star_images, optics), shape, "true_")
+        yield expose(optics, starlight, rng), cards, {"fault": fault, **truth}
