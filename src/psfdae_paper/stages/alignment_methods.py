@@ -376,6 +376,7 @@ def estimate(
         started = time.perf_counter()
         denoised = denoise(dae, config, noisy)
         denoising_seconds = time.perf_counter() - started
+        # Each network, with the stamps that it was trained for.
         for column, method in enumerate(learned):
             started = time.perf_counter()
             estimates[row, column] = predict[method.network](denoised if method.denoised else noisy)
