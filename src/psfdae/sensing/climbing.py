@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psfdae.base import progress
+
 Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
 
@@ -165,7 +167,7 @@ def climb(
     peaks = Peaks(start.copy(), *evaluate(active, start), evaluations, np.zeros(len(start), bool))
     damping = np.full(len(start), steps.initial_damping)
     gain = np.full(len(start), np.inf)
-    for _ in range(steps.max_steps):
+    for _ in progress.steps("maxima of the posterior", range(steps.max_steps)):
         # Gain sᵀg − ½ sᵀIs that the undamped step s promises. Damping makes a step small, which
         # says nothing about the distance of the maximum.
         step = _damped_step(peaks, active, np.zeros(active.size), limit)

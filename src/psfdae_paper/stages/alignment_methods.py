@@ -27,6 +27,7 @@ import pandas as pd
 from psfdae.base.belonging import require, require_origin, write_origin
 from psfdae.base.files import Column, Product, as_csv, as_yaml, write_csv, write_product, write_text
 from psfdae.base.options import AboveZero, File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.reading import from_tree, read_yaml
 from psfdae.base.rng import stream
 from psfdae.base.settings import deciding, parse_settings
@@ -370,7 +371,7 @@ def estimate(
     # Array [λ, method, state, number].
     estimates = np.empty((len(levels), len(learned), *product["states"].shape))
     rows = []
-    for row, level in enumerate(levels):
+    for row, level in enumerate(steps("noise levels", levels)):
         noisy = noisy_test_states(config, product["stamps"], test_set, level)
         # The DAE's output, which several networks get, and the time that it takes.
         started = time.perf_counter()
@@ -466,7 +467,7 @@ def fit_alignment_method(
     # The network's estimate is near enough to the maximum for Levenberg steps.
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
-    for method in methods:
+    for method in steps("fits", methods):
         # Flux and place of the stars are known, or parameters of the fit, too.
         optics = StateOptics(wavefronts, operator(movable=method.unknown_flux), emulator)
         exact = StateLikelihood(optics, noise_model(config), level, stamps)

@@ -19,6 +19,7 @@ import pandas as pd
 from psfdae.base.belonging import STARS, STATIC, require
 from psfdae.base.files import ProductError, read_product, write_csv, write_parquet, write_product
 from psfdae.base.options import File
+from psfdae.base.progress import steps
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
 from psfdae.methods import method
@@ -160,7 +161,7 @@ def optics(
         # The posterior does not depend on the reference: it is computed once for all references.
         first = method_class.with_bank(bank_product.arrays, config, next(iter(data.values())))
         estimators = {reference: replace(first, data=data[reference]) for reference in data}
-        for level, noisy in bounded.noisy.items():
+        for level, noisy in steps("noise levels", bounded.noisy.items()):
             # Time for the log: the posterior is what takes long.
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)

@@ -17,6 +17,7 @@ import pandas as pd
 from psfdae.base.belonging import STATIC, require
 from psfdae.base.files import Product, read_product, write_csv
 from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.rng import stream
 from psfdae.base.threads import limit_threads
 from psfdae.methods.metrics import mse, ssim
@@ -63,9 +64,9 @@ def scan(
         r0_values = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
     table = []
     # Noisy stars of each pixel scale, whose SSIM is computed at all dynamic ranges.
-    for r0 in r0_values:
+    for r0 in steps("values of r0", r0_values):
         source = _source(config, r0)
-        for scale in config.calibration.pixel_scales_arcsec:
+        for scale in steps("pixel scales", config.calibration.pixel_scales_arcsec):
             # Noise-free, framed, normalised stars at this pixel scale. The search for the brightest
             # pixel covers the same angle as at the configured scale.
             telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})

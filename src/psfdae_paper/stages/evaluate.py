@@ -15,6 +15,7 @@ import pandas as pd
 
 from psfdae.base.files import Product, write_csv, write_parquet, write_text
 from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.settings import ConfigError, Reference, SplitKind
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
@@ -90,10 +91,10 @@ def evaluate(
     test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
-    for level in config.noise.levels:
+    for level in steps("noise levels", config.noise.levels):
         # The same noisy images for all methods: their errors are compared star by star.
         noisy = noisy_test_images(config, product, test, level)
-        for name, estimator in methods.items():
+        for name, estimator in steps("methods", methods.items()):
             estimate = estimator.estimate(noisy, level, test_stars.position)
             row = {**key, "method": name, "noise_level": level}
             rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)

@@ -14,6 +14,7 @@ import numpy as np
 from psfdae.base import belonging
 from psfdae.base.files import Column, Empty, read_product, stream_product, write_product
 from psfdae.base.options import File
+from psfdae.base.progress import steps
 from psfdae.base.rng import stream
 from psfdae.base.threads import limit_threads
 from psfdae.stars.splits import draw_jitter, draw_phase
@@ -126,7 +127,7 @@ def stars(
     else:
         columns |= {"realisation": columns["template"], "energy": energy}
     with stream_product(out, "stars", columns, config.model_dump()) as data:
-        for start in range(0, count, STARS_AT_A_TIME):
+        for start in steps("stars", range(0, count, STARS_AT_A_TIME)):
             # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 from psfdae.base.errors import Error
 from psfdae.base.files import as_csv, as_yaml, sha256_of, write_text
 from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.version import __version__
 from psfdae.methods.interface import CONFIG
 from psfdae_paper.configuration.command import command
@@ -183,7 +184,7 @@ def _import(
     # MLflow's ids of the experiments by name, and of the runs by their source.
     experiments: dict[str, str] = {}
     imported: dict[str, str] = {}
-    for run in runs:
+    for run in steps("runs", runs):
         if run.experiment not in experiments:
             experiments[run.experiment] = experiment_of(client, run.experiment, uri, database)
         tags = {**import_tags, **tags_of(run)}
