@@ -22,7 +22,6 @@ SMALL = ("parts.train_stars=60", "parts.test_stars=20")
 """Makes `psfdae from-stars` quick."""
 
 TESTED_ELSEWHERE = {
-    "docs/first_session.md": "test_light_install.py",
     **{f"docs/{name}.md": "test_from_stars.py" for name in ("train", "photometry", "exposures")},
     "docs/own_telescope.md": "test_own_telescope.py",
     "docs/tutorial.md": "test_from_stars.py",
