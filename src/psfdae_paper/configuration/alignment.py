@@ -184,10 +184,10 @@ class Fit(Group):
     """
 
     # With more states the fit is slower, and closer to the exact optics.
-    neighbours: Annotated[int, Field(ge=5, le=1000)] = 125
+    neighbours: Annotated[int, Field(ge=5, le=1000)] = 60
     """Computed states that a stamp is interpolated from, in all but the last step."""
     # Without these states, estimates at the edge of the range would be less accurate.
-    outer_states: Count = 1000
+    outer_states: Count = 400
     """States beyond the range that are computed for it."""
     # A fit ends by its tolerance, or here.
     iterations: Count = 12
