@@ -60,11 +60,11 @@ def bundle(
     split : SplitKind, optional
         Refuse a network of another split. [default: that of the training]
     reference : Reference, optional
-        Of a method that serves both. [default: realisation]
+        Truth that is restored, by a method that serves both. [default: realisation]
     name : str, optional
         Name of the model. [default: the file's]
     licence : str
-        Of the model.
+        Licence of the model.
     largest_mb : float, optional
         Size of the model, for which a mixture leaves out fine axes.
     out : Path
