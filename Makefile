@@ -83,7 +83,7 @@ PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses log
 FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
   benchmark stability bounds bundles shipped night
 
 help: ## List the targets
@@ -149,6 +149,9 @@ reference: env ## Make the finished run in results the run of record, and renew 
 
 docs: env ## Renew the numbers in README and docs
 	python docs/tables.py
+
+notebook: env ## Run the cells of the first session anew
+	python docs/notebook.py docs/first_session.ipynb
 
 site: docs ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict

@@ -210,7 +210,7 @@ def test_a_mixture_measures_flux_better_than_the_photometry_and_flags_blends(mix
 
 @pytest.mark.parametrize("names", [(), ("background", "noise")])
 def test_bright_pixels_are_covered_as_the_others_are(tiny, names):
-    """Of unseen stars, whatever is known of them beside their flux."""
+    """Errors cover unseen stars, whatever is known of them beside their flux."""
     images, rng = gaussians(1500, 99), np.random.default_rng(5)
     model = PsfModel(tiny)
     for noise in (6e-3, 1.5e-2):

@@ -85,8 +85,8 @@ def test_seeds_count_beside_the_stars():
         ({"dataset": "d", "reference": "template"}, "worse"),
         ({"dataset": "e", "reference": "realisation"}, "worse"),
     ):
-        one = first.assign(**place)
-        row = of_network(compare_evaluations(one, scaled(one, 1.06), MEASURED))
+        single_seed = first.assign(**place)
+        row = of_network(compare_evaluations(single_seed, scaled(single_seed, 1.06), MEASURED))
         assert row.verdict == verdict
     row = of_network(compare_evaluations(first, scaled(first, 0.5), MEASURED))
     assert row.verdict == "better"

@@ -283,7 +283,7 @@ def test_models_of_photutils_do_not_mix(sky):
 
 @pytest.mark.parametrize(("oversampling", "limit"), [(2, 2e-3), (4, 1e-4)])
 def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
-    """At the nodes, between them and beyond them; a star that no stamp holds has no light there."""
+    """Light at the nodes, between and beyond them; none of a star that no stamp holds."""
     model = load_model(sky[1])
     grid, photutils = PsfGrid.of(model, 4, oversampling), model.to_photutils(4, oversampling)
     low, high = photutils.grid_xypos.min(axis=0), photutils.grid_xypos.max(axis=0)

@@ -27,7 +27,7 @@ class Moving(FieldPsfs):
     def field_range(self):
         return LOW, HIGH
 
-    def check_scale(self, pixel_scale_arcsec, what):
+    def check_scale(self, pixel_scale_arcsec, subject):
         pass
 
     def draw_psfs(self, place, oversampling):

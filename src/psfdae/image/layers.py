@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.base.progress import task
 from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
 from psfdae.image.camera import CameraValue
 from psfdae.image.detection import Sky, sky_of
@@ -198,8 +199,9 @@ def _sky(layers: Layers) -> Sky:
     """Return the image of layers with its sky; that of the last ones is kept for more calls."""
     # The sky is measured without bad pixels, in units of the map of σ if there is one.
     image, masked, sigma = layers.read()
-    bad_pixels = layers.find_bad(image, masked)
-    with silent():
+    with task("sky", 2) as advance, silent():
+        bad_pixels = layers.find_bad(image, masked)
+        advance(1, "bad pixels")
         try:
             measured = bad_pixels.sky
             sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.progress import task
 from psfdae.image.camera import (
     LARGEST_STAMP_PX,
     camera_values,
@@ -71,14 +72,16 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
     remarks += layer_remarks
     detections, threshold = None, source.detection_sigma
     if threshold is not None or layers.noise is not None:
-        sky = layers.sky()
-        remarks += [f"{source.path}: {note}" for note in sky.notes]
-        if layers.noise is not None:
-            layers = replace(layers, noise=replace(layers.noise, scale=sky.noise_scale))
-            layers, camera, photon_remarks = with_photons(layers, camera, sky)
-            remarks += photon_remarks
-        if threshold is not None:
-            detections = detected_stars(source.path, sky, threshold)
+        with task("image", 2) as advance:
+            sky = layers.sky()
+            advance(1, "sky")
+            remarks += [f"{source.path}: {note}" for note in sky.notes]
+            if layers.noise is not None:
+                layers = replace(layers, noise=replace(layers.noise, scale=sky.noise_scale))
+                layers, camera, photon_remarks = with_photons(layers, camera, sky)
+                remarks += photon_remarks
+            if threshold is not None:
+                detections = detected_stars(source.path, sky, threshold)
     stars, positions, list_remarks = locate_stars(
         source, image, detections or table, layers, is_cube
     )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.base.errors import Error
+from psfdae.base.progress import task
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut, sky_around
@@ -185,10 +186,12 @@ def collect(
     """
     observation.check_list()
     # Measure 2048 stars at a time; stamps of the good ones are kept.
-    parts = [
-        measure_stamps(stamps, settings, framing, observation.least_noise, observation.shape)
-        for stamps in observation.chunks(2048)
-    ]
+    parts = []
+    with task("stars of the image", observation.count) as advance:
+        for stamps in observation.chunks(2048):
+            image = observation.least_noise, observation.shape
+            parts.append(measure_stamps(stamps, settings, framing, *image))
+            advance(len(stamps.data))
     measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
     bright = BrightStars.joined([stars for _, stars in parts])
     # Stars that no criterion of a single star refuses, with their rows in the list.

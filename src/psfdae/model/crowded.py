@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.progress import steps
 from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
@@ -110,7 +111,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     wings, wing_light = None, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.flat, observation.gain)
-    for turn in range(3):
+    for turn in steps("photometry", range(3)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
         fit = fit_stars(psfs, without_wings, error, bad, place, flux, _box(fwhm), fwhm, origin)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.progress import steps
 from psfdae.model.psf_grid import PsfGrid
 
 if TYPE_CHECKING:
@@ -113,7 +114,8 @@ def fit_stars(
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
     damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.squares()
     moving = np.ones(len(fit.stars), dtype=bool)
-    for _ in range(15):  # stars without neighbours take three or four, close pairs ten
+    # Stars without neighbours take three or four steps, close pairs ten.
+    for _ in steps("joint fit", range(15)):
         design = fit.design()
         step, gradient = fit.solve(design, prior, damping)
         # No farther at once than the light is nearly linear in the place, and not out of its range.
@@ -365,10 +367,17 @@ def _normal_matrix(
 
 
 def standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
-    """Return the standard errors (m, k) of the parameters of m stars.
+    """Return the standard errors (m, k) of the k parameters of m stars.
 
     Those of a star are from the inverse of the part of the matrix that belongs to it and to the
     stars whose boxes overlap with its own; what these share with others changes little.
+
+    Parameters
+    ----------
+    matrix : sparse array, shape (m k, m k)
+        Normal matrix of all parameters, with 1 on its diagonal.
+    unit : ndarray, shape (m, k)
+        Factors by which its rows and columns were divided.
     """
     # Blocks of 3 × 3 numbers, one for each pair of stars that overlap.
     stars, parameters = unit.shape

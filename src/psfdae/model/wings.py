@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import sky_level
 from psfdae.model.photon_noise import pixel_error
@@ -303,7 +304,7 @@ def tented_light(
     """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
     height, width = shape
     # The tents of a whole image would take K times its memory.
-    for top in range(0, height, 128):
+    for top in steps("wings", range(0, height, 128)):
         rows = slice(top, min(top + 128, height))
         tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
         for window, tented_star in star_tents(rows, width, stars, wings):
@@ -538,7 +539,7 @@ def _wings_beside(
     is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
     stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
-    for turn in range(8):
+    for turn in steps("light beyond the stamps", range(8)):
         previous = wings
         if turn:
             without_wings = without_stars - wing_light(bad.shape, all_stars, previous)

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psfdae.base import progress
+
 Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
 
@@ -165,7 +167,7 @@ def climb(
     peaks = Peaks(start.copy(), *evaluate(active, start), evaluations, np.zeros(len(start), bool))
     damping = np.full(len(start), steps.initial_damping)
     gain = np.full(len(start), np.inf)
-    for _ in range(steps.max_steps):
+    for _ in progress.steps("maxima of the posterior", range(steps.max_steps)):
         # Gain sᵀg − ½ sᵀIs that the undamped step s promises. Damping makes a step small, which
         # says nothing about the distance of the maximum.
         step = _damped_step(peaks, active, np.zeros(active.size), limit)
@@ -194,7 +196,8 @@ def climb(
         if not active.size:
             break
         # A damped step is kept if it raises the posterior. The damping falls by a factor of 10
-        # after a good step, and rises by as much after a bad one.
+        # after a good step, and rises by as much after a bad one: at once to where it shortens the
+        # step, because less of it would only repeat the step that has failed.
         parameters = peaks.parameters[active]
         parameters = parameters + _damped_step(peaks, active, damping[active], limit)
         peaks.evaluations[active] += 1
@@ -203,7 +206,8 @@ def climb(
         tolerance = steps.relative_rounding * np.abs(peaks.height[active])
         is_improved = trial.height >= peaks.height[active] - tolerance
         peaks.overwrite(active[is_improved], trial, is_improved)
-        damping[active] *= np.where(is_improved, 1.0 / 10.0, 10.0)
+        increased = np.maximum(10.0 * damping[active], 0.3)
+        damping[active] = np.where(is_improved, damping[active] / 10.0, increased)
     return peaks
 
 

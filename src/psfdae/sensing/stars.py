@@ -18,7 +18,6 @@ from typing import ClassVar
 import numpy as np
 
 from psfdae.base.errors import Error
-from psfdae.base.progress import task
 from psfdae.base.rng import stream
 from psfdae.image.stamps import Stamps, border_median, border_scatter
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
@@ -409,7 +408,6 @@ class WavefrontSearch:
         diagonal = range(k + 4)
 
         def evaluate(members: np.ndarray, parameters: np.ndarray) -> Evaluation:
-            advance(1)
             stars, z, place = star[members], parameters[:, :k], parameters[:, k : k + 2]
             # Poisson likelihood of the counts.
             modes = optics.mode_coefficients(stars, optics.coefficients(stars, z), place)
@@ -422,8 +420,7 @@ class WavefrontSearch:
             return -0.5 * (deviance + self._prior_penalty(parameters)), score, information
 
         steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
-        with task("modes", steps.max_steps + 1) as advance:
-            peaks = climb(evaluate, start, limit, steps, star)
+        peaks = climb(evaluate, start, limit, steps, star)
         # Height = −½ (deviance + penalty of the prior).
         deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
         return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psfdae.base.progress import steps
 from psfdae.sensing.climbing import (
     Evaluation,
     Peaks,
@@ -166,7 +167,8 @@ def bound_covariances(
     # Stamps and slopes of a state serve all levels and both bounds. Those of 64 states are in
     # memory together.
     covariances = np.empty((len(unknown_flux), len(levels), len(states), 4, 4))
-    for part in (slice(start, start + 64) for start in range(0, len(states), 64)):
+    for start in steps("bounds of states", range(0, len(states), 64)):
+        part = slice(start, start + 64)
         stamps, slopes = optics(optics.parameters_of(states[part]))
         for bound, level in np.ndindex(covariances.shape[:2]):
             # The inverse of the Fisher matrix by all parameters; its part for the state is the

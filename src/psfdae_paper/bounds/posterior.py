@@ -16,6 +16,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from psfdae.base.progress import steps
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
@@ -385,7 +386,7 @@ def score_bank(bank: Bank, noisy: np.ndarray, likelihood: Likelihood) -> Iterato
         for j, jitter in enumerate(jitters(bank.jitter_px)):
             by_window[symmetry.window(jitter, bank.margin)].append((s, j))
     order = np.argsort(bank.field, kind="stable")  # stars of a field are adjacent
-    for start in range(0, order.size, bank.chunk):
+    for start in steps("bank", range(0, order.size, bank.chunk)):
         stars = order[start : start + bank.chunk]
         part = bank.take(stars)
         with np.errstate(divide="ignore"):  # −∞ where a symmetry does not count

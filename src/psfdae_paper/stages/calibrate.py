@@ -17,6 +17,7 @@ import pandas as pd
 from psfdae.base.belonging import STATIC, require
 from psfdae.base.files import Product, read_product, write_csv
 from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.rng import stream
 from psfdae.base.threads import limit_threads
 from psfdae.methods.metrics import mse, ssim
@@ -41,11 +42,7 @@ from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 
 @command("scan", reads=(*SIMULATION, "noise", "calibration"))
-def scan(
-    config: Config,
-    dataset: Annotated[str, "A dataset that the paper tabulates."],
-    out: Annotated[File, "CSV with the SSIM over scale, r0 and dynamic range."],
-) -> None:
+def scan(config: Config, dataset: str, out: File) -> None:
     """Scan parameters that the paper does not state against its original-noise rows.
 
     The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
@@ -53,6 +50,13 @@ def scan(
 
     A row of the table is a point of the scan: pixel scale in arcsec, r0 in metres (empty in scene
     1), noise level, dynamic range, and the mean SSIM of noisy stars to their noise-free images.
+
+    Parameters
+    ----------
+    dataset : str
+        A dataset that the paper tabulates.
+    out : Path
+        CSV with the SSIM over scale, r0 and dynamic range.
     """
     limit_threads(1)  # batches run in parallel
     # Columns of the paper's tables with the noise as it was, before any method.
@@ -63,9 +67,9 @@ def scan(
         r0_values = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
     table = []
     # Noisy stars of each pixel scale, whose SSIM is computed at all dynamic ranges.
-    for r0 in r0_values:
+    for r0 in steps("values of r0", r0_values):
         source = _source(config, r0)
-        for scale in config.calibration.pixel_scales_arcsec:
+        for scale in steps("pixel scales", config.calibration.pixel_scales_arcsec):
             # Noise-free, framed, normalised stars at this pixel scale. The search for the brightest
             # pixel covers the same angle as at the configured scale.
             telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
@@ -192,8 +196,8 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
 def calibrate(
     config: Config,
     scans: Annotated[tuple[File, ...], {"flag": "--scan"}],
-    stars: Annotated[tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."],
-    out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
+    stars: tuple[tuple[str, File], ...],
+    out: Folder,
 ) -> None:
     """Fit noise, dynamic range and pixel scales to the scans.
 
@@ -203,6 +207,13 @@ def calibrate(
     Four tables come out: fitted values beside the configured ones (fit.csv); each of the paper's
     columns beside simulated noise (columns.csv); residuals by pixel scale (scales.csv); and how
     well other r0 would do (degeneracy.csv). The configuration itself is not changed.
+
+    Parameters
+    ----------
+    stars : sequence of pairs
+        Dataset and its product of the stage stars.
+    out : Path
+        Folder for fit.csv, columns.csv and degeneracy.csv.
     """
     # Each of the paper's columns beside simulated stars with the configured parameters.
     products = dict(stars)

@@ -85,15 +85,20 @@ def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
 
 
 @command("night images")
-def night_images(
-    rows: Annotated[File, "CSV with a row for each image."],
-    folder: Annotated[Folder, "Folder for models, catalogues and report pages."],
-    out: Annotated[File, "CSV with a row for each image and what was measured in it."],
-) -> None:
+def night_images(rows: File, folder: Folder, out: File) -> None:
     """Model images that follow each other in time, and measure all of their stars.
 
     The most usual image of each camera is fitted; the others start from its model. An image that
     cannot be used is a row with its reason.
+
+    Parameters
+    ----------
+    rows : Path
+        CSV with a row for each image.
+    folder : Path
+        Folder for models, catalogues and report pages.
+    out : Path
+        CSV with a row for each image and what was measured in it.
     """
     from pandas import DataFrame
 
@@ -126,10 +131,18 @@ def night_images(
 
 @command("night table")
 def night_table(
-    parts: Annotated[tuple[File, ...], {"argument": True}, "Tables of night images, in order."],
-    out: Annotated[File, "CSV of the night; an ECSV with units is written beside it."],
+    parts: Annotated[tuple[File, ...], {"argument": True}],
+    out: File,
 ) -> None:
-    """Join the images of a night in one table, with a verdict on each."""
+    """Join the images of a night in one table, with a verdict on each.
+
+    Parameters
+    ----------
+    parts : sequence of Path
+        Tables of `night images`, in the order of time.
+    out : Path
+        CSV of the night; an ECSV with units is written beside it.
+    """
     from astropy.table import QTable
     from pandas import concat
 
@@ -145,12 +158,18 @@ def night_table(
 
 
 @command("night page")
-def write_night_page(
-    table: Annotated[File, "CSV of the night."],
-    folder: Annotated[Folder, "Folder with the models of the images."],
-    out: Annotated[File, "HTML page that needs no other file, but links the images' reports."],
-) -> None:
-    """Draw what an observer wants to know in the morning: bad images, and how the PSF moved."""
+def write_night_page(table: File, folder: Folder, out: File) -> None:
+    """Draw what an observer wants to know in the morning: bad images, and how the PSF moved.
+
+    Parameters
+    ----------
+    table : Path
+        CSV of the night.
+    folder : Path
+        Folder with the models of the images.
+    out : Path
+        HTML page that needs no other file, but links the images' reports.
+    """
     from psfdae.model.psf_model import load_model
 
     night = read_table(table, "name", "verdict", "reason")
@@ -168,8 +187,14 @@ def write_night_page(
 
 
 @command("night count")
-def night_count(table: Annotated[File, {"argument": True}, "CSV of the night."]) -> None:
-    """Print how many images are good, poor and failed; refuse a night without any model."""
+def night_count(table: Annotated[File, {"argument": True}]) -> None:
+    """Print how many images are good, poor and failed; refuse a night without any model.
+
+    Parameters
+    ----------
+    table : Path
+        CSV of the night.
+    """
     verdicts = Counter(read_table(table, "verdict").verdict)
     sentence = ", ".join(f"{verdicts[verdict]} {verdict}" for verdict in VERDICTS)
     if verdicts["failed"] == verdicts.total():

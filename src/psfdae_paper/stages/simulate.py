@@ -56,17 +56,11 @@ class StampSizeError(Error, ValueError):
 
 @command("simulate")
 def simulate(
-    out: Annotated[Folder | None, "Folder.  [default: name of the telescope]"] = None,
-    fits: Annotated[bool, "Also write the PSFs as FITS cube, psfs.fits."] = False,
-    image_snr: Annotated[
-        float | None,
-        click.FloatRange(min=0, min_open=True, max=1e6),
-        "Also write an image with a noisy star per field, image.fits, and stars.csv.",
-    ] = None,
-    seed: Annotated[int, click.IntRange(min=0), "Seed of the image's noise."] = 0,
-    least_energy: Annotated[
-        float, click.FloatRange(0, 1), "Refuse stamps with less than this part of the light."
-    ] = 0.1,
+    out: Folder | None = None,
+    fits: bool = False,
+    image_snr: Annotated[float | None, click.FloatRange(min=0, min_open=True, max=1e6)] = None,
+    seed: Annotated[int, click.IntRange(min=0)] = 0,
+    least_energy: Annotated[float, click.FloatRange(0, 1)] = 0.1,
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
     """Draw the PSFs of a telescope over its field: psfdae simulate telescope=NAME.
@@ -77,6 +71,19 @@ def simulate(
     PSFs at their places in the field; the table has, for each field point, the light inside the
     stamp, the FWHM in arcsec, ellipticity and position angle in degrees. Telescopes whose PSFs do
     not fit into their stamps are refused, before any file is written.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Folder. [default: name of the telescope]
+    fits : bool
+        Also write the PSFs as FITS cube, psfs.fits.
+    image_snr : float, optional
+        Also write an image with a noisy star per field, image.fits, and stars.csv.
+    seed : int
+        Seed of the image's noise.
+    least_energy : float
+        Refuse stamps with less than this part of the light.
     """
     # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
@@ -112,15 +119,20 @@ def simulate(
 
 
 @command("figure telescope")
-def figure_telescope(
-    templates: Annotated[File, "Product of the stage templates."],
-    table: Annotated[File, "CSV, a row per field point."],
-    out: Annotated[File, "PNG."],
-) -> None:
+def figure_telescope(templates: File, table: File, out: File) -> None:
     """Draw the static PSFs of a telescope with their light and their width, and tabulate them.
 
     The table has field angles in degrees, the light inside the stamp, FWHM in arcsec, ellipticity
     and position angle in degrees of every field point.
+
+    Parameters
+    ----------
+    templates : Path
+        Product of the stage templates.
+    table : Path
+        CSV, a row per field point.
+    out : Path
+        PNG.
     """
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
@@ -351,18 +363,31 @@ def write_image(
 
 @command("example-field")
 def write_example_field(
-    catalogue: Annotated[File, "CSV file for the star list."],
+    catalogue: File,
     seed: Annotated[int, click.IntRange(min=0)] = 1,
-    side: Annotated[int, click.IntRange(min=100), "Pixels along a side."] = FieldRecipe.side_px,
-    bright: Annotated[int, click.IntRange(min=1), "Bright stars."] = FieldRecipe.bright,
-    faint: Annotated[int, click.IntRange(min=0), "Faint stars."] = FieldRecipe.faint,
+    side: Annotated[int, click.IntRange(min=100)] = FieldRecipe.side_px,
+    bright: Annotated[int, click.IntRange(min=1)] = FieldRecipe.bright,
+    faint: Annotated[int, click.IntRange(min=0)] = FieldRecipe.faint,
     *,
-    out: Annotated[File, "FITS image."],
+    out: File,
 ) -> None:
     """Simulate an image of a star field with its star list, as an example.
 
     The list is what a catalogue of the image would have: numbers, pixel and sky coordinates of all
     stars but the faint halves of blends. The same seed gives the same image.
+
+    Parameters
+    ----------
+    catalogue : Path
+        CSV file for the star list.
+    side : int
+        Pixels along a side.
+    bright : int
+        Bright stars.
+    faint : int
+        Faint stars.
+    out : Path
+        FITS image.
     """
     check_outputs((out,), (catalogue,))
     write_example(out, catalogue, seed, side_px=side, bright=bright, faint=faint)
@@ -404,15 +429,22 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
 
 @command("example-night")
 def example_night(
-    out: Annotated[Folder, "Folder for images, truth.csv and reference.csv."],
+    out: Folder,
     seed: Annotated[int, click.IntRange(min=0)] = 1,
-    exposures: Annotated[int, click.IntRange(min=12), "Images."] = NightRecipe.exposures,
+    exposures: Annotated[int, click.IntRange(min=12)] = NightRecipe.exposures,
 ) -> None:
     """Simulate a night of a telescope, with bad images among them, as an example.
 
     truth.csv has a row for each image: what is wrong with it, and FWHM and ellipticity of its PSF
     in the middle and in the corners, without clouds or trail. reference.csv has the stars with
     their magnitudes. The same seed gives the same images.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for images, truth.csv and reference.csv.
+    exposures : int
+        Images.
     """
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)

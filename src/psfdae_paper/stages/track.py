@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 from psfdae.base.errors import Error
 from psfdae.base.files import as_csv, as_yaml, sha256_of, write_text
 from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
 from psfdae.base.version import __version__
 from psfdae.methods.interface import CONFIG
 from psfdae_paper.configuration.command import command
@@ -56,16 +57,14 @@ class TrackingError(Error, RuntimeError):
 
 @command("track")
 def track(
-    results: Annotated[Folder, "Folder that the workflow writes to."],
-    preset: Annotated[str, "Goes into the tags."],
-    database: Annotated[File, "SQLite file; mlartifacts/ lies beside it."],
-    out: Annotated[File, "CSV with the MLflow id of every run and what was done."],
-    stars: Annotated[
-        tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
-    ] = (),
-    alignment: Annotated[bool, "The networks of scene 3."] = False,
-    night: Annotated[bool, "The images of a night."] = False,
-    sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
+    results: Folder,
+    preset: str,
+    database: File,
+    out: File,
+    stars: tuple[tuple[str, File], ...] = (),
+    alignment: bool = False,
+    night: bool = False,
+    sweeps: Annotated[tuple[str, ...], {"flag": "--sweep"}] = (),
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
 
@@ -75,6 +74,25 @@ def track(
     with the tag superseded = true, beside the new one.
 
     If a server fails there is a message and no error: it must not stop a workflow.
+
+    Parameters
+    ----------
+    results : Path
+        Folder that the workflow writes to.
+    preset : str
+        Goes into the tags.
+    database : Path
+        SQLite file; mlartifacts/ lies beside it.
+    out : Path
+        CSV with the MLflow id of every run and what was done.
+    stars : sequence of pairs
+        Dataset and its product of the stage stars.
+    alignment : bool
+        The networks of scene 3.
+    night : bool
+        The images of a night.
+    sweeps : sequence of str
+        The points of a sweep.
     """
     # Methods, networks of scene 3, images of a night and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))
@@ -186,7 +204,7 @@ def _import(
     # MLflow's ids of the experiments by name, and of the runs by their source.
     experiments: dict[str, str] = {}
     imported: dict[str, str] = {}
-    for run in runs:
+    for run in steps("runs", runs):
         if run.experiment not in experiments:
             experiments[run.experiment] = experiment_of(client, run.experiment, uri, database)
         tags = {**import_tags, **tags_of(run)}
