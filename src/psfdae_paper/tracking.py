@@ -353,7 +353,7 @@ def runs_of_night(results: Path) -> list[TrackedRun]:
     ProductError
         If the table of the night or a model is missing.
     """
-    night = read_table(results / "night/night.csv", "image", "name", "verdict", "start")
+    night = read_table(results / "night/night.csv", "image", "name", "verdict")
     runs = []
     for row in night[night.verdict != "failed"].to_dict("records"):
         name = str(row["name"])

@@ -46,10 +46,10 @@ def with_verdicts(night: DataFrame) -> DataFrame:
     night : DataFrame
         Rows in the order of time, with the column `reason` of images that have no model.
     """
+    # A night without any model has no measurements.
+    night = night.reindex(columns=[*night, *(name for name in LIMITS if name not in night)])
     night = night.assign(verdict=np.where(night.reason == "", "good", "failed"))
     for column, (least_excess, sentence) in LIMITS.items():
-        if column not in night:
-            continue
         value = night[column].dropna()
         usual = value.rolling(11, center=True, min_periods=1).median()
         excess = value - usual

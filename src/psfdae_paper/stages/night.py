@@ -117,12 +117,13 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
             row["reason"] = reason_of(error, row)
     for stars_by_name in groups.values():
         start: PsfModel | None = None
+        start_name = ""
         for name in from_most_usual(stars_by_name):
             try:
                 model = model_of_image(stars_by_name[name], start)
                 results[name] |= measured(results[name], stars_by_name[name], model, folder)
-                results[name]["start"] = start.name if start else ""
-                start = start or model
+                results[name]["start"] = start_name
+                start, start_name = start or model, start_name or name
             except Exception as error:
                 results[name]["reason"] = reason_of(error, results[name])
             print(name, results[name]["reason"] or "done", flush=True)
