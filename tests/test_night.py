@@ -1,17 +1,15 @@
 """A night of a telescope: the simulated example, and the tables and pages made of many images."""
 
-import shutil
 import signal
+import subprocess
 import time
 
 import numpy as np
 import pandas as pd
 import pytest
 from astropy.io import fits
-from workflow_runs import QUIET, ROOT, captured, environment
 
 from psfdae.base.reading import read_table
-from psfdae.image.errors import ObservationError
 from psfdae_paper.evaluation.night import LIMITS, night_page, with_verdicts
 from psfdae_paper.stages.night import (
     NightError,
@@ -23,6 +21,7 @@ from psfdae_paper.stages.night import (
 )
 from psfdae_paper.stages.simulate import example_night
 from psfdae_paper.stars.nights import PLACES
+from workflow_runs import QUIET, captured, copy_of_sources, environment
 
 
 @pytest.fixture(scope="module")
@@ -188,16 +187,12 @@ def test_wrong_statement_is_the_reason(tmp_path):
 @pytest.mark.workflow
 def test_killed_and_typed_again_gives_the_same_files(folder, tmp_path):
     """The start of an image depends on the list, not on what was finished before."""
-    from workflow_runs import copy_of_sources
-
     products = []
     for is_killed in (False, True):
         place = copy_of_sources(tmp_path / str(is_killed))
         words = ["snakemake", "night", "--cores", "2", "--config", f"images={folder}/exp*.fits"]
         options = {"cwd": place, "env": environment(SOURCE_DATE_EPOCH="0")}
         if is_killed:
-            import subprocess
-
             run = subprocess.Popen(words, **options, **QUIET)
             while not [*place.glob("results/night/images/*.html")] and run.poll() is None:
                 time.sleep(0.2)
