@@ -84,7 +84,7 @@ UNKNOWN := $(strip $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $
 $(if $(filter-out PYTHON,$(UNKNOWN)),$(error $(UNKNOWN): no variable of this Makefile, whose first lines list them))
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
   benchmark stability bounds bundles shipped
 
 help: ## List the targets
@@ -147,6 +147,9 @@ reference: env ## Make the finished run in results the run of record, and renew 
 
 docs: env ## Renew the numbers in README and docs
 	python docs/tables.py
+
+notebook: env ## Run the cells of the first session anew
+	python docs/notebook.py docs/first_session.ipynb
 
 site: docs ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict

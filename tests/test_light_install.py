@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -11,7 +12,6 @@ import sys
 import numpy as np
 import pytest
 from astropy.io import fits
-from matplotlib.image import imread
 
 from docs_pages import FENCE, ROOT, read
 from fits_inputs import write_cube
@@ -20,7 +20,7 @@ from workflow_runs import captured
 
 pytestmark = pytest.mark.slow
 
-PAGES = ("README", "docs/first_session", "docs/tutorial", "docs/train", "docs/predict")
+PAGES = ("README", "docs/tutorial", "docs/train", "docs/predict")
 PAGES += ("docs/photometry", "docs/exposures", "docs/python")
 
 WITH_EXTRA = ("simulate", "fit")
@@ -30,9 +30,11 @@ OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
 """First words of lines that install psfdae or build the reproduction."""
 
 SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
-"""Options that make a command quick; the picture of the first session is of the full image."""
+"""Options that make a command quick."""
 
 EXAMPLE = "psfdae example-field --out image.fits --catalogue stars.csv"
+NOTEBOOK = ROOT / "docs/first_session.ipynb"
+
 PREPARATION = {
     **dict.fromkeys(("README", "docs/exposures"), EXAMPLE),
     "docs/python": f"""{EXAMPLE}
@@ -70,7 +72,7 @@ def light(tmp_path_factory):
 
 
 def run(light, folder, script):
-    """What a bash script prints in a folder, `psfdae` and `python` being the environment's."""
+    """Output of a bash script in a folder, `psfdae` and `python` being the environment's."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment["PATH"] = f"{light}{os.pathsep}{os.environ['PATH']}"
     process = captured(["bash", "-euc", script], cwd=folder, env=environment)
@@ -100,7 +102,7 @@ def shell_line(line, page):
         return ""
     if words[1] in WITH_EXTRA:
         return f"{shlex.quote(sys.executable)} -m {line}"
-    small = SMALL.get(words[1], "") if page != "docs/first_session" else ""
+    small = SMALL.get(words[1], "")
     sparse = "cp image.fits sparse.fits\n" if "sparse.fits" in words[:4] else ""
     return f"{sparse}{line} {small}"
 
@@ -115,11 +117,25 @@ def test_commands_and_python_lines_of_a_page_run_without_extras(light, page, tmp
         models = [tmp_path / f"{place}image.psf.safetensors" for place in ("", "model/")]
         assert models[0].read_bytes() == models[1].read_bytes()
         assert (tmp_path / "page.html").stat().st_size > 10_000
-    if page == "docs/first_session":
-        drawn, shown = (
-            imread(folder / "first_session.png") for folder in (tmp_path, ROOT / "docs/figures")
-        )
-        assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 0.01
+
+
+def test_notebook_shows_what_its_cells_show_here(light, tmp_path):
+    """Words are the same, numbers within the rounding of other machines, pictures as large."""
+    run(light, tmp_path, f"python {ROOT}/docs/notebook.py {NOTEBOOK} again.ipynb")
+    committed, executed = (shown(path) for path in (NOTEBOOK, tmp_path / "again.ipynb"))
+    assert [words for words, _ in executed] == [words for words, _ in committed]
+    for (_, numbers), (_, expected) in zip(executed, committed, strict=True):
+        np.testing.assert_allclose(numbers, expected, rtol=0.05, atol=0.05)
+    assert NOTEBOOK.stat().st_size < 400_000
+
+
+def shown(notebook):
+    """Words and numbers of each text that a notebook's cells show."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    texts = ["".join(output.get("data", output).get("text/plain", "image")) for output in outputs]
+    number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
+    return [(number.sub("n", text).split(), [*map(float, number.findall(text))]) for text in texts]
 
 
 def test_environment_is_small_and_holds_no_extra(light, tmp_path):
