@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from psfdae.base.belonging import STARS, STATIC, require
 from psfdae.base.files import Column, ProductError, write_product
 from psfdae.commands.cli import stage
@@ -22,8 +22,7 @@ METHODS = "methods=[noisy,pca_som,lmmse,dae]"
 
 
 def done(*words):
-    result = psfdae(*words)
-    assert result.exit_code == 0, result.output
+    printed(*words)
 
 
 def differs(folder, *words, file, key, values):

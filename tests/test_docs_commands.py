@@ -10,7 +10,7 @@ import click
 import numpy as np
 import pytest
 
-from command_line import psfdae
+from command_line import printed
 from docs_pages import ROOT, blocks, commands, pages, read
 from fits_inputs import write_field
 from image_training import few_draws
@@ -105,8 +105,7 @@ def test_commands_of_the_readme_run(observation, tmp_path, monkeypatch):
     assert {words[0] for words in lines} == {"from-stars", "predict"}
     for words in lines:
         with few_draws():
-            result = psfdae(*words, *(SMALL if words[0] == "from-stars" else ()))
-        assert result.exit_code == 0, result.output
+            printed(*words, *(SMALL if words[0] == "from-stars" else ()))
     assert {"model.html", "psfs.fits", "psfs.png"} <= {path.name for path in tmp_path.iterdir()}
 
 

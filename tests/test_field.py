@@ -14,7 +14,7 @@ from astropy.table import Table
 from packaging.version import Version
 from photutils.psf import GriddedPSFModel, PSFPhotometry
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.methods.field import FieldMixture
@@ -439,8 +439,7 @@ def image(tmp_path_factory):
     words += ["parts.test_stars=30", "field.orders=[2]", "field.modes=16", "--method", "field"]
     words += ["--catalogue", folder / "bright.csv", "--out", folder / "model"]
     with few_draws():
-        result = psfdae("from-stars", folder / "i.fits", *words)
-    assert result.exit_code == 0, result.output
+        printed("from-stars", folder / "i.fits", *words)
     inside = flux * truth(position, centre, SIDE).sum(axis=(1, 2))
     true = {"position": position, "flux": flux, "inside": inside}
     true = {name: values[~is_bright] for name, values in true.items()}
@@ -451,8 +450,7 @@ def predicted(image, *options):
     folder, model, _ = image
     out = folder / f"out{len(options)}.fits"
     words = ("--catalogue", folder / "faint.csv", "--model", model, "--out", out, "--overwrite")
-    result = psfdae("predict", folder / "i.fits", *words, "--quiet", *options)
-    assert result.exit_code == 0, result.output
+    printed("predict", folder / "i.fits", *words, "--quiet", *options)
     return Table.read(out, hdu="STARS"), fits.getdata(out, "UNCERT")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
@@ -354,8 +354,7 @@ def test_commands_of_pages_run(page, tmp_path, monkeypatch):
         if "sparse.fits" in rest:
             shutil.copy("image.fits", "sparse.fits")
         words = [name, *rest, *small.get(name, [])]
-        result = psfdae(*words)
-        assert result.exit_code == 0, (words, result.output)
+        printed(*words)
     names: dict[str, Any] = {}
     for body in blocks(text, "python"):
         exec(compile(body, page, "exec"), names)

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from psfdae.commands import mosaic
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
@@ -142,8 +142,7 @@ def test_a_mosaic_from_its_stars_to_their_psfs(tmp_path):
         assert (tmp_path / f"page_CCD{k}.html").is_file()
     mosaic = mosaic_file(tmp_path / "two.fits", *images)
     words = [mosaic, "--all-extensions", "--detect", "--model", out]
-    process = psfdae("predict", *words, "--out", tmp_path / "psf.fits")
-    assert process.exit_code == 0, process.output
+    printed("predict", *words, "--out", tmp_path / "psf.fits")
     for k in (1, 2):
         stars = Table.read(tmp_path / f"psf_CCD{k}.fits", hdu="STARS")
         assert len(stars) == len(Table.read(tmp_path / f"psf_CCD{k}_stars.csv")) > 100

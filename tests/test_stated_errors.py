@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import psfdae
-from command_line import psfdae as command
+from command_line import printed
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
@@ -128,8 +128,7 @@ def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp
     Table({"id": names, "x": place[:, 0], "y": place[:, 1]}).write(tmp_path / "s.csv")
     words = ["photometry", tmp_path / "i.fits", "--catalogue", tmp_path / "s.csv", "--origin", 0]
     words += ["--model", tmp_path / "m.psf.safetensors", "--out", tmp_path / "p.ecsv"]
-    process = command(*words)
-    assert process.exit_code == 0, process.output
+    printed(*words)
     rows = Table.read(tmp_path / "p.ecsv")
     assert rows["id"].tolist() == names
     assert (rows["flags"] == 0).mean() > 0.9
