@@ -190,7 +190,8 @@ def with_keywords(
         owner = next((group for group, keys in group_keys.items() if name in keys), None)
         if owner is None:
             names = ", ".join(key for keys in group_keys.values() for key in sorted(keys))
-            raise ConfigError(f"{name}: unknown setting; there are {names}")
+            hint = did_you_mean(name, names.split(", "))
+            raise ConfigError(f"{name}: unknown setting; there are {names}{hint}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
     return parse_settings(settings_model(), tree)
 
