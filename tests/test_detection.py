@@ -212,7 +212,7 @@ def test_bits_of_a_mask(field, tmp_path):
         assert observation.sky().bad[[10, 20, 30], [10, 20, 30]].tolist() == expected
     words = ["predict", path, "--detect", "--mask", "DQ", "--out", tmp_path / "x.fits"]
     done = psfdae(*words, "--bad-bits", 2**63)
-    assert done.exit_code == 2 and "bad bits 9223372036854775808, expected" in done.output
+    assert done.exit_code == 2 and "--bad-bits 9223372036854775808: expected" in done.output
 
 
 # What cannot be used: one line and code 2

@@ -14,6 +14,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from psfdae.base.errors import did_you_mean
 from psfdae.base.files import ProductError
 from psfdae.base.joined import joined
 from psfdae.methods.interface import Method
@@ -30,8 +31,9 @@ def method(name: str) -> type[Method]:
     # The package's own methods first: no other package replaces one.
     method_class = _of_module(f"{__name__}.{name}") or _joined().get(name)
     if method_class is None:
+        names = [k.name for k in all_methods()]
         raise ProductError(
-            f"no method {name!r}; there are {', '.join(k.name for k in all_methods())}"
+            f"no method {name!r}; there are {', '.join(names)}{did_you_mean(name, names)}"
         )
     return method_class
 
