@@ -61,17 +61,17 @@ def with_text(raw, change):
 
 
 def test_what_was_written_is_read_and_written_again_with_the_same_bytes(handmade, file, tmp_path):
-    again = read_bundle(file)
-    assert again.info == handmade.info
-    assert again.sha256 == handmade.sha256
-    assert again.errors.distance_limit == handmade.errors.distance_limit
+    copy = read_bundle(file)
+    assert copy.info == handmade.info
+    assert copy.sha256 == handmade.sha256
+    assert copy.errors.distance_limit == handmade.errors.distance_limit
     for name, values in handmade.weights.items():
-        assert (again.weights[name] == values).all()
+        assert (copy.weights[name] == values).all()
     tables = handmade.errors.arrays()
-    assert all((table == tables[name]).all() for name, table in again.errors.arrays().items())
+    assert all((table == tables[name]).all() for name, table in copy.errors.arrays().items())
     path, mask = tmp_path / "again.psf.safetensors", os.umask(0)
     os.umask(mask)
-    write_bundle(again, path)
+    write_bundle(copy, path)
     assert path.read_bytes() == file.read_bytes()
     assert path.stat().st_mode & 0o777 == 0o666 & ~mask  # others may read it
 

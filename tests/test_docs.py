@@ -83,8 +83,8 @@ def test_site_has_every_page_no_dead_link_and_needs_no_other_server(tmp_path):
 def leaves(tree, name=""):
     """Keys of a tree of settings."""
     for key, value in tree.items():
-        inner = f"{name}.{key}" if name else key
-        yield from leaves(value, inner) if isinstance(value, dict) else [inner]
+        path = f"{name}.{key}" if name else key
+        yield from leaves(value, path) if isinstance(value, dict) else [path]
 
 
 def test_every_key_that_a_file_of_the_configuration_sets_is_documented():

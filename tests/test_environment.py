@@ -34,7 +34,7 @@ def required(*extras):
 
 
 DECLARED = required("paper", "dev")
-"""What the environment of make and conda holds."""
+"""Packages of the environments of make and conda."""
 
 
 def locked(path):
@@ -51,12 +51,12 @@ def test_conda_requires_what_pyproject_requires():
     parts = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
     lines = [line for line in parts if isinstance(line, str)]
     lines += [line for line in parts[-1]["pip"] if line != "--editable ."]
-    ours = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
-    assert str(ours.pop("python")) == PROJECT["requires-python"]
-    ours.pop("pip")
+    specifiers = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
+    assert str(specifiers.pop("python")) == PROJECT["requires-python"]
+    specifiers.pop("pip")
     expected = {name: r.specifier for name, r in DECLARED.items()}
     expected["torch"] = SpecifierSet(f"=={TORCH}")
-    assert {canonicalize_name(name): s for name, s in ours.items()} == expected
+    assert {canonicalize_name(name): s for name, s in specifiers.items()} == expected
 
 
 def test_locked_and_installed_versions_satisfy_pyproject():

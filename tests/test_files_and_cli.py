@@ -145,11 +145,11 @@ print(json.dumps(found))
 def test_nothing_loads_packages_that_it_does_without():
     """In one interpreter, from what must be lightest to what may load most."""
     line = [sys.executable, "-c", LIGHT]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) == 3
-    assert not any(found.values()), found
+    process = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    loaded = json.loads(process.stdout.splitlines()[-1])
+    assert len(loaded) == 3
+    assert not any(loaded.values()), loaded
 
 
 def test_progress_is_a_bar_in_a_terminal(monkeypatch):

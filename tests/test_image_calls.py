@@ -53,9 +53,12 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
     table, without_stars = image.with_name("stars.ecsv"), image.with_name("residual.fits")
     words = ["--detect", "--zero-point", 25, "--model", bundle, "--out", table]
     assert psfdae("photometry", image, *words, "--residual", without_stars).exit_code == 0
-    fluxes, written = model.photometry(image, detect=True, zero_point=25.0), QTable.read(table)
-    assert fluxes.colnames == written.colnames and fluxes["flux"].unit == "adu"
-    np.testing.assert_array_equal(fluxes["mag"], written["mag"])
+    fluxes, command_table = (
+        model.photometry(image, detect=True, zero_point=25.0),
+        QTable.read(table),
+    )
+    assert fluxes.colnames == command_table.colnames and fluxes["flux"].unit == "adu"
+    np.testing.assert_array_equal(fluxes["mag"], command_table["mag"])
     residual = model.residual(image, detect=True)
     assert isinstance(residual, CCDData)
     np.testing.assert_array_equal(residual.data, fits.getdata(without_stars))
@@ -68,8 +71,8 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
 def test_detected_stars_are_a_star_list(image, model):
     pixels, place = small_field.field()
     detected = library.detect(CCDData(pixels, unit="adu", meta=dict(small_field.header())))
-    found = np.stack([detected["x"].value, detected["y"].value], axis=1)
-    assert np.abs(found[:, None] - place).max(axis=2).min(axis=1).max() < 0.3
+    detected_xy = np.stack([detected["x"].value, detected["y"].value], axis=1)
+    assert np.abs(detected_xy[:, None] - place).max(axis=2).min(axis=1).max() < 0.3
     assert len(detected) == small_field.COUNT and detected["flux_iso"].unit == "adu"
     prediction = model.predict_image(image, catalogue=detected)
     assert len(prediction) == len(detected)

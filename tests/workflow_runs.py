@@ -22,14 +22,14 @@ KERNELS = {
     for name, value in os.environ.items()
     if name.startswith("OPENBLAS_") and "THREADS" not in name
 }
-"""What chooses the kernels of linear algebra; like another processor it changes last digits."""
+"""Variable that chooses the kernels of linear algebra, which changes last digits."""
 
 
-def environment(**more):
+def environment(**variables):
     """The environment of a run, without what `make test` has in its own."""
     dropped = ("PSFDAE_RESULTS", "MAKEFLAGS", "MAKELEVEL")
     inherited = {key: value for key, value in os.environ.items() if key not in dropped}
-    return {**inherited, "PATH": PATH, **more}
+    return {**inherited, "PATH": PATH, **variables}
 
 
 def captured(args, **options):

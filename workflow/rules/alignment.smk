@@ -13,6 +13,8 @@ rule alignment_model:
         f"{RESULTS}/logs/alignment/model.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/model.tsv"
+    # The longest chain of jobs of a whole run goes through these networks: it starts first.
+    priority: 120
     params:
         config=lambda w: settings("alignment model"),
         source=source_hash("alignment model"),
@@ -32,6 +34,7 @@ rule alignment_states:
         f"{RESULTS}/logs/alignment/{{states}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{states}}.tsv"
+    priority: 120
     threads: lambda w: alignment_config().optics.threads
     resources:
         mem_mb=1000,
@@ -79,6 +82,7 @@ rule alignment_dae:
         f"{RESULTS}/logs/alignment/dae.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/dae.tsv"
+    priority: 120
     threads: lambda w: alignment_config().dae_train.threads
     resources:
         mem_mb=1500,
@@ -108,6 +112,7 @@ rule alignment_network:
         f"{RESULTS}/logs/alignment/{{network}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{network}}.tsv"
+    priority: 120
     threads: lambda w: getattr(alignment_config(), f"train_{w.network}").threads
     resources:
         mem_mb=1600,

@@ -203,7 +203,18 @@ class Catalogue:
             ) from None
 
     def flags(self, positions: Positions) -> np.ndarray:
-        """Return flags of the list's own program as `StarFlag`s, (n,), uint16."""
+        """Return what the program that made the list flags of its stars, as `StarFlag`s.
+
+        Parameters
+        ----------
+        positions : Positions
+            Columns of the positions, whose names tell the program and its column of flags.
+
+        Returns
+        -------
+        ndarray of uint16, shape (n,)
+            0 without such a column.
+        """
         flags = np.zeros(len(self), dtype=np.uint16)
         if positions.flags is not None and positions.flags in self.table.colnames:
             values = np.nan_to_num(self.numbers(positions.flags), posinf=0, neginf=0)

@@ -196,7 +196,8 @@ def climb(
         if not active.size:
             break
         # A damped step is kept if it raises the posterior. The damping falls by a factor of 10
-        # after a good step, and rises by as much after a bad one.
+        # after a good step, and rises by as much after a bad one: at once to where it shortens the
+        # step, because less of it would only repeat the step that has failed.
         parameters = peaks.parameters[active]
         parameters = parameters + _damped_step(peaks, active, damping[active], limit)
         peaks.evaluations[active] += 1
@@ -205,7 +206,8 @@ def climb(
         tolerance = steps.relative_rounding * np.abs(peaks.height[active])
         is_improved = trial.height >= peaks.height[active] - tolerance
         peaks.overwrite(active[is_improved], trial, is_improved)
-        damping[active] *= np.where(is_improved, 1.0 / 10.0, 10.0)
+        increased = np.maximum(10.0 * damping[active], 0.3)
+        damping[active] = np.where(is_improved, damping[active] / 10.0, increased)
     return peaks
 
 

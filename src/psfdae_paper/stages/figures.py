@@ -68,22 +68,25 @@ def figure_energy(templates: Templates, out: Png) -> None:
 @command("figure strip", reads=READS)
 def figure_strip(
     config: Config,
-    dataset: Annotated[str, "Name that goes into the title."],
+    dataset: str,
     stars: Stars,
     models: Models,
     reference: Reference = "realisation",
     *,
-    levels: Annotated[
-        tuple[Annotated[float, AboveZero], ...],
-        {"flag": "--level"},
-        "Noise level λ; repeat for more rows.",
-    ],
+    levels: Annotated[tuple[Annotated[float, AboveZero], ...], {"flag": "--level"}],
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration.
 
     A row is a method at a noise level, a column a star; below each stamp stands its MSE × 10⁶. The
     first row is the reference. Eight stars spread over the field are shown.
+
+    Parameters
+    ----------
+    dataset : str
+        Name that goes into the title.
+    levels : sequence of float
+        Noise level λ; repeat for more rows.
     """
     # Eight stars side by side fill the width of a page.
     strip_stars = drawn_stars(config, stars, models, reference, 8)
@@ -103,7 +106,7 @@ def figure_headline(
     dataset: str,
     stars: Stars,
     models: Models,
-    level: Annotated[float, AboveZero, "Noise level λ."],
+    level: Annotated[float, AboveZero],
     bounds: Bounds,
     efficiency: Efficiency,
     out: Png,
@@ -112,6 +115,11 @@ def figure_headline(
 
     At the left are five stars at one noise level, noisy and by every method, with the truth below;
     at the right is the MSE of each method against the noise level, with the bounds.
+
+    Parameters
+    ----------
+    level : float
+        Noise level λ.
     """
     strip_stars = drawn_stars(config, stars, models, "realisation", 5)
     # Rows of restored stars, one for each method, and below them the truth.
@@ -236,13 +244,18 @@ def drawn_stars(
 
 @command("figure curves")
 def figure_curves(
-    labels: Annotated[tuple[str, ...], {"flag": "--label"}, "One per history, in order."],
+    labels: Annotated[tuple[str, ...], {"flag": "--label"}],
     histories: Annotated[tuple[File, ...], {"argument": True}],
     out: Png,
 ) -> None:
     """Draw training and validation error of networks against the optimiser's steps.
 
     HISTORIES are tables of trainings, with the columns step, train_mse and validation_mse.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        One per history, in order.
     """
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
@@ -258,13 +271,16 @@ def figure_curves(
 
 @command("figure errors")
 def figure_errors(
-    dataset: str,
-    evaluations: Evaluations,
-    out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
+    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:
     """Draw metrics against the noise level, with the paper's points.
 
     Each metric is a figure; it is refused if the tables have no row of the dataset.
+
+    Parameters
+    ----------
+    out : sequence of pairs
+        Metric and its PNG; repeat for more.
     """
     metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
@@ -289,12 +305,14 @@ def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) ->
 
 
 @command("figure bank-growth")
-def figure_bank_growth(
-    dataset: DatasetName,
-    growth: Annotated[File, "CSV of the stage bounds: error by size of the bank."],
-    out: Png,
-) -> None:
-    """Draw the posterior mean's error against the size of the bank."""
+def figure_bank_growth(dataset: DatasetName, growth: File, out: Png) -> None:
+    """Draw the posterior mean's error against the size of the bank.
+
+    Parameters
+    ----------
+    growth : Path
+        CSV of the stage bounds: error by size of the bank.
+    """
     write_png(bound_figures.bank_growth(rows_of(growth, dataset), dataset), out)
 
 

@@ -186,7 +186,7 @@ class Training(ABC):
 
     def begin(self, lr: float) -> torch.optim.Optimizer:
         """Return the optimiser, Adam unless a subclass chooses another one."""
-        return torch.optim.Adam(self.model.parameters(), lr=lr)
+        return torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
 
     @abstractmethod
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
