@@ -79,6 +79,10 @@ PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses log
   --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
+# A mistyped PRESET would be ignored without a word.
+UNKNOWN := $(strip $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name))))
+$(if $(filter-out PYTHON,$(UNKNOWN)),$(error $(UNKNOWN): no variable of this Makefile, whose first lines list them))
+
 .DEFAULT_GOAL := help
 .PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
   benchmark stability bounds bundles shipped

@@ -144,8 +144,19 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
     Names whose last part is the word's are the likeliest: train.lr for lr. Others are alike in
     their letters.
     """
-    names = [name for name in names if name != word]
+    names = [str(name) for name in names if name != word]
     last_part = word.rpartition(".")[2]
     alike = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
     alike = sorted(alike, key=len) or get_close_matches(word, names, n=1)
     return f"; did you mean {' or '.join(alike[:3])}?" if alike else ""
+
+
+def no_such_file(path: Path) -> str:
+    """Return the line that refuses a file which does not exist, with one of its folder like it."""
+    try:
+        names = [neighbour.name for neighbour in path.parent.iterdir()]
+    except OSError:
+        return f"{path}: no such file, nor is there a folder {path.parent}"
+    # File names are alike in their letters: parts between dots have no meaning of their own.
+    alike = get_close_matches(path.name, names, n=1)
+    return f"{path}: no such file" + "".join(f"; did you mean {name}?" for name in alike)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -81,8 +81,10 @@ def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     """Yield the dotted keys of a pydantic model, those of its groups after each group's name."""
     for name, field in model.model_fields.items():
         yield prefix + name
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Group):
-            yield from keys_of(field.annotation, f"{prefix}{name}.")
+        # A group may be one of several classes.
+        for group in (field.annotation, *get_args(field.annotation)):
+            if isinstance(group, type) and issubclass(group, Group):
+                yield from keys_of(group, f"{prefix}{name}.")
 
 
 def _line(error: Mapping[str, Any], keys: Iterable[str]) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from psfdae.base.errors import did_you_mean
 from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.list_formats import read_list_table
@@ -297,9 +298,9 @@ class Catalogue:
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
         if resolved is None:
-            raise ObservationError(
-                self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
-            )
+            names = self.table.colnames
+            hint = did_you_mean(name, names)
+            raise ObservationError(self.path, f"no column {name!r}; found {shorten(names)}{hint}")
         # Coordinates and times are objects of astropy, not arrays.
         column = self.table[resolved]
         if not isinstance(column, np.ndarray):

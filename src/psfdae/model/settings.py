@@ -191,9 +191,9 @@ def with_keywords(
     for name, value in keywords.items():
         owner = next((group for group, keys in group_keys.items() if name in keys), None)
         if owner is None:
-            names = [key for keys in group_keys.values() for key in sorted(keys)]
-            hint = did_you_mean(name, names) or f"; there are {', '.join(names)}"
-            raise ConfigError(f"{name}: unknown setting{hint}")
+            names = ", ".join(key for keys in group_keys.values() for key in sorted(keys))
+            hint = did_you_mean(name, names.split(", "))
+            raise ConfigError(f"{name}: unknown setting; there are {names}{hint}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
         typed[f"{owner}.{name}"] = keyword(name).removesuffix("=")
     try:

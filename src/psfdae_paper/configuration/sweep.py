@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from psfdae.base.errors import did_you_mean
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import groups_of, method
 from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
@@ -332,6 +333,7 @@ def load_sweep(name: str) -> Sweep:
     name : str
         Name of the file, without its suffix.
     """
-    if name not in sweep_names():
-        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")
+    if name not in (names := sweep_names()):
+        hint = did_you_mean(name, names)
+        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(names)}{hint}")
     return load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")
