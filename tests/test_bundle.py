@@ -150,10 +150,10 @@ def test_network_of_a_bundle_is_the_one_that_was_packed(file, handmade, gaussian
 
 
 def test_completed_covariance_measures_fluxes_as_the_whole_one(gaussian_stars):
-    whole = FluxModel.fit(gaussian_stars)
-    model = packing.leading(whole, 48)
-    assert model.variance.sum() == pytest.approx(whole.variance.sum(), rel=1e-9)
+    full_basis = FluxModel.fit(gaussian_stars)
+    model = packing.leading(full_basis, 48)
+    assert model.variance.sum() == pytest.approx(full_basis.variance.sum(), rel=1e-9)
     np.testing.assert_allclose(model.basis.T @ model.basis, np.eye(256), atol=1e-6)
     noisy = 1e4 * gaussian_stars + np.random.default_rng(10).normal(0, 50, gaussian_stars.shape)
-    first, second = (robust_flux(noisy, m).flux for m in (whole, model))
+    first, second = (robust_flux(noisy, m).flux for m in (full_basis, model))
     assert second == pytest.approx(first, rel=1e-4)

@@ -171,8 +171,8 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     phase = (place - jitter)[subpixel]
     assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
-    again = windowed_centres(images.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
-    assert np.abs(again - place).max() < 0.03
+    moved_centre = windowed_centres(images.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
+    assert np.abs(moved_centre - place).max() < 0.03
 
 
 def test_a_neighbour_s_saturated_rest_makes_no_negative_rates():

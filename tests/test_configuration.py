@@ -90,9 +90,9 @@ def test_a_stage_refuses_an_unknown_group_and_a_folder_without_a_root(tmp_path, 
 
 def test_search_distances_follow_from_the_telescope():
     """21, 38, 42 and 56 λ/D are what the stars need; whole pixels of the default telescopes."""
-    asked = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
-    asked |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
-    for dataset, px in asked.items():
+    expected_px = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
+    expected_px |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
+    for dataset, px in expected_px.items():
         config = settings_of(dataset)
         assert (config.framing.search_px, config.stars.search_px) == (24, px)
         assert "search_lambda_d" not in config.model_dump()["stars"]

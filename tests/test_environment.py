@@ -29,8 +29,8 @@ def required(*extras):
     for name in extras:
         lines += PROJECT["optional-dependencies"][name]
     packages = {canonicalize_name(r.name): r for r in map(Requirement, lines)}
-    more = packages.pop("psfdae", None)
-    return packages | (required(*more.extras) if more else {})
+    self_requirement = packages.pop("psfdae", None)
+    return packages | (required(*self_requirement.extras) if self_requirement else {})
 
 
 DECLARED = required("paper", "dev")

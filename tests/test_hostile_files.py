@@ -178,10 +178,12 @@ def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipp
     stamps[::3, 4, 5] = np.nan
     stamps[::5, 9, 9] = 1e7
     for given_values in ({}, {"background": 100.0}):
-        full_basis, other = (model.predict(stamps, **given_values) for model in (shipped, lean))
-        assert (full_basis.flags == other.flags).all()
+        full_basis, lean_prediction = (
+            model.predict(stamps, **given_values) for model in (shipped, lean)
+        )
+        assert (full_basis.flags == lean_prediction.flags).all()
         for name in ("psf", "flux", "flux_error", "background", "noise", "chi2", "distance"):
-            a, b = getattr(full_basis, name), getattr(other, name)
+            a, b = getattr(full_basis, name), getattr(lean_prediction, name)
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6 * np.nanmax(np.abs(a)))
 
 

@@ -73,16 +73,16 @@ class Image:
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory):
     """The image, a field model of it, and its stars as `predict` measures them."""
-    made = Image(tmp_path_factory.mktemp("sky"))
-    out = made.folder / "model"
-    words = ("--catalogue", made.list, "--method", "field", "--out", out)
+    image_case = Image(tmp_path_factory.mktemp("sky"))
+    out = image_case.folder / "model"
+    words = ("--catalogue", image_case.list, "--method", "field", "--out", out)
     with few_draws():
-        printed("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
-    made.model = out / "sky.psf.safetensors"
-    process, table = made.predicted(made.list)
+        printed("from-stars", image_case.image, *words, "methods=[noisy,field]", *TINY)
+    image_case.model = out / "sky.psf.safetensors"
+    process, table = image_case.predicted(image_case.list)
     assert process.exit_code == 0, process.output
-    made.stars = Table.read(table, hdu="STARS")
-    return made
+    image_case.stars = Table.read(table, hdu="STARS")
+    return image_case
 
 
 def test_signal_to_noise_is_that_of_each_star(sky):

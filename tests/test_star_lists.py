@@ -207,14 +207,14 @@ def model(tmp_path_factory, image, place):
 @pytest.mark.slow
 def test_rows_without_position_and_twice_stay_in_every_result(tmp_path, image, place, model):
     write(tmp_path / "image.fits", image)
-    odd = np.concatenate([place, place[:1]])
-    odd[3, 0] = np.nan
-    table(odd).write(tmp_path / "s.csv")
+    listed_rows = np.concatenate([place, place[:1]])
+    listed_rows[3, 0] = np.nan
+    table(listed_rows).write(tmp_path / "s.csv")
     options = ["--catalogue", tmp_path / "s.csv", "--model", model]
     output = printed("photometry", tmp_path / "image.fits", *options, "--out", tmp_path / "p.ecsv")
     assert "row 4" in output and "1 row is within 0.1 px" in output
     photometry = Table.read(tmp_path / "p.ecsv")
-    assert len(photometry) == len(odd)
+    assert len(photometry) == len(listed_rows)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(photometry["flux"])), [3, 70])
     assert (photometry["flags"][[3, 70]] > 0).all()
     printed("predict", tmp_path / "image.fits", *options, "--out", tmp_path / "p.fits")
@@ -226,4 +226,6 @@ def test_rows_without_position_and_twice_stay_in_every_result(tmp_path, image, p
         catalogue_xy = as_catalogue(tmp_path / name).positions()
         assert (catalogue_xy.first, catalogue_xy.second, catalogue_xy.origin) == ("x", "y", 0)
         opened_xy = positions(tmp_path / "image.fits", tmp_path / name)
-        np.testing.assert_allclose(np.delete(opened_xy, 3, 0), np.delete(odd, 3, 0), atol=0.1)
+        np.testing.assert_allclose(
+            np.delete(opened_xy, 3, 0), np.delete(listed_rows, 3, 0), atol=0.1
+        )

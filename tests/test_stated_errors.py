@@ -58,8 +58,8 @@ def fitted(seed):
     stars = psfdae.Stars.from_image(image, place, **camera)
     field = fitted_to(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
-    made, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
-    bundle = with_model_errors(psfdae.PsfModel(made), field, 1)
+    packed, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
+    bundle = with_model_errors(psfdae.PsfModel(packed), field, 1)
     wings = wings_of_stars(psfdae.PsfModel(bundle), stars.observation.with_margin(2))
     return psfdae.PsfModel(with_wings(bundle, wings))
 
@@ -160,8 +160,8 @@ def test_flags_of_photometry():
     bad[21, 20] = saturated[80, 82] = True
     flags = star_flags(stars, bad, saturated, 5, 3.0)
     of = psfdae.StarFlag
-    wanted = [0, of.TRUNCATED, of.SATURATED, of.MASKED, of.FAINT, of.POOR_FIT]
-    assert flags.tolist() == [*wanted, of.BLENDED, of.BLENDED, of.NO_FLUX]
+    expected = [0, of.TRUNCATED, of.SATURATED, of.MASKED, of.FAINT, of.POOR_FIT]
+    assert flags.tolist() == [*expected, of.BLENDED, of.BLENDED, of.NO_FLUX]
     stars["photutils_flags"][:2] = [32, 8]
     flags = star_flags(stars, bad, saturated, 5, 3.0)
     assert flags[:2].tolist() == [of.OFF_CENTRE, of.TRUNCATED | of.POOR_FIT]

@@ -51,14 +51,18 @@ def clone(folder):
     environment_of_make = Path(sys.prefix)
     if not (environment_of_make / ".complete").is_file():
         pytest.skip("the environment is not make's")
-    made = shutil.ignore_patterns(
+    patterns = shutil.ignore_patterns(
         *(".*_cache", ".cache", ".git", ".snakemake", ".venv*"),
         *("__pycache__", "dist", "site"),
     )
 
     def ignored(place, names):
         # Times are kept, so that make finds its environment newer than the lock file.
-        return set(names) - {"reference"} if Path(place) == ROOT / "results" else made(place, names)
+        return (
+            set(names) - {"reference"}
+            if Path(place) == ROOT / "results"
+            else patterns(place, names)
+        )
 
     shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
     (folder / ".venv").symlink_to(environment_of_make)

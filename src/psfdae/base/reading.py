@@ -146,7 +146,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     *columns : str
         Names of columns that it must have.
     **options
-        Options of pandas.
+        Options of `pandas.read_csv`.
 
     Raises
     ------

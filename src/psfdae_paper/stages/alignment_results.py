@@ -316,7 +316,7 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
+@command("alignment figure stamps", reads=("seed", "noise", "evaluation"))
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
@@ -393,9 +393,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 
 
 @command(
-    "alignment figure twin",
-    reads=("telescope", "prescription", "alignment", "optics", "noise"),
-    choice=Alignment.choice,
+    "alignment figure twin", reads=("telescope", "prescription", "alignment", "optics", "noise")
 )
 def twin(config: Config, table: File, out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.
