@@ -550,7 +550,7 @@ def test_wrong_places_are_one_line(image, tmp_path, words, message):
 
 
 def test_models_without_a_field_say_so(image):
-    with pytest.raises(PredictionError, match="from-stars --method field"):
+    with pytest.raises(PredictionError, match=r"psfdae\.fit with method='field'"):
         load_model().psf_at(1.0, 2.0)
     with pytest.raises(PredictionError, match="finite"):
         load_model(image[1]).psf_at(np.nan, 2.0)

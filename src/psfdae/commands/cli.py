@@ -36,7 +36,7 @@ from typing import (
 
 import click
 
-from psfdae.base.errors import Error, did_you_mean, install_line, missing
+from psfdae.base.errors import Error, did_you_mean, install_line, missing, words_of_a_command
 from psfdae.base.joined import joined
 from psfdae.base.progress import displayed_by
 from psfdae.base.version import __version__
@@ -190,6 +190,11 @@ class SettingsCommand(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; `--quiet` is no parameter of its function."""
+        with words_of_a_command():
+            return self.invoke_displayed(ctx)
+
+    def invoke_displayed(self, ctx: click.Context) -> Any:
+        """Run the command with its progress and summary, or without them if it is quiet."""
         if not ctx.params.pop("quiet"):
             with displayed_by(bar_or_lines):
                 return super().invoke(ctx)
