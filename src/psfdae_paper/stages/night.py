@@ -88,8 +88,9 @@ def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
 def night_images(rows: File, folder: Folder, out: File) -> None:
     """Model images that follow each other in time, and measure all of their stars.
 
-    The most usual image of each camera is fitted; the others start from its model. An image that
-    cannot be used is a row with its reason.
+    The most usual image of each camera is fitted; the others start from the model of the image
+    whose stars are most like their own, or are fitted as well if none is. An image that cannot be
+    used is a row with its reason.
 
     Parameters
     ----------
@@ -116,14 +117,19 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
         except Exception as error:
             row["reason"] = reason_of(error, row)
     for stars_by_name in groups.values():
-        start: PsfModel | None = None
-        start_name = ""
-        for name in from_most_usual(stars_by_name):
+        sizes = log_sizes(stars_by_name)
+        starts: dict[str, PsfModel] = {}
+        for name in from_most_usual(stars_by_name, sizes):
             try:
-                model = model_of_image(stars_by_name[name], start)
-                results[name] |= measured(results[name], stars_by_name[name], model, folder)
-                results[name]["start"] = start_name
-                start, start_name = start or model, start_name or name
+                stars = stars_by_name[name]
+                # Stars that differ by more than 4 % in size show another field than a start has.
+                distance = {start: np.abs(sizes[start] - sizes[name]).max() for start in starts}
+                nearest = min(distance, key=distance.__getitem__, default="")
+                start = starts[nearest] if nearest and distance[nearest] < 0.04 else None
+                model = model_of_image(stars, start)
+                results[name] |= measured(results[name], stars, model, folder)
+                results[name]["start"] = nearest if model.info.adapted else ""
+                starts |= {} if model.info.adapted else {name: model}
             except Exception as error:
                 results[name]["reason"] = reason_of(error, results[name])
             print(name, results[name]["reason"] or "done", flush=True)
@@ -223,22 +229,30 @@ def bright_stars(row: Mapping[str, object]) -> Stars:
     return Stars.of([source], settings_model()())
 
 
-def from_most_usual(stars_by_name: Mapping[str, Stars]) -> list[str]:
+def log_sizes(stars_by_name: Mapping[str, Stars]) -> dict[str, np.ndarray]:
+    """Return the logarithms of the FWHM (px) and axis ratio of an image's mean PSF, by its name."""
+    from psfdae.stars.moments import measure_shapes
+
+    shapes = measure_shapes(np.stack([stars.mean_psf for stars in stars_by_name.values()]))
+    sizes = np.log([shapes.fwhm_px, 1.0 - shapes.ellipticity]).T
+    return dict(zip(stars_by_name, sizes, strict=True))
+
+
+def from_most_usual(
+    stars_by_name: Mapping[str, Stars], sizes: Mapping[str, np.ndarray]
+) -> list[str]:
     """Return the names of images, that which is most like the median image of the group first.
 
     Of those with at least the median number of stars, it is the one with the most usual size and
-    shape of stars: neither cloudy nor trailed. All others keep their order.
+    shape of stars (`log_sizes`): neither cloudy nor trailed. All others keep their order.
     """
-    from psfdae.stars.moments import measure_shapes
-
-    names = list(stars_by_name)
-    counts = np.array([len(stars) for stars in stars_by_name.values()])
-    shapes = measure_shapes(np.stack([stars.mean_psf for stars in stars_by_name.values()]))
-    # Distance of logarithm of the FWHM, and of ellipticity, from their medians.
-    values = np.stack([np.log(shapes.fwhm_px), shapes.ellipticity])
-    distance = np.abs(values - np.median(values, axis=1, keepdims=True)).sum(axis=0)
-    usual = names[int(np.argmin(np.where(counts >= np.median(counts), distance, np.inf)))]
-    return [usual, *(name for name in names if name != usual)]
+    least_count = np.median([len(stars) for stars in stars_by_name.values()])
+    middle = np.median([*sizes.values()], axis=0)
+    usual = min(
+        (name for name, stars in stars_by_name.items() if len(stars) >= least_count),
+        key=lambda name: np.abs(sizes[name] - middle).sum(),
+    )
+    return [usual, *(name for name in stars_by_name if name != usual)]
 
 
 def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
