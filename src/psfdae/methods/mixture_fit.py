@@ -54,21 +54,20 @@ def k_means(
     # The positions weigh `place` times as much as all components together.
     scale = np.sqrt(np.square(components).sum() / len(x) / max(position.shape[1], 1))
     features = np.hstack([components, scale * (place * standard)]).astype(np.float32)
-    # Clusters begin at stars that are drawn at random. Up to 512 clusters, a star's probability
-    # grows as the square of its distance from those already drawn (k-means++, Arthur and
-    # Vassilvitskii 2007); with more clusters that takes longer, and is no better.
-    rng = stream(seed, "gmm", "clusters")
-    first = features[rng.choice(len(x), clusters if clusters > 512 else 1, replace=False)]
-    distance2 = np.full(len(x), np.inf, np.float32)
-    while len(first) < clusters:
-        distance2 = np.minimum(distance2, np.square(features - first[-1]).sum(axis=1))
-        # Where no star is left that differs from those drawn, all are equally probable.
-        weight = distance2.astype(np.float64) + np.finfo(np.float32).tiny
-        first = np.vstack([first, features[rng.choice(len(x), p=weight / weight.sum())]])
+    # Clusters begin at stars that are drawn one by one, with a probability that grows as the square
+    # of the distance from those already drawn (k-means++, Arthur and Vassilvitskii 2007).
+    rng, square = stream(seed, "gmm", "clusters"), np.square(features).sum(axis=1)
+    drawn, distance2 = [int(rng.integers(len(x)))], np.full(len(x), np.inf, np.float32)
+    while len(drawn) < clusters:
+        last = features[drawn[-1]]
+        distance2 = np.minimum(distance2, square - 2.0 * features @ last + square[drawn[-1]])
+        # The smallest number above 0 is for stars that do not differ from those already drawn.
+        cumulative = np.maximum(distance2, 1e-30).cumsum(dtype=np.float64)
+        drawn.append(int(np.searchsorted(cumulative, rng.random() * cumulative[-1])))
     # Fifteen rounds of Lloyd's algorithm; later ones hardly move a star. A cluster that loses all
     # its stars is left out, which is no reason for a warning.
     with warnings.catch_warnings(action="ignore", category=UserWarning):
-        label = kmeans2(features, first, iter=15, minit="matrix")[1]
+        label = kmeans2(features, features[drawn], iter=15, minit="matrix")[1]
     return np.unique(label, return_inverse=True)[1]
 
 
