@@ -44,7 +44,8 @@ export MLFLOW_DISABLE_TELEMETRY := true
 # Everything stays in this folder, caches of libraries, too.
 export XDG_CACHE_HOME := $(CURDIR)/.cache
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
-export PIP_NO_CACHE_DIR := 1
+# pip keeps what it has downloaded only where PIP_CACHE_DIR says so, as jobs on GitHub do.
+export PIP_NO_CACHE_DIR := $(if $(PIP_CACHE_DIR),,1)
 
 # What a user gives reaches the recipes through the environment, as it stands: neither make nor
 # a shell expands a text that may come from a colleague's file.
@@ -79,8 +80,12 @@ PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses log
   --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
+# A mistyped PRESET would be ignored without a word.
+UNKNOWN := $(strip $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name))))
+$(if $(filter-out PYTHON,$(UNKNOWN)),$(error $(UNKNOWN): no variable of this Makefile, whose first lines list them))
+
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons dist lint format lock clean \
   benchmark stability bounds bundles shipped
 
 help: ## List the targets
@@ -184,6 +189,9 @@ test-docs: env ## Every command of README and docs as it is written
 
 test-pythons: env ## The fast tests with other Pythons, and the newest or lowest versions of dependencies
 	sh tests/pythons.sh $(FAST_TESTS)
+
+dist: env ## Build the source distribution and the wheel in dist/
+	uv build --no-build-isolation --python $(VENV)/bin/python --out-dir dist
 
 lock: env ## Renew the lock files from pyproject.toml and requirements; torch's CPU builds from TORCH_INDEX
 	$(if $(TORCH_INDEX),$(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \

@@ -8,10 +8,11 @@ include: "workflow/Snakefile"
 workflow.default_target = "all"
 
 
-# Snakemake takes a mistyped target for a file that no rule makes: the target that is like it. Words
-# of options, such as mtime, are less like a target than a typing error is.
+# Snakemake takes a mistyped target for a file that no rule makes. The last line names the target that
+# is like it. Words of options, such as mtime, are less like a target than a typing error is.
 names = [rule.name for rule in workflow.rules]
 for word in sys.argv[1:]:
     if word.isidentifier() and word not in names and not os.path.exists(word):
         for name in get_close_matches(word, names, n=1, cutoff=0.8):
-            print(f"psfdae: no target {word}; did you mean {name}?", file=sys.stderr)
+            hint = f"psfdae: no target {word}; did you mean {name}?"
+            atexit.register(print, hint, file=sys.stderr)

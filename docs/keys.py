@@ -49,7 +49,8 @@ def _rows(key: str, about: Schema, schema: Schema, value: Any) -> Iterator[str]:
         value = about.get("default") if value is None else value
         default = "" if value is None else f"`{json.dumps(value, ensure_ascii=False)}`"
         limits = ", ".join(limit for m in members for limit in _limits(m))
-        cells = (f"`{key}`", " or ".join(kinds), limits, default, _sentence(about))
+        meaning = _sentence(about).removesuffix(".")
+        cells = (f"`{key}`", " or ".join(kinds), limits, default, meaning)
         yield f"| {' | '.join(cells)} |"
 
 

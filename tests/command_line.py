@@ -14,6 +14,13 @@ def psfdae(*words):
     return result
 
 
+def printed(*words):
+    """The output of a command that ends with code 0."""
+    result = psfdae(*words)
+    assert result.exit_code == 0, (words, result.output)
+    return result.output
+
+
 def refused(*words):
     """The one line of a command that ends with code 2."""
     result = psfdae(*words)

@@ -188,8 +188,8 @@ def empty_database(tmp_path_factory):
 @pytest.fixture(scope="session")
 def training(shared_folder):
     """A model of a simulated image, trained once for all workers, which only read it."""
-    made = Training(shared_folder / "training")
-    with made_once(made.folder) as missing:
+    training_files = Training(shared_folder / "training")
+    with made_once(training_files.folder) as missing:
         if missing:
-            made.make()
-    return made
+            training_files.make()
+    return training_files

@@ -34,23 +34,25 @@ def read(page):
 
 def blocks(text, language):
     """Texts of the code blocks of a language."""
-    return [body for _, found, body in FENCE.findall(text) if found == language]
+    return [body for _, block_language, body in FENCE.findall(text) if block_language == language]
 
 
 def commands(text):
     """Commands of all `sh` blocks, in order."""
-    found = []
+    command_lines = []
     for block in blocks(text, "sh"):
         lines = iter(block.replace("\\\n", " ").splitlines())
         for line in lines:
             heredoc = re.search(r"<<-?\s*'?(\w+)'?", line)
-            typed, written = [line], []
+            typed, typed_and_output = [line], []
             while heredoc:
                 typed.append(next(lines))
                 if typed[-1].strip() == heredoc[1]:
                     break
-                written.append(typed[-1] + "\n")
+                typed_and_output.append(typed[-1] + "\n")
             words = shlex.split(line.replace(heredoc[0], "") if heredoc else line, comments=True)
             if words:
-                found.append(Command(tuple(words), "".join(written), "\n".join(typed)))
-    return found
+                command_lines.append(
+                    Command(tuple(words), "".join(typed_and_output), "\n".join(typed))
+                )
+    return command_lines

@@ -70,15 +70,15 @@ def parts_below(sources: Path) -> dict[str, list[tuple[Path, ast.AST]]]:
 
 def find(sources: Path, mutant: Mutant) -> tuple[Path, ast.AST]:
     """File and node of a mutant below a folder; LookupError unless there is exactly one."""
-    wanted = ast.parse(mutant.original).body[0]
-    text = ast.dump(wanted.value if isinstance(wanted, ast.Expr) else wanted)
-    alike: dict[Path, list[ast.AST]] = {}
+    original_node = ast.parse(mutant.original).body[0]
+    text = ast.dump(original_node.value if isinstance(original_node, ast.Expr) else original_node)
+    equal_nodes: dict[Path, list[ast.AST]] = {}
     for path, part in parts_below(sources).get(mutant.function, ()):
-        alike.setdefault(path, []).extend(n for n in ast.walk(part) if ast.dump(n) == text)
-    paths = [path for path, nodes in alike.items() if len(nodes) > mutant.occurrence]
+        equal_nodes.setdefault(path, []).extend(n for n in ast.walk(part) if ast.dump(n) == text)
+    paths = [path for path, nodes in equal_nodes.items() if len(nodes) > mutant.occurrence]
     if len(paths) != 1:
         raise LookupError(f"{mutant.function}: {mutant.original!r} is in {len(paths)} files, not 1")
-    nodes = sorted(alike[paths[0]], key=lambda node: (node.lineno, node.col_offset))
+    nodes = sorted(equal_nodes[paths[0]], key=lambda node: (node.lineno, node.col_offset))
     return paths[0], nodes[mutant.occurrence]
 
 
@@ -88,15 +88,15 @@ def mutated(path: Path, node: ast.AST, text: str) -> str:
     begin = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
     end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
     new = text if isinstance(node, ast.stmt) else f"({text})"
-    whole = b"".join(lines)
-    return (whole[:begin] + new.encode() + whole[end:]).decode()
+    source_bytes = b"".join(lines)
+    return (source_bytes[:begin] + new.encode() + source_bytes[end:]).decode()
 
 
 def main(words: list[str]) -> None:
-    chosen = [m for m in read_list() if not m.equivalent]
-    chosen = [m for m in chosen if not words or any(word in str(m) for word in words)]
+    selected = [m for m in read_list() if not m.equivalent]
+    selected = [m for m in selected if not words or any(word in str(m) for word in words)]
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).splitlines()
-    for mutant in chosen:
+    for mutant in selected:
         with tempfile.TemporaryDirectory() as folder:
             for name in tracked:
                 Path(folder, name).parent.mkdir(parents=True, exist_ok=True)

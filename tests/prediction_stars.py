@@ -52,14 +52,14 @@ def with_network(bundle):
     """The bundle with a network of random weights in place of its method."""
     shape = Architecture(kernels=(5, 3, 5), widths=(4, 4))
     network = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
-    told = bundle.info.model_dump(exclude={"misfit"})
-    told |= {"method": "dae", "dae": shape, "image_scale": 256.0}
+    description = bundle.info.model_dump(exclude={"misfit"})
+    description |= {"method": "dae", "dae": shape, "image_scale": 256.0}
     errors = bundle.errors
     unscaled = ErrorModel.uncalibrated(errors.noise, errors.half_width68)
     limit = errors.distance_limit
     return replace(
         bundle,
-        info=BundleInfo(**told),
+        info=BundleInfo(**description),
         weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
         errors=replace(unscaled, ratio95=errors.ratio95, distance_limit=limit),
     )

@@ -54,12 +54,12 @@ def drawn(profile, place, flux, size, half=40, over=5):
     return light[half:-half, half:-half]
 
 
-def image_of(profile, flux, size, apart, seed=1, edge=20):
+def image_of(profile, flux, size, spacing_px, seed=1, edge=20):
     """Noisy image (size, size) of stars at least `apart` px from each other, and their places."""
     rng, place = np.random.default_rng(seed), []
     while len(place) < len(flux):
         new = rng.uniform(edge, size - 1 - edge, 2)
-        if all(np.hypot(*(new - old)) >= apart for old in place):
+        if all(np.hypot(*(new - old)) >= spacing_px for old in place):
             place.append(new)
     return noisy(drawn(profile, place, flux, size), rng), np.array(place)
 

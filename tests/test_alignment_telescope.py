@@ -78,7 +78,7 @@ def test_signs_and_sizes_of_the_four_degrees_of_freedom(tracer, fields_deg, name
 
 
 def test_batoid_s_own_zernike_fit(tracer):
-    """On a fine square grid; ours needs 96 rays of the annulus."""
+    """Zernikes are those of a fine square grid; ours needs 96 rays of the annulus."""
     from batoid import zernike
 
     state = np.array([0.7, -1.0, 0.4, 0.9])

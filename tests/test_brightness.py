@@ -87,9 +87,9 @@ def test_the_psf_follows_magnitude_or_colour_and_is_that_of_the_end_beyond(name)
     for value in (*ends, np.mean(ends), ends[0] - 9, ends[1] + 9):
         place = np.full((1, 4), np.nan)
         place[0, :2], place[0, coordinate] = 250.0, value
-        wanted = truth.images(truth.terms(place), np.zeros((1, 2)), SIDE)
+        true_psf = truth.images(truth.terms(place), np.zeros((1, 2)), SIDE)
         # Splines are smoothed: by 1 % of the narrowest star.
-        assert fit.psf_at(place) == pytest.approx(wanted / wanted.sum(), abs=1.5e-3)
+        assert fit.psf_at(place) == pytest.approx(true_psf / true_psf.sum(), abs=1.5e-3)
     (fact,) = (fit.facts()[word] for word in ("Brightness", "Colour") if word in fit.facts())
     assert name in fact
 
@@ -113,11 +113,17 @@ def changing_model(training, name):
     low[:2], high[:2] = arrays["low"][:2], arrays["high"][:2]
     low[coordinate], high[coordinate] = RANGES[name]
     # The mean and the covariance of m and m² of stars that are spread evenly over the range.
-    usual = np.append(arrays["usual"], [0.0, 1 / 3])
-    spread = np.diag([*np.zeros(len(usual) - 2), 1 / 3, 4 / 45])
+    typical_terms = np.append(arrays["usual"], [0.0, 1 / 3])
+    spread = np.diag([*np.zeros(len(typical_terms) - 2), 1 / 3, 4 / 45])
     spread[:-2, :-2] = arrays["spread"]
     field = np.concatenate([splines, [slope, 0 * slope]]).astype(np.float32)
-    changed = {"coefficients": field, "low": low, "high": high, "usual": usual, "spread": spread}
+    changed = {
+        "coefficients": field,
+        "low": low,
+        "high": high,
+        "usual": typical_terms,
+        "spread": spread,
+    }
     info = bundle.info
     if name == "colour":
         stars = info.config["stars"] | {"colour_column": "g_r"}
@@ -165,12 +171,12 @@ def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(p
     place, flux = np.tile(PLACE, (count, 1)), 10 ** (-0.4 * mag)
     in_counts = plate.predict(flux * noisy, position=place)
     stated = plate.predict(noisy, position=np.column_stack([place, np.full(count, mag)]))
-    unlike = plate.predict(noisy, position=place)  # as the faintest
+    as_faintest = plate.predict(noisy, position=place)  # as the faintest
     assert in_counts.flux / flux == pytest.approx(stated.flux, rel=0.05)
-    beyond = [(p.flags & StarFlag.BEYOND) > 0 for p in (in_counts, stated, unlike)]
-    assert [flagged.mean() for flagged in beyond] == [0.0, 0.0, 1.0]
+    is_beyond = [(p.flags & StarFlag.BEYOND) > 0 for p in (in_counts, stated, as_faintest)]
+    assert [flagged.mean() for flagged in is_beyond] == [0.0, 0.0, 1.0]
     assert squared_error(in_counts, truth) == pytest.approx(squared_error(stated, truth), rel=0.1)
-    assert squared_error(stated, truth) < 0.5 * squared_error(unlike, truth)
+    assert squared_error(stated, truth) < 0.5 * squared_error(as_faintest, truth)
 
 
 def test_a_star_has_the_psf_of_its_colour(colourful):
@@ -183,24 +189,24 @@ def test_a_star_has_the_psf_of_its_colour(colourful):
     noisy = 1e4 * (truth + 0.02 * rng.standard_normal(truth.shape))
     unknown = np.full(count, np.nan)
 
-    def predicted(known):
-        place = np.column_stack([np.tile(PLACE, (count, 1)), unknown, known])
+    def predicted(stated_colour):
+        place = np.column_stack([np.tile(PLACE, (count, 1)), unknown, stated_colour])
         return colourful.predict(noisy, position=place)
 
     several = predicted(np.array([low, high, np.nan, 3.0] + [0.5] * (count - 4)))
     assert np.flatnonzero(several.flags & StarFlag.BEYOND).tolist() == [3]
-    right, none, wrong, middle = (
-        squared_error(predicted(known), truth)
-        for known in (colour, unknown, colour[::-1], np.full(count, (low + high) / 2))
+    true_colour, none, reversed_colour, middle = (
+        squared_error(predicted(stated_colour), truth)
+        for stated_colour in (colour, unknown, colour[::-1], np.full(count, (low + high) / 2))
     )
-    assert right < 0.8 * none < wrong
+    assert true_colour < 0.8 * none < reversed_colour
     # That the field may change with the colour is known, if the colour is not.
     assert 0.75 * middle < none < 0.95 * middle
 
 
-@pytest.mark.parametrize(("column", "unlike"), [("g_r", False), ("r_i", True)])
+@pytest.mark.parametrize(("column", "mismatch"), [("g_r", False), ("r_i", True)])
 def test_colours_are_those_of_the_list_and_of_another_column_are_named(
-    training, colourful, column, unlike
+    training, colourful, column, mismatch
 ):
     listed = Table.read(training.catalogue)
     listed[column] = np.linspace(0.1, 0.9, len(listed))
@@ -209,5 +215,5 @@ def test_colours_are_those_of_the_list_and_of_another_column_are_named(
     bright = stars.candidates.bright
     assert bright.colour == pytest.approx(np.asarray(listed[column])[bright.row])
     observation = ImageInput(training.image, catalogue=listed, **words).open(16)
-    other = other_instrument(colourful, observation)
-    assert (column in other) == unlike == bool(other)
+    instrument_note = other_instrument(colourful, observation)
+    assert (column in instrument_note) == mismatch == bool(instrument_note)

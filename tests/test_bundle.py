@@ -61,17 +61,17 @@ def with_text(raw, change):
 
 
 def test_what_was_written_is_read_and_written_again_with_the_same_bytes(handmade, file, tmp_path):
-    again = read_bundle(file)
-    assert again.info == handmade.info
-    assert again.sha256 == handmade.sha256
-    assert again.errors.distance_limit == handmade.errors.distance_limit
+    copy = read_bundle(file)
+    assert copy.info == handmade.info
+    assert copy.sha256 == handmade.sha256
+    assert copy.errors.distance_limit == handmade.errors.distance_limit
     for name, values in handmade.weights.items():
-        assert (again.weights[name] == values).all()
+        assert (copy.weights[name] == values).all()
     tables = handmade.errors.arrays()
-    assert all((table == tables[name]).all() for name, table in again.errors.arrays().items())
+    assert all((table == tables[name]).all() for name, table in copy.errors.arrays().items())
     path, mask = tmp_path / "again.psf.safetensors", os.umask(0)
     os.umask(mask)
-    write_bundle(again, path)
+    write_bundle(copy, path)
     assert path.read_bytes() == file.read_bytes()
     assert path.stat().st_mode & 0o777 == 0o666 & ~mask  # others may read it
 
@@ -150,10 +150,10 @@ def test_network_of_a_bundle_is_the_one_that_was_packed(file, handmade, gaussian
 
 
 def test_completed_covariance_measures_fluxes_as_the_whole_one(gaussian_stars):
-    whole = FluxModel.fit(gaussian_stars)
-    model = packing.leading(whole, 48)
-    assert model.variance.sum() == pytest.approx(whole.variance.sum(), rel=1e-9)
+    full_basis = FluxModel.fit(gaussian_stars)
+    model = packing.leading(full_basis, 48)
+    assert model.variance.sum() == pytest.approx(full_basis.variance.sum(), rel=1e-9)
     np.testing.assert_allclose(model.basis.T @ model.basis, np.eye(256), atol=1e-6)
     noisy = 1e4 * gaussian_stars + np.random.default_rng(10).normal(0, 50, gaussian_stars.shape)
-    first, second = (robust_flux(noisy, m).flux for m in (whole, model))
+    first, second = (robust_flux(noisy, m).flux for m in (full_basis, model))
     assert second == pytest.approx(first, rel=1e-4)

@@ -62,6 +62,6 @@ def test_fit_recovers_range_and_scales(scan):
 
 def test_best_scanned_scale_has_the_smallest_residual(scan):
     table = residuals_by_scale(scan, 0.7)
-    best = table.loc[table.groupby("experiment").rms.idxmin()].set_index("experiment")
-    assert best.pixel_scale_arcsec["scene1"] in (0.1, 0.12)
-    assert best.pixel_scale_arcsec["scene2"] == 0.15
+    least_rms = table.loc[table.groupby("experiment").rms.idxmin()].set_index("experiment")
+    assert least_rms.pixel_scale_arcsec["scene1"] in (0.1, 0.12)
+    assert least_rms.pixel_scale_arcsec["scene2"] == 0.15

@@ -30,25 +30,27 @@ def gaussians(centre, side=32, sigma=1.5):
 
 def bright_stars(centre, snr=500.0):
     """Stars without noise around the given centres, at random positions of an image."""
-    wide = 1e4 * gaussians(centre)
-    count = len(wide)
+    stamps = 1e4 * gaussians(centre)
+    count = len(stamps)
     position = np.random.default_rng(4).uniform(0, 1000, (count, 2))
-    peak, _ = brightest_pixels(wide, 3)
+    peak, _ = brightest_pixels(stamps, 3)
     level = np.full(count, snr)
     noise = np.ones(count)
     centre, row, colour = np.asarray(centre), np.arange(count), np.full(count, np.nan)
-    return BrightStars(wide, peak, centre, position, 1e4 * noise, noise, level, row, centre, colour)
+    return BrightStars(
+        stamps, peak, centre, position, 1e4 * noise, noise, level, row, centre, colour
+    )
 
 
 def test_sky_is_that_around_the_star():
     rng = np.random.default_rng(1)
-    wide = rng.normal(200.0, 5.0, (50, 32, 32))
-    wide[:, 12:20, 12:20] += 1e4  # the star
-    wide[::2, 2:5, 2:5] += 500.0  # a neighbour
-    bad = np.zeros(wide.shape, dtype=bool)
+    stamps = rng.normal(200.0, 5.0, (50, 32, 32))
+    stamps[:, 12:20, 12:20] += 1e4  # the star
+    stamps[::2, 2:5, 2:5] += 500.0  # a neighbour
+    bad = np.zeros(stamps.shape, dtype=bool)
     bad[:, 30] = True
-    wide[bad] = 1e6
-    level, noise = sky_around(wide, bad, 16)
+    stamps[bad] = 1e6
+    level, noise = sky_around(stamps, bad, 16)
     # Of 736 pixels: 5 √(π/2/736) = 0.23 for a median, 4.3 % for a median deviation.
     assert np.abs(level - 200.0).max() < 4 * 0.23
     assert np.abs(noise / 5.0 - 1).max() < 4 * 0.043
@@ -89,12 +91,12 @@ def test_only_a_bright_neighbour_crowds():
 
 def test_centres_are_found_to_a_hundredth_of_a_pixel():
     centre = np.random.default_rng(3).uniform(-1.4, 1.4, (40, 2))
-    wide = gaussians(centre)
-    peak, inside = brightest_pixels(wide, 3)
+    stamps = gaussians(centre)
+    peak, inside = brightest_pixels(stamps, 3)
     assert inside.all()
     assert brightest_pixels(gaussians([[4.0, 0.0], [3.0, -3.0]]), 3)[1].tolist() == [False, True]
     assert (np.abs(peak - centre) <= 0.5 + 1e-9).all()
-    measured = windowed_centres(wide, peak, np.full(40, 1.5), 10, 1.5)
+    measured = windowed_centres(stamps, peak, np.full(40, 1.5), 10, 1.5)
     assert np.abs(measured - centre).max() < 0.01
 
 
@@ -107,10 +109,10 @@ def test_a_blend_is_a_misfit_although_the_psf_varies():
     stars[10] += 0.3 * gaussians([[0, 5.0]], 16)[0]
     stars[20, 3, 12] += 0.02  # a cosmic ray
     score = misfit(stars, position, np.full(80, 3e-4))
-    *usual, third, _, _ = np.sort(score)
+    *single_scores, third, _, _ = np.sort(score)
     assert set(np.argsort(score)[-2:]) == {10, 20}
     assert score[[10, 20]].min() > 4.0 * third
-    assert max(usual) < 2.5  # at most one good star is lost, at the edge of the field
+    assert max(single_scores) < 2.5  # at most one good star is lost, at the edge of the field
     unknown = misfit(stars, np.full((80, 2), np.nan), np.full(80, 3e-4))
     assert set(np.argsort(unknown)[-2:]) == {10, 20}
 
@@ -123,10 +125,10 @@ def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
     position = np.random.default_rng(count).uniform(0, 2000, (count, 2))
     grid = star_grid(position)
     assert len(np.unique(grid, axis=0)) == count
-    held = held_out_fields(grid)
-    assert held.mean() == pytest.approx(0.2, abs=0.05)
+    is_held_out = held_out_fields(grid)
+    assert is_held_out.mean() == pytest.approx(0.2, abs=0.05)
     quarter = bins_of(position, 2)
-    assert (np.bincount(quarter[held], minlength=4) > 0).all()
+    assert (np.bincount(quarter[is_held_out], minlength=4) > 0).all()
     order = np.random.default_rng(0).permutation(count)
     assert (star_grid(position[order]) == grid[order]).all()
 
@@ -151,7 +153,7 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     template = gaussians(np.zeros((10, 2)))
     star = np.repeat(np.arange(10), 40)
     subpixel = np.tile([False, True], 200)
-    realisation, made, jitter, _ = make_images(
+    realisation, images, jitter, _ = make_images(
         stars, template, star, FRAMING, subpixel, stream(1, "test")
     )
     assert realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
@@ -160,17 +162,17 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     assert set(map(tuple, jitter)) == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
     # A star that is not moved is a plain piece of the image.
     for image in np.flatnonzero(~subpixel)[::9]:
-        one = star[image]
-        offset = stars.peak[one] - jitter[image]
-        piece = cut(stars.stamps[one : one + 1], 16, offset[None])[0]
+        image_star = star[image]
+        offset = stars.peak[image_star] - jitter[image]
+        piece = cut(stars.stamps[image_star : image_star + 1], 16, offset[None])[0]
         assert realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
     # The others lie anywhere in their pixel, and so do their templates.
     place = windowed_centres(realisation.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     phase = (place - jitter)[subpixel]
     assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
-    again = windowed_centres(made.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
-    assert np.abs(again - place).max() < 0.03
+    moved_centre = windowed_centres(images.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
+    assert np.abs(moved_centre - place).max() < 0.03
 
 
 def test_a_neighbour_s_saturated_rest_makes_no_negative_rates():

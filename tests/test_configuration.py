@@ -90,20 +90,20 @@ def test_a_stage_refuses_an_unknown_group_and_a_folder_without_a_root(tmp_path, 
 
 def test_search_distances_follow_from_the_telescope():
     """21, 38, 42 and 56 λ/D are what the stars need; whole pixels of the default telescopes."""
-    asked = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
-    asked |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
-    for dataset, px in asked.items():
+    expected_px = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
+    expected_px |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
+    for dataset, px in expected_px.items():
         config = settings_of(dataset)
         assert (config.framing.search_px, config.stars.search_px) == (24, px)
         assert "search_lambda_d" not in config.model_dump()["stars"]
-    given = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
-    assert (given.framing.search_px, given.stars.search_px) == (100, 57)
+    stated = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
+    assert (stated.framing.search_px, stated.stars.search_px) == (100, 57)
 
 
 def test_settings_that_cannot_change_a_result_are_set_apart():
     tree = compose.stage_tree(groups_of("dae"), compose.compose())
-    free = {*as_overrides(tree)} - {*as_overrides(compose.decisive_settings(tree))}
-    assert [text.split(".", 1)[1] for text in free] == ["checkpoint_seconds=20.0"]
+    indecisive = {*as_overrides(tree)} - {*as_overrides(compose.decisive_settings(tree))}
+    assert [text.split(".", 1)[1] for text in indecisive] == ["checkpoint_seconds=20.0"]
 
     def checkpoint(*overrides):
         return fingerprint(deciding(load(overrides).train), np.zeros(3))
@@ -126,24 +126,30 @@ def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
 
 
 def test_overrides_reach_the_datasets_that_know_them():
-    given = ["wavefront.coma=3", "++wavefront.r0_m=0.1", "wavefront.colour=1"]
-    both = ["wavefront.colour=1"]
-    for dataset, own in (("dataset3", "wavefront.coma=3"), ("dataset8", "++wavefront.r0_m=0.1")):
-        kept = compose.overrides_for(given, [f"dataset={dataset}"])
-        assert kept == (own, *both)
+    overrides = ["wavefront.coma=3", "++wavefront.r0_m=0.1", "wavefront.colour=1"]
+    common = ["wavefront.colour=1"]
+    for dataset, scene_override in (
+        ("dataset3", "wavefront.coma=3"),
+        ("dataset8", "++wavefront.r0_m=0.1"),
+    ):
+        dataset_overrides = compose.overrides_for(overrides, [f"dataset={dataset}"])
+        assert dataset_overrides == (scene_override, *common)
     # What chooses another wavefront decides which keys there are.
-    given = ["wavefront=seidel", "wavefront.coma=3"]
-    assert compose.overrides_for(given, ["dataset=dataset8"]) == tuple(given)
+    overrides = ["wavefront=seidel", "wavefront.coma=3"]
+    assert compose.overrides_for(overrides, ["dataset=dataset8"]) == tuple(overrides)
 
 
 def test_stage_overrides_reproduce_the_stage_s_configuration():
     """Words that the workflow puts on a command line mean what the dataset meant."""
     # Options that differ in their keys are chosen by name, then every key is pinned.
-    own = ("dataset=_telescope", "telescope=example_raytraced")
-    for names, chosen in (((), ("dataset=dataset5", "preset=smoke")), (own, own)):
-        tree = compose.stage_tree(SIMULATION, compose.compose(chosen))
+    own_telescope = ("dataset=_telescope", "telescope=example_raytraced")
+    for names, overrides in (
+        ((), ("dataset=dataset5", "preset=smoke")),
+        (own_telescope, own_telescope),
+    ):
+        tree = compose.stage_tree(SIMULATION, compose.compose(overrides))
         pinned = [*names, *as_overrides(tree)]
-        assert load_stage(SIMULATION, pinned) == load_stage(SIMULATION, chosen)
+        assert load_stage(SIMULATION, pinned) == load_stage(SIMULATION, overrides)
 
 
 DATASET = (
@@ -171,11 +177,11 @@ def test_an_installed_wheel_finds_its_configuration(tmp_path):
     shutil.unpack_archive(*tmp_path.glob("*.whl"), site, format="zip")
     (site / "config").mkdir()
     (site / "config/config.yaml").write_text("colour: blue\n")
-    kept = {key: value for key, value in os.environ.items() if key != "PSFDAE_CONFIG"}
+    environment = {key: value for key, value in os.environ.items() if key != "PSFDAE_CONFIG"}
     for words in (("config", "--stage", "fit"), ("config", "dataset=alignment")):
         line = [sys.executable, "-m", "psfdae", *words]
         installed, source = (
-            captured(line, cwd=tmp_path, env={**kept, "PYTHONPATH": str(path)})
+            captured(line, cwd=tmp_path, env={**environment, "PYTHONPATH": str(path)})
             for path in (site, root / "src")
         )
         assert installed.stdout == source.stdout

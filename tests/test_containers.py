@@ -91,7 +91,7 @@ def model_of(image, catalogue):
 
 @pytest.fixture(scope="module")
 def expected(image, place):
-    """From another process, which pickles what it gives back."""
+    """Results of another process, which pickles what it gives back."""
     with ProcessPoolExecutor(1, get_context("fork")) as pool:
         return pool.submit(model_of, image, place).result()
 
@@ -124,10 +124,10 @@ def test_any_container_and_any_list_give_the_same_model(
 
 
 def test_what_a_process_gives_back_is_as_good_as_its_own(expected):
-    stars, model, found = pickle.loads(pickle.dumps(expected))
+    stars, model, prediction = pickle.loads(pickle.dumps(expected))
     assert stars.settings == expected[0].settings
-    np.testing.assert_array_equal(model.predict(np.ones((1, 16, 16))).flux, found.flux)
-    for result in (stars, found):
+    np.testing.assert_array_equal(model.predict(np.ones((1, 16, 16))).flux, prediction.flux)
+    for result in (stars, prediction):
         assert f"{len(result)} stars" in repr(result) and "<table>" in result._repr_html_()
 
 
@@ -171,10 +171,12 @@ def test_an_image_of_the_tutorials_table_gives_what_it_says(
         words = [*option.split(), *([] if "--catalogue" in option else ["--detect"])]
         words += [*WORDS, "--method", "field", "--out", "m", "--overwrite"]
         with few_draws():
-            done = psfdae("from-stars", "image.fits", *words)
-        assert done.exit_code == (2 if "refused" in row[1] else 0), done.output
-        output += done.output
-    assert all(said in output for said in re.findall("`([^`]+)`[.,]", row[1])), output
+            process = psfdae("from-stars", "image.fits", *words)
+        assert process.exit_code == (2 if "refused" in row[1] else 0), process.output
+        output += process.output
+    assert all(words_of_page in output for words_of_page in re.findall("`([^`]+)`[.,]", row[1])), (
+        output
+    )
 
 
 def test_an_hdu_is_read_with_its_header(image, place):
@@ -189,8 +191,8 @@ def test_an_hdulist_of_a_file_has_its_name_and_the_same_stars(tmp_path, image, p
     with fits.open(path) as hdus:
         from_list = Stars.from_image(hdus, catalogue=place)
     assert from_list.name == "night" and from_list.described() == from_file.described()
-    again = pickle.loads(pickle.dumps(from_list.source))
-    assert again.open(16).sha256() == from_file.observation.sha256()
+    unpickled = pickle.loads(pickle.dumps(from_list.source))
+    assert unpickled.open(16).sha256() == from_file.observation.sha256()
 
 
 @pytest.mark.parametrize("kind", [StdDevUncertainty, VarianceUncertainty, InverseVariance])
@@ -232,9 +234,9 @@ def test_quantities_are_converted_and_other_units_refused(tmp_path, image, place
     camera = Stars.from_image(path, catalogue=place, **stated).observation.camera
     values = [camera[name][0] for name in ("gain", "read noise", "saturation", "pixel scale")]
     np.testing.assert_allclose(values, [1.6, 4.0, 5e4, 0.6])
-    for name, wrong in (("gain", u.m), ("read_noise", u.adu), ("saturate", u.s)):
-        with pytest.raises(Error, match=f"2.0 {wrong}, expected a number of"):
-            Stars.from_image(path, catalogue=place, **{name: 2.0 * wrong})
+    for name, unit in (("gain", u.m), ("read_noise", u.adu), ("saturate", u.s)):
+        with pytest.raises(Error, match=f"{name}=2.0 {unit}: expected a number of"):
+            Stars.from_image(path, catalogue=place, **{name: 2.0 * unit})
 
 
 def test_predict_uses_mask_sigma_and_unit_of_its_stamps(expected, image):
@@ -247,9 +249,9 @@ def test_predict_uses_mask_sigma_and_unit_of_its_stamps(expected, image):
     sigma = StdDevUncertainty(np.full(stamps.shape, 15.0))
     data = NDData(stamps, mask=bad, uncertainty=sigma, unit=u.adu)
     of_data = small_model.predict(data, gain=GAIN * u.electron / u.adu)
-    for found in (masked, of_data):
-        np.testing.assert_array_equal(found.flags, of_arrays.flags)
-        np.testing.assert_array_equal(found.flux, of_arrays.flux)
+    for prediction in (masked, of_data):
+        np.testing.assert_array_equal(prediction.flags, of_arrays.flags)
+        np.testing.assert_array_equal(prediction.flux, of_arrays.flux)
     quantity = small_model.predict(stamps * u.ct)
     np.testing.assert_array_equal(quantity.flux, small_model.predict(stamps).flux)
 
@@ -257,7 +259,7 @@ def test_predict_uses_mask_sigma_and_unit_of_its_stamps(expected, image):
 # Layers of pipelines' files.
 
 
-def pipeline_file(path, image, quality, **more):
+def pipeline_file(path, image, quality, **cards):
     """SCI in MJy/sr without its sky, ERR with the stars' photons, DQ, and other layers."""
     scale = 1e-3
     error = np.sqrt(np.clip(image, 1, None) / GAIN + (READ / GAIN) ** 2) * scale
@@ -269,7 +271,7 @@ def pipeline_file(path, image, quality, **more):
         "AREA": np.ones_like(science),
         "VAR_POISSON": science**2,
         "WHT": np.ones_like(science),
-        **more,
+        **cards,
     }
     hdus = [fits.ImageHDU(values, name=name) for name, values in layers.items()]
     hdus[0].header["BUNIT"] = "MJy/sr"
@@ -296,19 +298,19 @@ def test_err_and_dq_of_the_file_are_used_and_said(tmp_path, image, place, bad):
 def test_many_masked_pixels_are_said_with_the_option_that_helps(tmp_path, image, place, bad):
     harmless = 4 * (np.arange(bad.size).reshape(bad.shape) % 3 == 0)
     path = pipeline_file(tmp_path / "cal.fits", image, bad + harmless)
-    with pytest.raises(Error, match=r"47 % of the pixels have a bit of DQ: state --bad-bits"):
+    with pytest.raises(Error, match=r"47 % of the pixels have a bit of DQ: state bad_bits="):
         Stars.from_image(path, catalogue=place)
-    found = verdicts(path, place, bad_bits=1)
-    assert found == verdicts(image, place, mask=bad, **CAMERA)
+    counts = verdicts(path, place, bad_bits=1)
+    assert counts == verdicts(image, place, mask=bad, **CAMERA)
     jwst = fits.open(path)
     jwst[0].header["TELESCOP"] = "JWST"  # whose bit 1 is DO_NOT_USE
-    assert verdicts(jwst, place) == found
+    assert verdicts(jwst, place) == counts
 
 
 def test_sigma_is_no_variance_and_other_layers_are_no_science(tmp_path, image, place, bad):
     path = pipeline_file(tmp_path / "cal.fits", image, bad)
     assert science_images(path) == {"SCI": 1}
-    with pytest.raises(Error, match="--error ERR"):
+    with pytest.raises(Error, match="error='ERR'"):
         Stars.from_image(path, catalogue=place, variance="ERR")
     stated = Stars.from_image(path, catalogue=place, mask="none", error="ERR")
     squared = Stars.from_image(
@@ -346,8 +348,8 @@ def test_a_gain_that_the_pixels_contradict_is_left_out(
     stars = Stars.from_image(path, catalogue=place)
     assert stars.observation.gain is None and stars.observation.least_noise == 0.0
     assert key in stars.observation.summary()
-    without = Stars.from_image((image * factor + offset).astype(np.float32), catalogue=place)
-    np.testing.assert_allclose(stars.candidates.snr, without.candidates.snr, rtol=1e-6)
+    no_gain = Stars.from_image((image * factor + offset).astype(np.float32), catalogue=place)
+    np.testing.assert_allclose(stars.candidates.snr, no_gain.candidates.snr, rtol=1e-6)
     stated = Stars.from_image(path, catalogue=place, gain=GAIN / factor)
     assert stated.observation.gain == GAIN / factor
 
@@ -365,7 +367,7 @@ def test_a_saturation_below_the_sky_is_said_or_refused(tmp_path, image, place):
     stars = Stars.from_image(path, catalogue=place)
     assert stars.observation.saturate is None
     assert "10 counts (SATURATE) is below the sky of 300" in stars.observation.summary()
-    with pytest.raises(Error, match="--saturate"):
+    with pytest.raises(Error, match="saturate="):
         Stars.from_image(path, catalogue=place, saturate=10.0)
 
 

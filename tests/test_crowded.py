@@ -15,7 +15,7 @@ from photutils.psf import PSFPhotometry
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
 from psfdae.base.files import read_product
@@ -75,8 +75,7 @@ def sky(tmp_path_factory):
     settings = ["methods=[noisy,field]", "framing.stamp_px=10", "field.orders=[0]", "field.modes=8"]
     settings += [f"parts.{name}={count}" for name, count in COUNTS.items()]
     with few_draws():
-        result = psfdae("from-stars", folder / "i.fits", *words, *settings)
-    assert result.exit_code == 0, result.output
+        printed("from-stars", folder / "i.fits", *words, *settings)
     true = Table({"x": place[:, 0], "y": place[:, 1], "flux": light})
     true["pair"] = np.concatenate([paired, np.ones(len(companions), bool)])
     return folder, folder / "model/i.psf.safetensors", true
@@ -283,7 +282,7 @@ def test_models_of_photutils_do_not_mix(sky):
 
 @pytest.mark.parametrize(("oversampling", "limit"), [(2, 2e-3), (4, 1e-4)])
 def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
-    """At the nodes, between them and beyond them; a star that no stamp holds has no light there."""
+    """Light at the nodes, between and beyond them; none of a star that no stamp holds."""
     model = load_model(sky[1])
     grid, photutils = PsfGrid.of(model, 4, oversampling), model.to_photutils(4, oversampling)
     low, high = photutils.grid_xypos.min(axis=0), photutils.grid_xypos.max(axis=0)
@@ -315,8 +314,7 @@ def test_the_command_and_its_table(sky, tmp_path):
     words = ("photometry", folder / "i.fits", "--model", model, "--detect")
     out, residual = tmp_path / "stars.fits", tmp_path / "left.fits"
     options = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", residual)
-    result = psfdae(*words, "--out", out, *options)
-    assert result.exit_code == 0, result.output
+    printed(*words, "--out", out, *options)
     rows, header = Table.read(out), fits.getheader(out, 1)
     assert header["ZEROPT"] == pytest.approx(24.5, abs=0.01) and header["FLUXRAD"] == 25.0
     assert 0.975 < header["INMODEL"] < 0.995
@@ -333,8 +331,7 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     rows["X_IMAGE"][24] = 5000.0  # off the image
     rows.write(tmp_path / "some.csv")
     words = ("photometry", folder / "i.fits", "--model", model, "--out", tmp_path / "some.ecsv")
-    result = psfdae(*words, "--catalogue", tmp_path / "some.csv")
-    assert result.exit_code == 0, result.output
+    printed(*words, "--catalogue", tmp_path / "some.csv")
     measured = Table.read(tmp_path / "some.ecsv")
     assert (
         len(measured) == 25 and not np.isfinite(measured["flux"][24]) and measured["flags"][24] > 0

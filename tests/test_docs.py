@@ -42,8 +42,8 @@ def test_a_typed_number_is_named_and_renewed_with_its_record(
     record, page = tmp_path / "results/reference", tmp_path / "README.md"
     record.mkdir(parents=True)
     (record / f"{name}.csv").write_text("a,b\n1,2\n")
-    kept = {"old.csv": {"commit": "1" * 40, "date": "2026-01-02"}}
-    (record / "provenance.json").write_text(json.dumps({"commit": "3" * 40, "kept": kept}))
+    old_record = {"old.csv": {"commit": "1" * 40, "date": "2026-01-02"}}
+    (record / "provenance.json").write_text(json.dumps({"commit": "3" * 40, "kept": old_record}))
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     monkeypatch.setattr(tables, "REFERENCE", record)
     sources = tmp_path / "docs/numbers.yaml"
@@ -83,8 +83,8 @@ def test_site_has_every_page_no_dead_link_and_needs_no_other_server(tmp_path):
 def leaves(tree, name=""):
     """Keys of a tree of settings."""
     for key, value in tree.items():
-        inner = f"{name}.{key}" if name else key
-        yield from leaves(value, inner) if isinstance(value, dict) else [inner]
+        path = f"{name}.{key}" if name else key
+        yield from leaves(value, path) if isinstance(value, dict) else [path]
 
 
 def test_every_key_that_a_file_of_the_configuration_sets_is_documented():

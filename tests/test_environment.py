@@ -29,12 +29,12 @@ def required(*extras):
     for name in extras:
         lines += PROJECT["optional-dependencies"][name]
     packages = {canonicalize_name(r.name): r for r in map(Requirement, lines)}
-    more = packages.pop("psfdae", None)
-    return packages | (required(*more.extras) if more else {})
+    self_requirement = packages.pop("psfdae", None)
+    return packages | (required(*self_requirement.extras) if self_requirement else {})
 
 
 DECLARED = required("paper", "dev")
-"""What the environment of make and conda holds."""
+"""Packages of the environments of make and conda."""
 
 
 def locked(path):
@@ -51,12 +51,12 @@ def test_conda_requires_what_pyproject_requires():
     parts = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
     lines = [line for line in parts if isinstance(line, str)]
     lines += [line for line in parts[-1]["pip"] if line != "--editable ."]
-    ours = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
-    assert str(ours.pop("python")) == PROJECT["requires-python"]
-    ours.pop("pip")
+    specifiers = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
+    assert str(specifiers.pop("python")) == PROJECT["requires-python"]
+    specifiers.pop("pip")
     expected = {name: r.specifier for name, r in DECLARED.items()}
     expected["torch"] = SpecifierSet(f"=={TORCH}")
-    assert {canonicalize_name(name): s for name, s in ours.items()} == expected
+    assert {canonicalize_name(name): s for name, s in specifiers.items()} == expected
 
 
 def test_locked_and_installed_versions_satisfy_pyproject():

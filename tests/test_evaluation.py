@@ -28,20 +28,20 @@ def pair(gaussian_stars):
 def test_ssim_is_scikit_image_s_with_one_range_and_with_one_of_each_star(pair):
     noisy, clean = (a[:20].astype(np.float64) for a in pair)
     peak = clean.max(axis=(1, 2)) - clean.min(axis=(1, 2))
-    ours = all_metrics(noisy, clean, 0.66)
+    metrics = all_metrics(noisy, clean, 0.66)
     for name, ranges in (("ssim", np.full(20, 0.66)), ("ssim_peak", peak)):
         stars = zip(noisy, clean, ranges, strict=True)
-        theirs = [structural_similarity(x, y, data_range=r) for x, y, r in stars]
-        assert ours[name] == pytest.approx(theirs, abs=1e-10)
+        skimage_ssim = [structural_similarity(x, y, data_range=r) for x, y, r in stars]
+        assert metrics[name] == pytest.approx(skimage_ssim, abs=1e-10)
 
 
 def test_mse_is_scikit_image_s(pair):
     noisy, clean = (a[:20] for a in pair)
-    each = [
+    star_mse = [
         mean_squared_error(x.astype(float), y.astype(float))
         for x, y in zip(noisy, clean, strict=True)
     ]
-    assert mse(noisy, clean) == pytest.approx(each, rel=1e-6)
+    assert mse(noisy, clean) == pytest.approx(star_mse, rel=1e-6)
 
 
 def test_ssim_refuses_what_it_cannot_measure(gaussian_stars):
@@ -65,12 +65,12 @@ def test_error_of_a_paired_ratio_is_its_scatter():
     """Stars of a field share a factor; the stars' own scatter cancels in the ratio."""
     rng = np.random.default_rng(2)
     field = np.repeat(np.arange(40), 10)
-    found = []
+    ratios = []
     for _ in range(300):
         stars = rng.gamma(1.0, 1.0, field.size)
-        worse = 1.1 * stars * rng.normal(1, 0.1, 40)[field]
-        found.append(clustered_ratio(worse, stars, field))
-    ratio, stderr = np.transpose(found)
+        larger_errors = 1.1 * stars * rng.normal(1, 0.1, 40)[field]
+        ratios.append(clustered_ratio(larger_errors, stars, field))
+    ratio, stderr = np.transpose(ratios)
     assert ratio.mean() == pytest.approx(1.1, abs=0.005)
     assert stderr.mean() == pytest.approx(ratio.std(), rel=0.15)
 

@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import PredictionError, Stars, load_model
 from psfdae.image.image_input import ImageInput
@@ -22,7 +22,7 @@ from psfdae.model.wings import Wings
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP = 450, 100.0, 10
-FEW = (
+FEW_STARS = (
     "methods=[noisy,field]",
     "framing.stamp_px=10",
     "parts.train_stars=150",
@@ -61,8 +61,7 @@ def simulated(folder, name, seed, count, width, **cards):
 
 def trained(*words):
     with few_draws():
-        done = psfdae("from-stars", *words, *FEW)
-    assert done.exit_code == 0, done.output
+        printed("from-stars", *words, *FEW_STARS)
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +80,9 @@ def sky(tmp_path_factory):
 
 def error(model, width):
     """Mean squared error at places, of PSFs of the sum 1 in a stamp."""
-    drawn, true = model.psf_at(*PLACES.T, 1), psfs(PLACES, width, STAMP)
+    estimate, true = model.psf_at(*PLACES.T, 1), psfs(PLACES, width, STAMP)
     inside = psfs(np.rint(PLACES), width, STAMP).sum(axis=(1, 2), keepdims=True)
-    return np.square(drawn - true / inside).mean()
+    return np.square(estimate - true / inside).mean()
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +93,14 @@ def hundred(sky):
         simulated(folder, "hundred", 3, 100, 1.04).image, folder / "hundred.csv",
         stamp_px=STAMP, train_stars=60, test_stars=10,
     )  # fmt: skip
-    bright, own = stars.candidates.bright, model.method
-    splines = (own.settings.orders, own.settings.spacing_px, own.settings.smoothness)
-    alone = fit_field(bright, SKY, STAMP + 4, STAMP, *splines).model
-    images = alone.images(alone.terms(PLACES), (PLACES - np.rint(PLACES))[:, ::-1], STAMP)
+    bright, field_model = stars.candidates.bright, model.method
+    splines = (
+        field_model.settings.orders,
+        field_model.settings.spacing_px,
+        field_model.settings.smoothness,
+    )
+    single_fit = fit_field(bright, SKY, STAMP + 4, STAMP, *splines).model
+    images = single_fit.images(single_fit.terms(PLACES), (PLACES - np.rint(PLACES))[:, ::-1], STAMP)
     inside = psfs(np.rint(PLACES), 1.04, STAMP).sum(axis=(1, 2), keepdims=True)
     return np.square(images - psfs(PLACES, 1.04, STAMP) / inside).mean()
 
@@ -107,8 +110,8 @@ def test_ten_stars_are_as_good_as_a_hundred_with_another_exposure(sky, hundred):
     _, model, sparse = sky
     adapted, line = exposure(model, sparse, "sparse")
     assert error(adapted, 1.04) < min(1.15 * hundred, 0.2 * error(model, 1.04))
-    before, after = model.bundle.weights, adapted.bundle.weights
-    changed = {key for key in before if not np.array_equal(before[key], after[key])}
+    old_weights, new_weights = model.bundle.weights, adapted.bundle.weights
+    changed = {key for key in old_weights if not np.array_equal(old_weights[key], new_weights[key])}
     assert changed == {"coefficients", "listed"}
     assert adapted.info.config["stars"]["adapted"] == {"from": model.sha256, "stars": 10}
     assert exposure(model, sparse, "sparse")[0].sha256 == adapted.sha256 != model.sha256
@@ -119,8 +122,8 @@ def test_the_command_writes_a_model_that_predict_takes(sky):
     folder, _, _ = sky
     of = (folder / "sparse.fits", "--catalogue", folder / "sparse.csv")
     out, model = folder / "sparse.psf.safetensors", folder / "m/rich.psf.safetensors"
-    done = psfdae("exposure", *of, "--model", model, "--out", out)
-    assert done.exit_code == 0 and "10 stars of sparse.fits" in done.output, done.output
+    process = psfdae("exposure", *of, "--model", model, "--out", out)
+    assert process.exit_code == 0 and "10 stars of sparse.fits" in process.output, process.output
     assert "sparse.fits, by 10 of its stars" in psfdae("describe", out).output
     assert psfdae("predict", *of, "--model", out, "--out", folder / "p.fits").exit_code == 0
     words = ("--model", out, "--out", folder / "second.psf.safetensors")
@@ -143,8 +146,8 @@ def test_without_other_stars_the_field_stays(sky):
         sparse.image.with_name("rich.fits"), sparse.image.with_name("rich.csv"),
         stamp_px=STAMP, train_stars=60, test_stars=10,
     ).candidates.bright  # fmt: skip
-    same = field.of_exposure(observed.of(np.arange(8)), SKY)
-    off = np.abs(same.coefficients - field.coefficients).max() / np.abs(field.coefficients).max()
+    adapted = field.of_exposure(observed.of(np.arange(8)), SKY)
+    off = np.abs(adapted.coefficients - field.coefficients).max() / np.abs(field.coefficients).max()
     assert off < 0.02
 
 
@@ -156,10 +159,10 @@ def test_deformations_are_the_slopes_of_the_splines():
     light = np.exp(-(x**2 + y**2) / (2 * sigma**2))
     slopes = [-(x**2), -(y**2), -2 * x * y]
     curves = [x**2 / sigma**2 - 1, y**2 / sigma**2 - 1, x * y / sigma**2]
-    wanted = np.stack([a * light / sigma**2 for a in (*slopes, *curves)])
-    found = deformations(light[None], spacing)[:, 0]
-    largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
-    off = (np.abs(found - wanted) / largest).max(axis=(1, 2))
+    analytic = np.stack([a * light / sigma**2 for a in (*slopes, *curves)])
+    computed = deformations(light[None], spacing)[:, 0]
+    largest = np.abs(analytic).max(axis=(1, 2), keepdims=True)
+    off = (np.abs(computed - analytic) / largest).max(axis=(1, 2))
     assert (off < [0.005] * 3 + [0.02] * 3).all()
 
 
@@ -173,8 +176,8 @@ NIGHT = {"rich": (150, 1.0), "poor": (10, 1.04), "empty": (3, 0.98)}
 def night(tmp_path_factory):
     """A folder with exposures, and their models in another one."""
     folder = tmp_path_factory.mktemp("night")
-    for seed, (name, what) in enumerate(NIGHT.items()):
-        simulated(folder, name, 11 + seed, *what, INSTRUME="Cam", FILTER="R")
+    for seed, (name, simulation) in enumerate(NIGHT.items()):
+        simulated(folder, name, 11 + seed, *simulation, INSTRUME="Cam", FILTER="R")
     images = [folder / f"{name}.fits" for name in NIGHT]
     trained(*images, "--detect", "--out", folder / "m")
     return folder, folder / "m"
@@ -194,12 +197,11 @@ def test_predict_takes_the_exposure_s_own_model_from_the_folder(night, tmp_path)
     folder, out = night
     for name in ("rich", "poor"):
         words = (folder / f"{name}.fits", "--detect", "--model", out)
-        done = psfdae("predict", *words, "--out", tmp_path / f"{name}.fits")
-        assert done.exit_code == 0, done.output
+        printed("predict", *words, "--out", tmp_path / f"{name}.fits")
         header = fits.getheader(tmp_path / f"{name}.fits")
         assert header["PSFSHA"] == load_model(out / f"{name}.psf.safetensors").sha256
-    other = simulated(tmp_path, "other", 1, 5, 1.0).image
-    words = (other, "--detect", "--model", out, "--out", tmp_path / "x.fits")
+    second_image = simulated(tmp_path, "other", 1, 5, 1.0).image
+    words = (second_image, "--detect", "--model", out, "--out", tmp_path / "x.fits")
     assert "other: 0 models, expected one" in refused("predict", *words)
 
 
@@ -209,16 +211,16 @@ def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night, shipped):
     images = [folder / f"{name}.fits" for name in NIGHT]
     settings = {"stamp_px": STAMP, "train_stars": 150, "test_stars": 30}
     stars = Stars.from_image(images, detect=True, **settings)
-    alone = Stars.from_image(images[0], detect=True, **settings)
+    first_stars = Stars.from_image(images[0], detect=True, **settings)
     table = Table.read(out / "selection.csv")
-    assert [*table["part"][:150]] == [*alone.table["part"]]
+    assert [*table["part"][:150]] == [*first_stars.table["part"]]
     bright = stars.candidates.bright
     assert len(set(bright.row)) == len(bright) == len(table) == 163
     held_out, of = stars.held_out, stars.columns["field_index"].values
     assert not {*of[:150]} & set(np.flatnonzero(held_out)) and held_out[150:160].any()
     model = load_model(out / "poor.psf.safetensors")
     with pytest.raises(PredictionError, match="was trained on other stars of this image"):
-        validate(model, alone)
+        validate(model, first_stars)
     # A model without a field is that of each exposure.
     assert for_exposures(shipped, stars) == dict.fromkeys(NIGHT, shipped)
 
@@ -249,20 +251,20 @@ def test_several_images_that_belong_to_no_training_are_refused(sky, night, tmp_p
         ([rich, poor, "--catalogue", folder / "rich.csv"], "sky coordinates"),
         ([rich, poor, "--detect", "--out", out], "--overwrite"),
     ):
-        assert message in refused("from-stars", "--out", tmp_path / "m", *words, *FEW)
+        assert message in refused("from-stars", "--out", tmp_path / "m", *words, *FEW_STARS)
 
 
 def test_wings_of_several_images_are_one_profile():
     """Each counts by its error; a profile is by the light in the outer part of the PSF."""
     radius, eye = np.array([5.0, 8.0, 12.0]), np.eye(3)
-    one = Wings(radius, np.array([1e-5, 1e-4, 3e-5]), 1e-12 * eye, 0.02)
-    assert Wings.joined([one]).plain() == one.plain()
-    both = Wings.joined([one, one])
-    assert both.profile == pytest.approx(one.profile)
-    assert both.light()[1] == pytest.approx(one.light()[1] / np.sqrt(2))
-    vague = Wings(radius, 3 * one.profile, 1e-8 * eye, 0.02)
-    assert Wings.joined([one, vague]).profile == pytest.approx(one.profile, rel=1e-3)
-    wider = Wings(radius, 2 * one.profile, 4e-12 * eye, 0.04)
+    wings = Wings(radius, np.array([1e-5, 1e-4, 3e-5]), 1e-12 * eye, 0.02)
+    assert Wings.joined([wings]).plain() == wings.plain()
+    pair = Wings.joined([wings, wings])
+    assert pair.profile == pytest.approx(wings.profile)
+    assert pair.light()[1] == pytest.approx(wings.light()[1] / np.sqrt(2))
+    vague = Wings(radius, 3 * wings.profile, 1e-8 * eye, 0.02)
+    assert Wings.joined([wings, vague]).profile == pytest.approx(wings.profile, rel=1e-3)
+    doubled = Wings(radius, 2 * wings.profile, 4e-12 * eye, 0.04)
     light = np.array([0.03])
-    joined = Wings.joined([one, wider]).total_over_flux(light)[0]
-    assert joined == pytest.approx(one.total_over_flux(light)[0])
+    joined = Wings.joined([wings, doubled]).total_over_flux(light)[0]
+    assert joined == pytest.approx(wings.total_over_flux(light)[0])

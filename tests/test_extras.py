@@ -1,4 +1,4 @@
-"""Without the packages of an extra: what needs none works, the rest says which extra to install."""
+"""Installation without an extra: what needs none works, the rest says which extra to install."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_no_extra_brings_stays_a_traceback(module):
     ],
 )
 def test_an_extra_is_installed_from_where_psfdae_was(monkeypatch, tmp_path, note, line):
-    """As pip notes it (PEP 610): psfdae is on no index."""
+    """Source of the installation as pip notes it (PEP 610): psfdae is on no index."""
     text = note.format(folder=tmp_path) or None
     installed = SimpleNamespace(read_text=lambda name: text)
     monkeypatch.setattr(errors, "distribution", lambda name: installed)

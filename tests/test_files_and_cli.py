@@ -143,13 +143,13 @@ print(json.dumps(found))
 
 
 def test_nothing_loads_packages_that_it_does_without():
-    """In one interpreter, from what must be lightest to what may load most."""
+    """One interpreter runs all, from what must be lightest to what may load most."""
     line = [sys.executable, "-c", LIGHT]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert len(found) == 3
-    assert not any(found.values()), found
+    process = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    loaded = json.loads(process.stdout.splitlines()[-1])
+    assert len(loaded) == 3
+    assert not any(loaded.values()), loaded
 
 
 def test_progress_is_a_bar_in_a_terminal(monkeypatch):
@@ -174,7 +174,7 @@ def test_progress_is_a_bar_in_a_terminal(monkeypatch):
 
 
 def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):
-    """Of 100 steps of 1 s a log has ten lines, and with them what is left at this pace."""
+    """A log has ten lines of 100 steps of 1 s, and with them what is left at this pace."""
     seconds = itertools.count(0.0, 1.0)
     monkeypatch.setattr("time.time", seconds.__next__)
     with progress.displayed_by(bar_or_lines), progress.task("training", 100) as advance:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
@@ -85,19 +85,19 @@ def test_star_of_a_perfect_telescope_lies_where_it_was_put():
 
 def test_example_is_reproducible_and_has_the_noise_that_it_states():
     recipe = FieldRecipe(**{**RECIPE, "bright": 5, "faint": 5, "blended": 0, "saturated": 1})
-    made, again = example_field(recipe, 3), example_field(recipe, 3)
-    assert (made.image == again.image).all()
-    assert (made.image != example_field(recipe, 4).image).any()
-    far = np.ones(made.image.shape, dtype=bool)
-    for column, row in np.rint(made.position).astype(int):
-        far[max(row - 30, 0) : row + 31, max(column - 30, 0) : column + 31] = False
-    middle = far.copy()
+    example, repeated = example_field(recipe, 3), example_field(recipe, 3)
+    assert (example.image == repeated.image).all()
+    assert (example.image != example_field(recipe, 4).image).any()
+    is_sky = np.ones(example.image.shape, dtype=bool)
+    for column, row in np.rint(example.position).astype(int):
+        is_sky[max(row - 30, 0) : row + 31, max(column - 30, 0) : column + 31] = False
+    middle = is_sky.copy()
     middle[:, :300] = middle[:, 400:] = False
-    sky = made.image[middle].astype(float) * recipe.gain
+    sky = example.image[middle].astype(float) * recipe.gain
     variance = recipe.sky_e + recipe.read_noise_e**2 + recipe.gain**2 / 12
     assert sky.mean() == pytest.approx(recipe.sky_e, rel=0.01)
     assert sky.var() == pytest.approx(variance, rel=0.03)
-    assert made.image.max() == recipe.saturation
+    assert example.image.max() == recipe.saturation
 
 
 def test_selection_keeps_good_stars_only(made, candidates):
@@ -122,8 +122,8 @@ def test_what_the_list_says_against_a_star_counts(training, candidates, config, 
     assert verdict[good].tolist() == [
         *("good", "blended", "saturated", "incomplete", "no position"),
     ]
-    others = np.setdiff1d(candidates.bright.row, good)
-    assert (verdict[others] == "good").mean() > 0.95
+    refused_rows = np.setdiff1d(candidates.bright.row, good)
+    assert (verdict[refused_rows] == "good").mean() > 0.95
     assert f"no position in row {good[4] + 1}: flagged" in observation.summary()
 
 
@@ -132,13 +132,13 @@ def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
     grid = star_grid(bright.position)
     held_out = held_out_fields(grid)
     out = tmp_path / "stars.h5"
-    written = []
+    columns = []
     for _ in range(2):
         rng = stream(config.seed, "own stars")
         shape = (config.framing, config.parts)
         write_product(out, "stars", training_columns(bright, grid, held_out, 2, *shape, rng), {})
-        written.append(out.read_bytes())
-    assert written[0] == written[1]
+        columns.append(out.read_bytes())
+    assert columns[0] == columns[1]
     product = read_product(out, "stars")
     parts = split_stars(product, "held_out", config)
     assert parts.train.size == 120
@@ -211,48 +211,48 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
 def test_own_noise_is_what_moving_and_dividing_leave_of_it():
     """The covariance is that of many noisy images of one star, and of few stars in many."""
     rng, grid, count = np.random.default_rng(3), np.arange(24) - 12, 6000
-    wide = np.exp(-(grid[:, None] ** 2 + grid**2) / 8)
-    wide /= cut(wide[None], 8).sum()
+    profile = np.exp(-(grid[:, None] ** 2 + grid**2) / 8)
+    profile /= cut(profile[None], 8).sum()
     sky, background = 0.004, 1.0
-    rms = np.sqrt(sky**2 + sky / background**0.5 * wide)
+    rms = np.sqrt(sky**2 + sky / background**0.5 * profile)
     phase = rng.uniform(-0.5, 0.5, (count, 2))
     noise = shift_stamps(rms * rng.normal(size=(count, 24, 24)), phase)
     clean, noisy = (
-        cut(shift_stamps(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise)
+        cut(shift_stamps(profile[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise)
     )
     error = noisy / noisy.sum((1, 2), keepdims=True) - clean / clean.sum((1, 2), keepdims=True)
-    found = error.reshape(count, -1).T @ error.reshape(count, -1)
-    everyone, alone = np.arange(count), np.full(count, sky)
+    covariance = error.reshape(count, -1).T @ error.reshape(count, -1)
+    everyone, star_sky = np.arange(count), np.full(count, sky)
     mean = clean.mean(axis=0).ravel()
-    model = OwnNoise(alone, background, phase, everyone)(everyone, mean / mean.sum())
-    assert np.trace(model) == pytest.approx(np.trace(found), rel=0.05)
-    assert np.abs(model - found).max() < 0.1 * found.max()
-    few = OwnNoise(alone, background, phase, everyone % 4)(everyone, mean / mean.sum())
-    assert few == pytest.approx(0.75 * model, rel=0.1, abs=0.01 * model.max())
+    model = OwnNoise(star_sky, background, phase, everyone)(everyone, mean / mean.sum())
+    assert np.trace(model) == pytest.approx(np.trace(covariance), rel=0.05)
+    assert np.abs(model - covariance).max() < 0.1 * covariance.max()
+    four_stars = OwnNoise(star_sky, background, phase, everyone % 4)(everyone, mean / mean.sum())
+    assert four_stars == pytest.approx(0.75 * model, rel=0.1, abs=0.01 * model.max())
 
 
 def test_a_model_is_replaced_on_request_only(training, tmp_path):
     out = tmp_path / "model"
     shutil.copytree(training.out, out)
-    made = out / training.bundle.name
+    bundle_file = out / training.bundle.name
     words = [*training.words, "--out", out, *WORDS, "--method", "gmm"]
-    before = {path: path.read_bytes() for path in out.rglob("*")}
+    bytes_before = {path: path.read_bytes() for path in out.rglob("*")}
     message = refused("from-stars", *words, "--name", "other")
-    assert str(made) in message and "--overwrite" in message
-    assert {path: path.read_bytes() for path in out.rglob("*")} == before
+    assert str(bundle_file) in message and "--overwrite" in message
+    assert {path: path.read_bytes() for path in out.rglob("*")} == bytes_before
     with few_draws():
         result = run(*words, "--overwrite")
     assert result.exit_code == 0, result.output
-    assert read_bundle(made).info.method == "gmm"
-    assert set(out.rglob("*")) == before.keys()
+    assert read_bundle(bundle_file).info.method == "gmm"
+    assert set(out.rglob("*")) == bytes_before.keys()
 
 
 def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp_path, monkeypatch):
     """The bundle comes last, after the page, and says that all is there."""
     out, page = tmp_path / "model", tmp_path / "page.html"
     shutil.copytree(training.out, out)
-    made = out / training.bundle.name
-    made.unlink()
+    bundle_file = out / training.bundle.name
+    bundle_file.unlink()
     monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "field.h5"))
     monkeypatch.setattr(stage, "pack_model", lambda *args: training.model)
     monkeypatch.setattr(Report, "page", lambda self: "page")
@@ -269,11 +269,11 @@ def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp
         run(*words)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    assert not made.exists() and page.exists()
+    assert not bundle_file.exists() and page.exists()
     assert f"{page}: exists already" in refused("from-stars", *words)
-    done = run(*words, "--overwrite")
-    assert done.exit_code == 0, done.output
-    assert made.read_bytes() == training.bundle.read_bytes()
+    process = run(*words, "--overwrite")
+    assert process.exit_code == 0, process.output
+    assert bundle_file.read_bytes() == training.bundle.read_bytes()
 
 
 @pytest.mark.parametrize("gain", [1e-9, 1e300])
@@ -282,8 +282,8 @@ def test_the_sky_of_any_gain_can_be_drawn(gain):
     stars = BrightStars(*[np.ones(30)] * 10)
     noise = NoiseModel(1.0, stars.sky_photons(gain, 1e4))
     psf = np.full((20, 16, 16), 1 / 256)
-    left = noise.draw(psf, 0.05, stream(1, "gain")) - psf
-    assert left.std() == pytest.approx(np.sqrt(noise.variance(psf, 0.05).mean()), rel=0.05)
+    residual = noise.draw(psf, 0.05, stream(1, "gain")) - psf
+    assert residual.std() == pytest.approx(np.sqrt(noise.variance(psf, 0.05).mean()), rel=0.05)
 
 
 def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
@@ -354,8 +354,7 @@ def test_commands_of_pages_run(page, tmp_path, monkeypatch):
         if "sparse.fits" in rest:
             shutil.copy("image.fits", "sparse.fits")
         words = [name, *rest, *small.get(name, [])]
-        result = psfdae(*words)
-        assert result.exit_code == 0, (words, result.output)
+        printed(*words)
     names: dict[str, Any] = {}
     for body in blocks(text, "python"):
         exec(compile(body, page, "exec"), names)

@@ -184,7 +184,7 @@ def test_a_flux_that_is_an_estimate_is_found(of_images):
 
 
 def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
-    """By it coordinates are left out in which noise hides all differences of the clusters."""
+    """The rule leaves out coordinates in which noise hides all differences of the clusters."""
     mixture, (images, _) = fitted(4), stars(400)
     flux = np.random.default_rng(5).normal(1.0, mixing.FLUX_SIGMA, (400, 1))
     flat = images.reshape(400, -1)
@@ -365,10 +365,10 @@ def test_the_position_is_used_where_it_tells_something():
     data, settings = training(), Gmm(**{**BASIC, "components": [4, 12]})
     truth, place = stars(400, seed=2)[0], kind_places(400, seed=2)
     noisy = noisy_of(truth, 4 * LEVEL)
-    placed, unplaced = (kind.fit(data, settings) for kind in (PlacedGmm, GaussianMixture))
+    with_place, unplaced = (kind.fit(data, settings) for kind in (PlacedGmm, GaussianMixture))
     errors = [
         np.square(m.estimate(noisy, 4 * LEVEL, place).psf - truth).mean()
-        for m in (placed, unplaced)
+        for m in (with_place, unplaced)
     ]
     assert errors[0] < 0.9 * errors[1]
     # Learnt on one half of the field, it is wrong on the other.

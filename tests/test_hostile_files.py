@@ -178,10 +178,12 @@ def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipp
     stamps[::3, 4, 5] = np.nan
     stamps[::5, 9, 9] = 1e7
     for given_values in ({}, {"background": 100.0}):
-        one, other = (model.predict(stamps, **given_values) for model in (shipped, lean))
-        assert (one.flags == other.flags).all()
+        full_basis, lean_prediction = (
+            model.predict(stamps, **given_values) for model in (shipped, lean)
+        )
+        assert (full_basis.flags == lean_prediction.flags).all()
         for name in ("psf", "flux", "flux_error", "background", "noise", "chi2", "distance"):
-            a, b = getattr(one, name), getattr(other, name)
+            a, b = getattr(full_basis, name), getattr(lean_prediction, name)
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6 * np.nanmax(np.abs(a)))
 
 
@@ -192,7 +194,7 @@ def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
     for name in (CUBE, LIST, MODEL):
         shutil.copy(good / name, tmp_path / name)
     cube, field, model = (tmp_path / name for name in (CUBE, LIST, MODEL))
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    bytes_before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for words in (
         ["predict", cube, "--model", model, "--out", model, "--overwrite"],
         ["predict", cube, "--mask", cube, "--out", cube, "--overwrite"],
@@ -200,4 +202,4 @@ def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
     ):
         out = [] if "--out" in words else ["--out", tmp_path / "model"]
         assert "is an input, too" in refused(*words, *out)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == bytes_before

@@ -15,7 +15,7 @@ from astropy.table import QTable
 
 import psfdae as library
 import small_field
-from command_line import psfdae
+from command_line import psfdae, refused
 from image_training import few_draws
 
 
@@ -53,9 +53,12 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
     table, without_stars = image.with_name("stars.ecsv"), image.with_name("residual.fits")
     words = ["--detect", "--zero-point", 25, "--model", bundle, "--out", table]
     assert psfdae("photometry", image, *words, "--residual", without_stars).exit_code == 0
-    fluxes, written = model.photometry(image, detect=True, zero_point=25.0), QTable.read(table)
-    assert fluxes.colnames == written.colnames and fluxes["flux"].unit == "adu"
-    np.testing.assert_array_equal(fluxes["mag"], written["mag"])
+    fluxes, command_table = (
+        model.photometry(image, detect=True, zero_point=25.0),
+        QTable.read(table),
+    )
+    assert fluxes.colnames == command_table.colnames and fluxes["flux"].unit == "adu"
+    np.testing.assert_array_equal(fluxes["mag"], command_table["mag"])
     residual = model.residual(image, detect=True)
     assert isinstance(residual, CCDData)
     np.testing.assert_array_equal(residual.data, fits.getdata(without_stars))
@@ -68,8 +71,8 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
 def test_detected_stars_are_a_star_list(image, model):
     pixels, place = small_field.field()
     detected = library.detect(CCDData(pixels, unit="adu", meta=dict(small_field.header())))
-    found = np.stack([detected["x"].value, detected["y"].value], axis=1)
-    assert np.abs(found[:, None] - place).max(axis=2).min(axis=1).max() < 0.3
+    detected_xy = np.stack([detected["x"].value, detected["y"].value], axis=1)
+    assert np.abs(detected_xy[:, None] - place).max(axis=2).min(axis=1).max() < 0.3
     assert len(detected) == small_field.COUNT and detected["flux_iso"].unit == "adu"
     prediction = model.predict_image(image, catalogue=detected)
     assert len(prediction) == len(detected)
@@ -92,6 +95,70 @@ def test_models_are_copied_and_pickled_and_work_on_images_side_by_side(image, mo
     for unpickled in (pickle.loads(pickle.dumps(grid)), copy.deepcopy(grid)):
         assert type(unpickled) is type(grid) and unpickled.x_0 == 40.0
         assert unpickled(41, 40) == grid(41, 40)
+
+
+@pytest.mark.parametrize(
+    ("statements", "words", "python", "command"),
+    [
+        ({}, (), "or detect=True", "or --detect"),
+        ({"detect": True, "gain": -1}, ("--detect", "--gain", -1), "gain=-1:", "--gain -1:"),
+        (
+            {"detect": True, "pixel_scale_arcsec": 0},
+            ("--detect", "--pixel-scale", 0),
+            "pixel_scale_arcsec=0:",
+            "--pixel-scale 0:",
+        ),
+        (
+            {"detect": True, "saturate": 10.0},
+            ("--detect", "--saturate", 10),
+            "saturate= takes that",
+            "--saturate takes that",
+        ),
+        (
+            {"detect": True, "bad_bits": 4},
+            ("--detect", "--bad-bits", 4),
+            "bad_bits= needs a mask",
+            "--bad-bits needs a mask",
+        ),
+        (
+            {"detect": True, "threshold": 1e7},
+            ("--detect", "--threshold", 1e7),
+            "threshold= sets",
+            "--threshold sets",
+        ),
+        (
+            {"detect": True, "origin": 1},
+            ("--detect", "--origin", 1),
+            "detect=True takes an image",
+            "--detect takes an image",
+        ),
+        (
+            {"detect": True, "snr_min": -3},
+            ("--detect", "--snr-min", -3),
+            "snr_min =",
+            "--snr-min =",
+        ),
+        (
+            {"detect": True, "stamp_px": 15},
+            ("--detect", "--stamp-px", 15),
+            "stamp_px",
+            "--stamp-px",
+        ),
+        (
+            {"detect": True, "stars_min": 5000},
+            ("--detect", "--stars-min", 5000),
+            "stars_min= takes fewer, snr_min= fainter",
+            "--stars-min takes fewer, --snr-min fainter",
+        ),
+    ],
+)
+def test_a_refusal_names_keywords_in_python_and_options_in_a_command(
+    image, tmp_path, statements, words, python, command
+):
+    with pytest.raises(library.Error) as refusal:
+        library.Stars.from_image(image, **statements)
+    assert python in str(refusal.value) and "--" not in str(refusal.value)
+    assert command in refused("from-stars", image, *words, "--out", tmp_path / "model")
 
 
 def test_what_a_user_holds_is_shown_in_a_line_and_in_short_numbers(image, stars, model):

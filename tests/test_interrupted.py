@@ -25,7 +25,7 @@ SLOW = "train.epochs=20 train.checkpoint_seconds=0 train.batch=8"
 
 
 def reproduce(folder):
-    """What a user types, with the environment active and nothing else set, for `subprocess`."""
+    """Arguments of `subprocess` for what a user types in the active environment."""
     environment = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src")}
     environment |= NO_CLUSTER | KERNELS
     line = ["make", "reproduce", "PRESET=smoke", f"TARGETS={TARGET}", f"SET={SLOW}"]

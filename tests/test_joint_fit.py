@@ -26,8 +26,8 @@ def image_of(psfs, place, flux, size=120):
     side = psfs.side_px
     image = np.zeros((size + 2 * side,) * 2)
     corner = np.rint(place).astype(int) - side // 2
-    drawn = psfs.stamps(place, corner, side)[:, 0]
-    for (x, y), light in zip(corner + side, flux[:, None, None] * drawn, strict=True):
+    stamp = psfs.stamps(place, corner, side)[:, 0]
+    for (x, y), light in zip(corner + side, flux[:, None, None] * stamp, strict=True):
         image[y : y + side, x : x + side] += light
     return image[side:-side, side:-side]
 
@@ -88,9 +88,9 @@ def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):
 def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
     place = np.array([[60.0, 60.0]])
     image = image_of(psfs, place, np.array([1e4]))
-    known = np.ones(image.shape), np.zeros(image.shape, bool)
+    weight_and_mask = np.ones(image.shape), np.zeros(image.shape, bool)
     start, origin = place - [1.5, 0.0], place - [3.0, 0.0]
-    fit = fit_stars(psfs, image, *known, start, None, BOX_PX, 2.0, origin)
+    fit = fit_stars(psfs, image, *weight_and_mask, start, None, BOX_PX, 2.0, origin)
     assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
 
 

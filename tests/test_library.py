@@ -1,4 +1,4 @@
-"""From Python: stars of an image, a fit, its validation; the command is these calls."""
+"""Calls of Python: stars of an image, a fit, its validation; the command is these calls."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stars(training):
 def test_the_command_is_the_calls_which_are_silent_and_write_nothing(
     training, stars, tmp_path, monkeypatch, capfd
 ):
-    """Without a method, validation stars choose it for both."""
+    """Validation stars choose the method for both, if none is stated."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
     monkeypatch.chdir(tmp_path)
     state = np.random.get_state()[1].copy()  # noqa: NPY002 - that of others must not change
@@ -38,8 +38,8 @@ def test_the_command_is_the_calls_which_are_silent_and_write_nothing(
         model = psfdae.fit(stars, **MIXTURE, **FIELD)
     assert model.info.method == "field"
     assert model.bundle.sha256 == training.model.bundle.sha256
-    others = {"gmm": method("gmm").load(training.out / "gmm.h5")}
-    report = psfdae.validate(model, stars, others)
+    fits = {"gmm": method("gmm").load(training.out / "gmm.h5")}
+    report = psfdae.validate(model, stars, fits)
     page = report.page()
     assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
     printed = capfd.readouterr()
@@ -55,8 +55,12 @@ def test_the_command_is_the_calls_which_are_silent_and_write_nothing(
 
 def test_the_lines_of_the_pages_run(training, tmp_path, monkeypatch):
     """Those of docs/python.md are the same as those of README."""
-    body, same = (blocks(read(page), "python")[0] for page in ("README.md", "docs/python.md"))
-    statements = [[ast.unparse(line) for line in ast.parse(text).body] for text in (body, same)]
+    body, python_page = (
+        blocks(read(page), "python")[0] for page in ("README.md", "docs/python.md")
+    )
+    statements = [
+        [ast.unparse(line) for line in ast.parse(text).body] for text in (body, python_page)
+    ]
     assert statements[0] == statements[1]
     for path in (training.image, training.catalogue):
         shutil.copy(path, tmp_path)
@@ -122,9 +126,9 @@ def test_a_model_of_another_image_is_told_the_noise_of_these_stars(training, sta
     [({"snr_min": 150.0}, "trained on other stars"), ({"stamp_px": 20}, "stamps of 20 px")],
 )
 def test_a_model_that_may_have_seen_the_stars_is_refused(training, settings, message):
-    others = psfdae.Stars.from_image(training.image, training.catalogue, **SIZES, **settings)
+    second_stars = psfdae.Stars.from_image(training.image, training.catalogue, **SIZES, **settings)
     with pytest.raises(psfdae.Error, match=message):
-        psfdae.validate(training.model, others)
+        psfdae.validate(training.model, second_stars)
 
 
 @pytest.mark.parametrize(

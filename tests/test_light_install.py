@@ -72,7 +72,7 @@ def light(tmp_path_factory):
 
 
 def run(light, folder, script):
-    """What a bash script prints in a folder, `psfdae` and `python` being the environment's."""
+    """Output of a bash script in a folder, `psfdae` and `python` being the environment's."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment["PATH"] = f"{light}{os.pathsep}{os.environ['PATH']}"
     process = captured(["bash", "-euc", script], cwd=folder, env=environment)

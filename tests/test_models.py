@@ -90,7 +90,7 @@ def are_equal(first, second):
 
 
 def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
-    """For Gaussian images of known covariance its error is tr(C − C(C + N)⁻¹C)/P."""
+    """The error for Gaussian images of known covariance is tr(C − C(C + N)⁻¹C)/P."""
     rng = np.random.default_rng(0)
     mixing = rng.normal(size=(64, 5)) * 0.01
     images = (rng.normal(size=(20000, 5)) @ mixing.T + 1 / 64).reshape(-1, 8, 8)
@@ -295,14 +295,14 @@ def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
     attempts = []
 
-    def dead_once(*given):
-        model = build_dae(*given)
+    def dead_once(*arguments):
+        model = build_dae(*arguments)
         attempts.append(model.layers[0].weight.detach().clone())
         return killed(model) if len(attempts) == 1 else model
 
     monkeypatch.setattr(dae_network, "build_dae", dead_once)
-    whole = train(data, tmp_path)
-    assert whole.attempt == 1
+    uninterrupted = train(data, tmp_path)
+    assert uninterrupted.attempt == 1
     assert not torch.equal(*attempts)
     attempts.clear()
     interrupted(data, tmp_path, 2)
@@ -310,7 +310,7 @@ def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
     # The dead one, the one that was interrupted, and that again.
     assert len(attempts) == 3 and torch.equal(attempts[1], attempts[2])
     assert resumed.attempt == 1
-    assert are_equal(whole.result, resumed.result)
+    assert are_equal(uninterrupted.result, resumed.result)
 
 
 @pytest.mark.parametrize("kind", ["fixed", "fresh"])

@@ -12,14 +12,14 @@ from workflow_runs import NO_CLUSTER, ROOT, captured, environment
 
 pytestmark = pytest.mark.workflow
 
-WRITTEN = {
+NEW_FILES = {
     "/path/to/psfdae": str(ROOT),
     "results/": "out/",
     '"preset": "fast"': '"preset": "smoke", "results": "out"',
     "telescope=mine": "telescope=mine methods=[noisy,dae]",
     "rule errors": "rule stars",
 }
-"""What the test changes in the Snakefile of docs/reproduce.md; a rule there has a name of ours."""
+"""Changes by the test to the Snakefile of docs/reproduce.md; a rule there has a name of ours."""
 GLOBALS = "RESULTS, DATASET, settings = 'elsewhere', 3, None\n"
 TELESCOPE = """
 name: mine
@@ -35,7 +35,7 @@ def test_a_project_builds_dataset3_with_its_telescope(tmp_path):
     shutil.copytree(ROOT / "config", tmp_path / "config")
     (tmp_path / "config/telescope/mine.yaml").write_text(TELESCOPE)
     (text,) = blocks(read("docs/reproduce.md"), "snakemake")
-    for old, new in WRITTEN.items():
+    for old, new in NEW_FILES.items():
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "Snakefile").write_text(GLOBALS + text)
@@ -43,9 +43,9 @@ def test_a_project_builds_dataset3_with_its_telescope(tmp_path):
     def run(*arguments):
         line = ["snakemake", "--cores", "1", *arguments]
         paths = environment(PYTHONPATH=str(ROOT / "src"), **NO_CLUSTER)
-        done = captured(line, cwd=tmp_path, env=paths)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout + done.stderr
+        process = captured(line, cwd=tmp_path, env=paths)
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout + process.stderr
 
     run("psfdae_dataset3", "stars")
     stars = read_product(tmp_path / "out/data/seidel/seidel_10pct.h5", "stars", ())
@@ -54,6 +54,6 @@ def test_a_project_builds_dataset3_with_its_telescope(tmp_path):
     table = (tmp_path / "errors.csv").read_text()
     assert table == (tmp_path / "out/tables/dataset3_mse.csv").read_text()
     assert (tmp_path / "out/mlflow/dataset3.csv").is_file()
-    written = {path.name for path in tmp_path.iterdir()}
-    assert written == {".snakemake", "Snakefile", "config", "out", "errors.csv"}
+    file_names = {path.name for path in tmp_path.iterdir()}
+    assert file_names == {".snakemake", "Snakefile", "config", "out", "errors.csv"}
     assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "stars")

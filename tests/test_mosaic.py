@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from psfdae.commands import mosaic
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
@@ -26,13 +26,13 @@ NUMBERS = {"CCD1": 1, "CCD2": 2, "5": 5, "6": 6}
 
 def mosaic_file(path, *images):
     """A FITS file with named images, None for a table, and no primary one."""
-    made = [
+    hdus = [
         fits.BinTableHDU(Table({"x": [1.0]}), name=name)
         if pixels is None
         else fits.ImageHDU(np.asarray(pixels, np.float32), header, name=name)
         for name, pixels, header in images
     ]
-    fits.HDUList([fits.PrimaryHDU(), *made]).writeto(path)
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path)
     return path
 
 
@@ -56,9 +56,14 @@ def ccds(tmp_path_factory):
         images.append((f"CCD{k}", pixels, header))
     rows = Table({name: np.concatenate([t[name] for t in lists]) for name in ("id", "ra", "dec")})
     rows.write(folder / "sky.csv")
-    same = np.ones((9, 9))
-    others = [("DQ", same, None), ("CAT", None, None), ("SCI", same, None), ("SCI", same, None)]
-    return mosaic_file(folder / "m.fits", *images, *others), folder / "sky.csv"
+    quality = np.ones((9, 9))
+    other_extensions = [
+        ("DQ", quality, None),
+        ("CAT", None, None),
+        ("SCI", quality, None),
+        ("SCI", quality, None),
+    ]
+    return mosaic_file(folder / "m.fits", *images, *other_extensions), folder / "sky.csv"
 
 
 def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path):
@@ -76,9 +81,9 @@ def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
     for k in (1, 2):
         of = stated[f"CCD{k}"]
         assert of.gain == 2.0
-        found = ImageInput(image, **vars(of)).open(4)
-        assert found.count == 5
-        assert next(found.chunks(9)).id.tolist() == [10 * k + n for n in range(5)]
+        opened = ImageInput(image, **vars(of)).open(4)
+        assert opened.count == 5
+        assert next(opened.chunks(9)).id.tolist() == [10 * k + n for n in range(5)]
     # The list reaches beyond an image, which alone keeps and flags all of them.
     assert ImageInput(image, catalogue=catalogue, extension=1).open(4).count == 10
 
@@ -129,16 +134,15 @@ def test_a_mosaic_from_its_stars_to_their_psfs(tmp_path):
     image = mosaic_file(tmp_path / "m.fits", *images, empty)
     out = tmp_path / "model"
     words = [image, "--all-extensions", "--detect"]
-    done = psfdae("from-stars", *words, "--out", out, "--report", tmp_path / "page.html", *TINY)
-    assert done.exit_code == 2
-    assert done.output.endswith("1 of 3 images failed: EMPTY\n")
+    process = psfdae("from-stars", *words, "--out", out, "--report", tmp_path / "page.html", *TINY)
+    assert process.exit_code == 2
+    assert process.output.endswith("1 of 3 images failed: EMPTY\n")
     for k in (1, 2):
         assert read_bundle(out / f"CCD{k}/m_CCD{k}.psf.safetensors").info.source == "stars"
         assert (tmp_path / f"page_CCD{k}.html").is_file()
-    whole = mosaic_file(tmp_path / "two.fits", *images)
-    words = [whole, "--all-extensions", "--detect", "--model", out]
-    done = psfdae("predict", *words, "--out", tmp_path / "psf.fits")
-    assert done.exit_code == 0, done.output
+    mosaic = mosaic_file(tmp_path / "two.fits", *images)
+    words = [mosaic, "--all-extensions", "--detect", "--model", out]
+    printed("predict", *words, "--out", tmp_path / "psf.fits")
     for k in (1, 2):
         stars = Table.read(tmp_path / f"psf_CCD{k}.fits", hdu="STARS")
         assert len(stars) == len(Table.read(tmp_path / f"psf_CCD{k}_stars.csv")) > 100

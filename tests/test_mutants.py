@@ -10,5 +10,7 @@ from mutants import ROOT, find, mutated, read_list
 def test_every_mutant_changes_code_that_is_there():
     for mutant in read_list():
         ast.parse(mutated(*find(ROOT / "src", mutant), mutant.mutated))
-        before, after = (ast.dump(ast.parse(m)) for m in (mutant.original, mutant.mutated))
-        assert before != after, mutant
+        original_tree, mutated_tree = (
+            ast.dump(ast.parse(m)) for m in (mutant.original, mutant.mutated)
+        )
+        assert original_tree != mutated_tree, mutant

@@ -124,7 +124,7 @@ def run(tree, tmp_path_factory):
 
 
 def psfdae(tree, folder, *words):
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "psfdae", *map(str, words)],
         cwd=folder,
         env=environment(PYTHONPATH=str(tree / "src")),
@@ -132,16 +132,16 @@ def psfdae(tree, folder, *words):
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 def test_toy_is_in_the_tables_of_metrics(run):
     table = pd.read_csv(run / "results/tables/psf_metrics.csv")
-    mine = table[table["method"] == "shrunk"]
-    assert set(mine["reference"]) == set(REFERENCES)
-    assert set(mine["split"]) == {"random", "held_out"}
-    assert len(mine) == len(table[table["method"] == "dae"])
+    toy_rows = table[table["method"] == "shrunk"]
+    assert set(toy_rows["reference"]) == set(REFERENCES)
+    assert set(toy_rows["split"]) == {"random", "held_out"}
+    assert len(toy_rows) == len(table[table["method"] == "dae"])
     table = pd.read_csv(run / "results/tables/from_stars.csv")
     assert {"noisy", "pca_som", "dae", "shrunk"} <= set(table["method"])
 

@@ -142,8 +142,8 @@ def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, con
     path = tmp_path / "stars.csv"
     path.write_text(content)
     observation = open_observation(image, D, catalogue=path)
-    lost = [False, True, True, True, False]
-    assert observation.without_position().tolist() == lost
+    has_no_position = [False, True, True, True, False]
+    assert observation.without_position().tolist() == has_no_position
     assert f"{path}: no position in row 2, 3, 4: flagged" in observation.summary()
     stamps = next(observation.chunks(5))
     assert (

@@ -141,9 +141,9 @@ def test_header_values_and_those_that_are_given_before_them(cube):
     camera = open_observation(cube, D)
     assert (camera.pixel_scale_arcsec, camera.gain, camera.saturate) == (1.1, 2.0, 5000.0)
     assert camera.header_cards == [("OBJECT", "M 31", "")]
-    given = open_observation(cube, D, pixel_scale_arcsec=3.0, gain=4.0, saturate=210.0)
-    assert (given.pixel_scale_arcsec, given.gain, given.saturate) == (3.0, 4.0, 210.0)
-    columns = read(given)
+    stated = open_observation(cube, D, pixel_scale_arcsec=3.0, gain=4.0, saturate=210.0)
+    assert (stated.pixel_scale_arcsec, stated.gain, stated.saturate) == (3.0, 4.0, 210.0)
+    columns = read(stated)
     np.testing.assert_array_equal(columns["saturated"], columns["data"] >= 210.0)
     assert columns["saturated"].any() and not columns["bad"].any()
 
@@ -259,8 +259,8 @@ def test_stars_at_the_edge_and_off_the_image_are_flagged_and_kept(ramp, tmp_path
     np.testing.assert_array_equal(columns["bad"][1].sum(axis=0), [10] * 4 + [0] * 6)
     np.testing.assert_array_equal(columns["data"][1, 5, 5], 15_001)
     # Only the margin is off the image: not truncated.
-    near = catalogue(tmp_path / "near.csv", [4], [15], ("xcenter", "ycenter"))
-    columns = read(open_observation(ramp, D, 1, catalogue=near))
+    near_edge = catalogue(tmp_path / "near.csv", [4], [15], ("xcenter", "ycenter"))
+    columns = read(open_observation(ramp, D, 1, catalogue=near_edge))
     assert not columns["truncated"].any() and columns["bad"].sum() == 10
 
 
@@ -287,8 +287,8 @@ def test_distortion_is_inverted_and_far_stars_do_not_fold_into_the_image(ramp, t
         header.update(A_2_0=2e-3, B_0_2=-1e-3)
     wcs = WCS(fits.getheader(ramp))
     ra, dec = wcs.all_pix2world([5.0, 30.0], [7.0, 20.0], 0)
-    antipode, far = (ra[0] + 180, -dec[0]), (ra[0] + 0.5, dec[0])
-    ra, dec = [*ra, antipode[0], far[0]], [*dec, antipode[1], far[1]]
+    antipode, far_star = (ra[0] + 180, -dec[0]), (ra[0] + 0.5, dec[0])
+    ra, dec = [*ra, antipode[0], far_star[0]], [*dec, antipode[1], far_star[1]]
     stars = catalogue(tmp_path / "c.csv", ra, dec, ("ALPHA_J2000", "DELTA_J2000"))
     observation = open_observation(ramp, D, catalogue=stars)
     np.testing.assert_allclose(observation.positions[:2], [[5, 7], [30, 20]], atol=1e-4)

@@ -12,8 +12,8 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from command_line import printed, refused
 from command_line import psfdae as run
-from command_line import refused
 from image_training import few_draws
 from psfdae import StarFlag, load_model
 from psfdae.image.image_input import ImageInput
@@ -44,8 +44,8 @@ class Image:
         image = galsim.ImageF(COLUMNS, ROWS, xmin=0, ymin=0)
         self.area = np.empty(count)
         for star, (at, snr) in enumerate(zip(self.position, self.snr, strict=True)):
-            near = np.rint(at).astype(int)
-            bounds = galsim.BoundsI(near[0] - 10, near[0] + 9, near[1] - 10, near[1] + 9)
+            pixel = np.rint(at).astype(int)
+            bounds = galsim.BoundsI(pixel[0] - 10, pixel[0] + 9, pixel[1] - 10, pixel[1] + 9)
             stamp = galsim.ImageD(bounds)
             psf.drawImage(stamp, center=galsim.PositionD(*at), scale=1.0)
             inside = cut(stamp.array[None], SIDE)[0]
@@ -59,9 +59,9 @@ class Image:
         fits.PrimaryHDU(self.pixels, fits.Header({"GAIN": 1.0})).writeto(self.image)
         self.list = self.listed("stars", *self.position.T)
 
-    def listed(self, name, x, y, **more):
+    def listed(self, name, x, y, **columns):
         path = self.folder / f"{name}.csv"
-        pd.DataFrame({"x_fit": x, "y_fit": y, **more}).to_csv(path, index=False)
+        pd.DataFrame({"x_fit": x, "y_fit": y, **columns}).to_csv(path, index=False)
         return path
 
     def predicted(self, catalogue, *words):
@@ -73,21 +73,20 @@ class Image:
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory):
     """The image, a field model of it, and its stars as `predict` measures them."""
-    made = Image(tmp_path_factory.mktemp("sky"))
-    out = made.folder / "model"
-    words = ("--catalogue", made.list, "--method", "field", "--out", out)
+    image_case = Image(tmp_path_factory.mktemp("sky"))
+    out = image_case.folder / "model"
+    words = ("--catalogue", image_case.list, "--method", "field", "--out", out)
     with few_draws():
-        done = run("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
-    assert done.exit_code == 0, done.output
-    made.model = out / "sky.psf.safetensors"
-    done, table = made.predicted(made.list)
-    assert done.exit_code == 0, done.output
-    made.stars = Table.read(table, hdu="STARS")
-    return made
+        printed("from-stars", image_case.image, *words, "methods=[noisy,field]", *TINY)
+    image_case.model = out / "sky.psf.safetensors"
+    process, table = image_case.predicted(image_case.list)
+    assert process.exit_code == 0, process.output
+    image_case.stars = Table.read(table, hdu="STARS")
+    return image_case
 
 
 def test_signal_to_noise_is_that_of_each_star(sky):
-    """That of a filter matched to its own PSF, not to the mean of moved ones, which is wider."""
+    """The filter is matched to the star's PSF, not to the mean of moved ones, which is wider."""
     ratio = sky.stars["snr"] / sky.snr
     for low, high in ((10, 40), (120, 3000)):
         between = (sky.snr > low) & (sky.snr < high)
@@ -119,32 +118,32 @@ def test_levels_of_noise_follow_the_least_signal_to_noise():
 def test_lists_that_are_off_are_refused(sky):
     x, y = sky.position.T
     for catalogue in (sky.listed("off", x + 5, y), sky.listed("exchanged", y, x)):
-        done, out = sky.predicted(catalogue)
-        assert done.exit_code == 2 and not out.exists()
+        process, out = sky.predicted(catalogue)
+        assert process.exit_code == 2 and not out.exists()
         place = rf"{catalogue.name}: stars are off its positions by x .*--accept-offset"
-        assert re.search(place, done.output)
-    done, out = sky.predicted(catalogue, "--accept-offset")
-    assert done.exit_code == 0 and out.exists()
+        assert re.search(place, process.output)
+    process, out = sky.predicted(catalogue, "--accept-offset")
+    assert process.exit_code == 0 and out.exists()
 
 
 def test_list_of_another_crowded_image_teaches_nothing(sky, tmp_path):
-    """Where every position has a source by chance, the stars' centres tell."""
+    """The stars' centres tell an offset where every position has a source by chance."""
     x, y = sky.position.T
     catalogue = sky.listed("two_off", x + 2, y)
     words = ("--catalogue", catalogue, "--out", tmp_path / "model", "methods=[noisy,field]", *TINY)
     assert "by x -2.0" in refused("from-stars", sky.image, *words)
 
 
-@pytest.mark.parametrize(("level", "wrong"), [(SKY, False), (0.0, True)])
-def test_a_sky_of_another_image_is_flagged(sky, level, wrong):
+@pytest.mark.parametrize(("level", "is_flagged"), [(SKY, False), (0.0, True)])
+def test_a_sky_of_another_image_is_flagged(sky, level, is_flagged):
     catalogue = sky.listed(f"sky{level:.0f}", *sky.position.T, sky=np.full(len(sky.snr), level))
-    done, out = sky.predicted(catalogue, "--background-column", "sky")
-    assert done.exit_code == 0 and (f"SKY_OFF: {len(sky.snr)}" in done.output) == wrong
-    assert ((Table.read(out, hdu="STARS")["flags"] & StarFlag.SKY_OFF > 0) == wrong).all()
+    process, out = sky.predicted(catalogue, "--background-column", "sky")
+    assert process.exit_code == 0 and (f"SKY_OFF: {len(sky.snr)}" in process.output) == is_flagged
+    assert ((Table.read(out, hdu="STARS")["flags"] & StarFlag.SKY_OFF > 0) == is_flagged).all()
 
 
 def test_models_of_other_releases_are_read(sky, tmp_path):
-    """With a setting that was not there yet, and one that is no more."""
+    """Fit that lacks a new setting, and has one that no longer exists."""
     bundle = read_bundle(sky.model)
     config = {**bundle.info.config, "train": {**bundle.info.config["train"]}}
     config["train"]["field"] = {k: v for k, v in config["train"]["field"].items() if k != "modes"}
@@ -183,7 +182,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
 
 
 def test_a_hole_in_the_image_makes_no_faint_star_bright(sky, tmp_path):
-    """What is left where too much of a neighbour's light was subtracted is no light of a star."""
+    """Residuals where too much of a neighbour's light was subtracted are no light of a star."""
     faint = int(np.flatnonzero(sky.snr < 10)[0])
     x, y = np.rint(sky.position[faint]).astype(int)
     pixels, noise = sky.pixels.copy(), np.std(sky.pixels[:5, :5])

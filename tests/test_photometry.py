@@ -169,7 +169,7 @@ def test_noise_of_bright_and_of_faint_stars_is_that_of_the_sky(gaussian_stars, w
 
 @pytest.mark.parametrize("sky", [0.0, 4.0])
 def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels(gaussian_stars, whole_model, sky):
-    """Of flux_of(x − b) nothing is left but what the good pixels say at that sky."""
+    """The flux of x − b is what the good pixels say at that sky, and nothing else."""
     stamps = 1e3 * gaussian_stars[:20].astype(np.float64)
     stamps += np.random.default_rng(6).normal(0, 8.0, stamps.shape)
     bad = np.zeros(stamps.shape, dtype=bool)

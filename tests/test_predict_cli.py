@@ -90,8 +90,8 @@ def test_image_and_catalogue(folder, field_psfs, shipped):
     truth = Table.read(folder / "stars.csv")
     assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
     source = ImageInput(folder / "image.fits", catalogue=folder / "stars.csv")
-    ((_, found),) = shipped.stream(source.open(shipped.stamp_px, shipped.margin_px))
-    rows = found.to_table()
+    ((_, prediction),) = shipped.stream(source.open(shipped.stamp_px, shipped.margin_px))
+    rows = prediction.to_table()
     assert rows.colnames == table.colnames and {"ra", "dec"} < {*rows.colnames}
     for name in rows.colnames:
         assert rows[name].unit == table[name].unit
@@ -112,11 +112,11 @@ def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
     names = ["id", "x", "flux", "Flux_list", "flux_list_list", "mag", "name"]
     for suffix in SUFFIXES:
         write_table(tmp_path / f"t{suffix}", table)
-        again = QTable.read(tmp_path / f"t{suffix}")
-        assert again.colnames == names
+        read_table = QTable.read(tmp_path / f"t{suffix}")
+        assert read_table.colnames == names
         if suffix != ".csv":
-            assert again["x"][0] == table["x"][0]
-            units = [str(again[name].unit) for name in ("x", "flux", "mag")]
+            assert read_table["x"][0] == table["x"][0]
+            units = [str(read_table[name].unit) for name in ("x", "flux", "mag")]
             assert units == ["pix", "electron / s", "mag"]
     assert (tmp_path / "t.csv").read_text().splitlines()[1:] == [
         "0,5.0000,1,1,'=1+1,3.0,'@a",

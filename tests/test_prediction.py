@@ -65,13 +65,13 @@ def test_uncertainty_covers_68_per_cent_and_the_flux_error_is_the_scatter(
     shipped, field_psfs, level
 ):
     stars = observe(field_psfs, level)
-    for known in ({"flux": stars.flux, "background": SKY}, {"background": SKY}, {}):
-        result = shipped.predict(stars.stamps, **known)
+    for stated in ({"flux": stars.flux, "background": SKY}, {"background": SKY}, {}):
+        result = shipped.predict(stars.stamps, **stated)
         valid = ~has(result, StarFlag.NO_FLUX)
         assert valid.mean() > 0.99
         error = np.abs(result.psf - stars.flux * stars.truth)[valid]
         assert (error <= result.uncertainty[valid]).mean() == pytest.approx(0.68, abs=0.05)
-        if "flux" not in known and level > 1e-4:
+        if "flux" not in stated and level > 1e-4:
             scatter = rms(result.flux - stars.flux)
             assert scatter == pytest.approx(rms(result.flux_error), rel=0.2)
             assert np.nanmean(result.flux / stars.flux) == pytest.approx(1.0, abs=0.05)
@@ -111,7 +111,7 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
 
 
 def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
-    """What the model does not know of a star's shape would pass for flux and for no noise."""
+    """A shape that the model does not know would pass for flux and for no noise."""
     no_misfit = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
     stars = observe(field_psfs, 3e-5)
     result, plain = (m.predict(stars.stamps) for m in (shipped, PsfModel(no_misfit)))
@@ -265,7 +265,7 @@ def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean
 
 @pytest.mark.parametrize(("end", "factor"), [("LOW", 0.6), ("HIGH", 2.0)])
 def test_sn_outside_the_training_is_flagged(shipped, field_psfs, end, factor):
-    """Of each star, by a filter matched to itself; that of faint stars scatters by an eighth."""
+    """The filter is matched to each star; the S/N of faint stars scatters by an eighth."""
     info, psf = shipped.info, field_psfs[:50]
     snr = factor * (info.snr_min if end == "LOW" else info.snr_max)
     level = np.sqrt(np.square(psf).sum(axis=(1, 2), keepdims=True)) / (snr * KAPPA)

@@ -50,7 +50,7 @@ def test_airy_pattern_of_an_obscured_pupil_along_a_radius():
 @pytest.mark.parametrize("samples", [96, 398])
 @pytest.mark.parametrize("operator", [None, PointSampling, PeriodSampling])
 def test_airy_encircled_energy(samples, operator):
-    """In the dark rings, where pixels cannot blur the circle, on coarse and on fine grids."""
+    """Compare the dark rings, where pixels cannot blur the circle, on coarse and on fine grids."""
     pupil, side, pixel = annular_pupil(samples, 0.0), 140, 0.05
     if operator is None:
         image = StampPropagator(pupil, side, pixel)(flat(pupil))[0]

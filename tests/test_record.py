@@ -136,8 +136,8 @@ def test_record_of_another_code_is_refused(results, history, tmp_path, file, sta
 
 
 def test_record_is_of_commits_in_the_history():
-    found = recorded(REFERENCE)
-    commits = {found["commit"], *(of["commit"] for of in found["kept"].values())}
+    record = recorded(REFERENCE)
+    commits = {record["commit"], *(of["commit"] for of in record["kept"].values())}
     commits |= {*pd.read_csv(ROOT / "studies/real_sky/table.csv").commit}
     if (
         source.git_commit() == "unknown"

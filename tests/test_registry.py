@@ -53,12 +53,12 @@ def test_a_registered_model_restores_as_its_bundle_does(
     database = tmp_path / "mlflow.db"
     database.write_bytes(empty_database.read_bytes())
     track.import_runs([run], "smoke", database, tmp_path / "runs.csv")
-    before = mlflow.get_tracking_uri()
+    tracking_uri = mlflow.get_tracking_uri()
     mlflow.set_tracking_uri(f"sqlite:///{database}")
     try:
         folder = mlflow.artifacts.download_artifacts("models:/mine-dae@best")
     finally:
-        mlflow.set_tracking_uri(before)
+        mlflow.set_tracking_uri(tracking_uri)
 
     stamps = np.random.default_rng(5).poisson(2e4 * gaussian_stars[:20] + 1e4).astype(np.float32)
     registered, model = load_model(f"{folder}/mine-dae.psf.safetensors"), load_model(packed)

@@ -1,4 +1,4 @@
-"""What is said of a model of one's own: beside one mean PSF, on its page, and as advice."""
+"""Statements on a model of one's own: beside one mean PSF, on its page, and as advice."""
 
 from __future__ import annotations
 

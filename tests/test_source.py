@@ -41,8 +41,8 @@ def changed(before, tmp_path, monkeypatch):
         for path in paths:
             with (tmp_path / "src" / path).open("a") as file:
                 file.write(text)
-        after = hashes()
-        return {name for name in before if before[name] != after[name]}
+        new_hashes = hashes()
+        return {name for name in before if before[name] != new_hashes[name]}
 
     yield edit
     source.module_digest.cache_clear()

@@ -9,7 +9,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from command_line import psfdae
+from command_line import printed
 from image_training import few_draws
 from psfdae import Error, StarFlag, Stars, fit
 from psfdae.image.catalogue import as_catalogue, read_catalogue
@@ -44,8 +44,8 @@ def positions(image, catalogue, **stated):
 def test_pairs_and_masked_positions_are_positions_from_0(image, place):
     np.testing.assert_array_equal(positions(image, place * u.pix), place)
     masked = np.ma.MaskedArray(place, np.arange(len(place))[:, None] == [3, 3])
-    found = positions(image, masked)
-    assert np.isnan(found[3]).all() and np.isfinite(np.delete(found, 3, axis=0)).all()
+    masked_xy = positions(image, masked)
+    assert np.isnan(masked_xy[3]).all() and np.isfinite(np.delete(masked_xy, 3, axis=0)).all()
 
 
 def test_sky_coordinates_of_astropy(path, place):
@@ -74,7 +74,7 @@ def test_columns_with_units(image, place):
 
 
 def vizier(listed, name):
-    """As asu-tsv writes it: comments, names, units, dashes."""
+    """Star list as asu-tsv writes it: comments, names, units, dashes."""
     rows = "\n".join(f"{k}\t{ra:.7f}\t{dec:.7f}" for k, (ra, dec) in enumerate(listed))
     head = "#\n#   VizieR Astronomical Server\n#Column\tRAJ2000\t(F10.6)\tRight ascension\n\n"
     name.write_text(f"{head}\nrecno\tRAJ2000\tDEJ2000\n\tdeg\tdeg\n--------\t---\t----\n{rows}\n")
@@ -155,7 +155,7 @@ def test_the_stars_say_the_origin_of_plain_columns(tmp_path, image, place):
 
 def test_where_they_do_not_the_origin_is_asked_for(image, place):
     for listed in (table(place + 0.5), table(place + np.array([0.0, 1.0])), table(place[:5])):
-        with pytest.raises(Error, match="--origin says it"):
+        with pytest.raises(Error, match="origin= says it"):
             positions(image, listed)
 
 
@@ -168,8 +168,8 @@ def test_a_list_off_by_one_pixel_is_refused_whatever_the_noise(seed):
         ({"catalogue": table(place, 0, ("X_IMAGE", "Y_IMAGE"))}, 0),
         ({"catalogue": table(place), "origin": 1}, 0),
     )
-    for stated, right in cases[:: 1 if seed == 0 else 4]:
-        with pytest.raises(Error, match=f"--origin {right} says so"):
+    for stated, is_accepted in cases[:: 1 if seed == 0 else 4]:
+        with pytest.raises(Error, match=f"origin={is_accepted} says so"):
             Stars.from_image(image, **stated, **CAMERA)
     accepted = Stars.from_image(image, catalogue=place + 1, accept_offset=True, **CAMERA)
     assert "x -1.00, y -1.00 px" in "".join(accepted.notes)
@@ -185,11 +185,14 @@ def test_iraf_counts_from_1_and_photutils_from_0(image, place):
 
 def test_of_two_rows_of_one_star_one_is_flagged_and_one_learnt_from(image, place):
     twice = np.concatenate([place, place[5:8] + np.array([0.05, -0.05])])
-    alone = Stars.from_image(image, catalogue=place, **CAMERA)
+    single_rows = Stars.from_image(image, catalogue=place, **CAMERA)
     stars = Stars.from_image(image, catalogue=twice, **CAMERA)
     flags = next(stars.observation.chunks(100)).flags
     assert np.flatnonzero(flags & StarFlag.BLENDED).tolist() == [70, 71, 72]
-    assert stars.candidates.verdict.tolist() == alone.candidates.verdict.tolist() + ["blended"] * 3
+    assert (
+        stars.candidates.verdict.tolist()
+        == single_rows.candidates.verdict.tolist() + ["blended"] * 3
+    )
     assert "3 rows are within 0.1 px of an earlier one (71, 72, 73)" in stars.notes[0]
 
 
@@ -204,25 +207,25 @@ def model(tmp_path_factory, image, place):
 @pytest.mark.slow
 def test_rows_without_position_and_twice_stay_in_every_result(tmp_path, image, place, model):
     write(tmp_path / "image.fits", image)
-    odd = np.concatenate([place, place[:1]])
-    odd[3, 0] = np.nan
-    table(odd).write(tmp_path / "s.csv")
-    said = ["--catalogue", tmp_path / "s.csv", "--model", model]
-    done = psfdae("photometry", tmp_path / "image.fits", *said, "--out", tmp_path / "p.ecsv")
-    assert done.exit_code == 0, done.output
-    assert "row 4" in done.output and "1 row is within 0.1 px" in done.output
-    found = Table.read(tmp_path / "p.ecsv")
-    assert len(found) == len(odd)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["flux"])), [3, 70])
-    assert (found["flags"][[3, 70]] > 0).all()
-    done = psfdae("predict", tmp_path / "image.fits", *said, "--out", tmp_path / "p.fits")
-    assert done.exit_code == 0, done.output
+    listed_rows = np.concatenate([place, place[:1]])
+    listed_rows[3, 0] = np.nan
+    table(listed_rows).write(tmp_path / "s.csv")
+    options = ["--catalogue", tmp_path / "s.csv", "--model", model]
+    output = printed("photometry", tmp_path / "image.fits", *options, "--out", tmp_path / "p.ecsv")
+    assert "row 4" in output and "1 row is within 0.1 px" in output
+    photometry = Table.read(tmp_path / "p.ecsv")
+    assert len(photometry) == len(listed_rows)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(photometry["flux"])), [3, 70])
+    assert (photometry["flags"][[3, 70]] > 0).all()
+    printed("predict", tmp_path / "image.fits", *options, "--out", tmp_path / "p.fits")
     rows = fits.getdata(tmp_path / "p.fits", "STARS")
     assert np.isnan(rows["flux"][3]) and rows["flags"][3] & StarFlag.NO_FLUX
 
     # Both results are star lists themselves, from 0.
     for name in ("p.ecsv", "p.fits"):
-        where = as_catalogue(tmp_path / name).positions()
-        assert (where.first, where.second, where.origin) == ("x", "y", 0)
-        again = positions(tmp_path / "image.fits", tmp_path / name)
-        np.testing.assert_allclose(np.delete(again, 3, 0), np.delete(odd, 3, 0), atol=0.1)
+        catalogue_xy = as_catalogue(tmp_path / name).positions()
+        assert (catalogue_xy.first, catalogue_xy.second, catalogue_xy.origin) == ("x", "y", 0)
+        opened_xy = positions(tmp_path / "image.fits", tmp_path / name)
+        np.testing.assert_allclose(
+            np.delete(opened_xy, 3, 0), np.delete(listed_rows, 3, 0), atol=0.1
+        )

@@ -112,13 +112,13 @@ def test_search_image_is_where_the_rays_land(scene1):
 
 def test_peak_outside_a_small_window_is_found_by_a_second_search(scene1, templates):
     _, peak = templates
-    near, tiny = (
+    wide_window, tiny = (
         Propagation(
             template_wavefronts(scene1), scene1.telescope, scene1.optics, scene1.framing, reach
         )
         for reach in (12, 4)
     )
-    assert (near.brightest() == peak).all()
+    assert (wide_window.brightest() == peak).all()
     with pytest.raises(FramingError, match="search_px = 4"):
         tiny.brightest()
 
@@ -157,12 +157,15 @@ def test_noise_is_that_of_the_star_in_every_split_and_independent_between_sets(
         product = Product(Path("s.h5"), {"stars": {"name": name}}, {"realisation": gaussian_stars})
         return noisy_test_images(scene1, product, np.array(test), level) - gaussian_stars[test]
 
-    ours, other = noise_of("seidel_10pct", [3, 7, 8]), noise_of("seidel_50pct", [3, 7, 8])
-    assert (noise_of("seidel_10pct", [8, 250, 3])[[2, 0]] == ours[[0, 2]]).all()
-    further = noise_of("seidel_10pct", [3, 7, 8], 0.005)
-    for noise in (other, further):
-        correlation = np.corrcoef(ours.ravel(), noise.ravel())[0, 1]
-        assert abs(correlation) < 4 / np.sqrt(ours.size)
+    set_noise, second_set_noise = (
+        noise_of("seidel_10pct", [3, 7, 8]),
+        noise_of("seidel_50pct", [3, 7, 8]),
+    )
+    assert (noise_of("seidel_10pct", [8, 250, 3])[[2, 0]] == set_noise[[0, 2]]).all()
+    fainter_noise = noise_of("seidel_10pct", [3, 7, 8], 0.005)
+    for noise in (second_set_noise, fainter_noise):
+        correlation = np.corrcoef(set_noise.ravel(), noise.ravel())[0, 1]
+        assert abs(correlation) < 4 / np.sqrt(set_noise.size)
 
 
 def test_every_level_of_a_band_is_drawn_as_often():
@@ -181,16 +184,16 @@ def test_random_split_sizes_and_separation():
     assert (split.train == np.sort(np.concatenate([split.fit, split.validation]))).all()
 
 
-@pytest.mark.parametrize(("points", "held"), [(11, 24), (20, 80)])
-def test_held_out_split_never_shares_a_field(points, held):
+@pytest.mark.parametrize(("points", "held_out_count"), [(11, 24), (20, 80)])
+def test_held_out_split_never_shares_a_field(points, held_out_count):
     grid, _ = square_grid(points, 1.0)
     fields = len(grid)
     star_field = assign_fields(20 * fields, fields, stream(1, "field"))
-    assert held_out_fields(grid).sum() == held
+    assert held_out_fields(grid).sum() == held_out_count
     split = held_out_split(star_field, grid, 0.1, seed=1)
     parts = [set(star_field[part]) for part in (split.fit, split.validation, split.test)]
     assert sum(map(len, parts)) == len(set.union(*parts)) == fields
-    assert len(parts[2]) == held
+    assert len(parts[2]) == held_out_count
     assert split.fit.size + split.validation.size + split.test.size == star_field.size
 
 

@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import psfdae
-from command_line import psfdae as command
+from command_line import printed
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
@@ -58,8 +58,8 @@ def fitted(seed):
     stars = psfdae.Stars.from_image(image, place, **camera)
     field = fitted_to(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
-    made, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
-    bundle = with_model_errors(psfdae.PsfModel(made), field, 1)
+    packed, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
+    bundle = with_model_errors(psfdae.PsfModel(packed), field, 1)
     wings = wings_of_stars(psfdae.PsfModel(bundle), stars.observation.with_margin(2))
     return psfdae.PsfModel(with_wings(bundle, wings))
 
@@ -78,31 +78,31 @@ def within(off, error):
 @pytest.mark.parametrize("snr", [(5, 20), (20, 50), (50, 200), (200, 1000), (1000, 2000)])
 def test_errors_hold_at_every_signal_to_noise(models, snr):
     rng, side, count = np.random.default_rng(2), models[0].stamp_px + 4, 100
-    held = {}
+    coverage = {}
     for model in models:
         place = rng.uniform(20, SIZE - 20, (count, 2))
         # Flux of a star of S/N r over n = 24 pixels: r² = F² / (F / g + n σ²).
-        wanted = 10 ** rng.uniform(*np.log10(snr), count)
-        sky, photons = 24 * (SKY / GAIN + (READ / GAIN) ** 2), wanted**2 / (2 * GAIN)
-        flux = photons + np.sqrt(photons**2 + sky * wanted**2)
+        star_snr = 10 ** rng.uniform(*np.log10(snr), count)
+        sky, photons = 24 * (SKY / GAIN + (READ / GAIN) ** 2), star_snr**2 / (2 * GAIN)
+        flux = photons + np.sqrt(photons**2 + sky * star_snr**2)
         light = [f * star_at(at, side) for f, at in zip(flux, place, strict=True)]
         stamps = noisy(np.stack(light), rng)
-        found = model.predict(stamps, position=place, gain=GAIN, margin=2)
-        usable = (found.flags & psfdae.StarFlag.NO_FLUX) == 0
+        prediction = model.predict(stamps, position=place, gain=GAIN, margin=2)
+        usable = (prediction.flags & psfdae.StarFlag.NO_FLUX) == 0
         assert usable.mean() > 0.98
         centre = side // 2 + place - np.floor(place + 0.5)
         pairs = {
-            "flux": (found.flux_total - flux, found.flux_total_error),
-            "sky": (found.background - SKY, found.background_error),
-            "x": (found.x_fit - centre[:, 0], found.x_error),
-            "y": (found.y_fit - centre[:, 1], found.y_error),
+            "flux": (prediction.flux_total - flux, prediction.flux_total_error),
+            "sky": (prediction.background - SKY, prediction.background_error),
+            "x": (prediction.x_fit - centre[:, 0], prediction.x_error),
+            "y": (prediction.y_fit - centre[:, 1], prediction.y_error),
         }
         for name, (off, error) in pairs.items():
-            held.setdefault(name, []).append(within(off[usable], error[usable]))
-    for name, parts in held.items():
-        one, two = np.mean(parts, axis=0)
+            coverage.setdefault(name, []).append(within(off[usable], error[usable]))
+    for name, parts in coverage.items():
+        within_1_sigma, two = np.mean(parts, axis=0)
         # 1200 stars leave ± 0.014 and 0.006, but bright stars of a model share its error.
-        assert 0.61 < one < 0.75, (name, one)
+        assert 0.61 < within_1_sigma < 0.75, (name, within_1_sigma)
         assert 0.91 < two < 0.985, (name, two)
 
 
@@ -110,12 +110,12 @@ def test_errors_hold_at_every_signal_to_noise(models, snr):
 def test_no_errors_of_the_model_where_numbers_are_known(models):
     place = np.full((3, 2), 300.0)
     stamps = 1e5 * np.stack([star_at(at, 16) for at in place]) + SKY
-    given = {"position": place, "noise": 10.0, "background": SKY, "centre": np.zeros((3, 2))}
-    found = models[0].predict(stamps, fixed=True, **given)
-    assert (found.background_error == 0).all()
-    assert (found.x_error == 0).all()
+    stated = {"position": place, "noise": 10.0, "background": SKY, "centre": np.zeros((3, 2))}
+    prediction = models[0].predict(stamps, fixed=True, **stated)
+    assert (prediction.background_error == 0).all()
+    assert (prediction.x_error == 0).all()
     errors = models[0].bundle.errors.measured
-    assert (found.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
+    assert (prediction.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
 
 
 @pytest.mark.slow
@@ -128,18 +128,17 @@ def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp
     Table({"id": names, "x": place[:, 0], "y": place[:, 1]}).write(tmp_path / "s.csv")
     words = ["photometry", tmp_path / "i.fits", "--catalogue", tmp_path / "s.csv", "--origin", 0]
     words += ["--model", tmp_path / "m.psf.safetensors", "--out", tmp_path / "p.ecsv"]
-    done = command(*words)
-    assert done.exit_code == 0, done.output
+    printed(*words)
     rows = Table.read(tmp_path / "p.ecsv")
     assert rows["id"].tolist() == names
     assert (rows["flags"] == 0).mean() > 0.9
     # As one star after the other is measured by `predict`, within the errors of both.
-    found = next(
+    photometry = next(
         models[0].stream(ImageInput(tmp_path / "i.fits", catalogue=place).open(16, 2), threads=1)
     )[1]
-    off = np.array(rows["flux"]) - found.flux_total
-    one, two = within(off, np.hypot(rows["flux_error"], found.flux_total_error))
-    assert one > 0.6 and two > 0.9
+    off = np.array(rows["flux"]) - photometry.flux_total
+    within_1_sigma, two = within(off, np.hypot(rows["flux_error"], photometry.flux_total_error))
+    assert within_1_sigma > 0.6 and two > 0.9
     # No error of a bright star is below that of the model, which grows towards the edge.
     model_error = models[0].flux_error(place)
     assert (rows["flux_error"] > model_error * rows["flux"]).all()
@@ -161,8 +160,8 @@ def test_flags_of_photometry():
     bad[21, 20] = saturated[80, 82] = True
     flags = star_flags(stars, bad, saturated, 5, 3.0)
     of = psfdae.StarFlag
-    wanted = [0, of.TRUNCATED, of.SATURATED, of.MASKED, of.FAINT, of.POOR_FIT]
-    assert flags.tolist() == [*wanted, of.BLENDED, of.BLENDED, of.NO_FLUX]
+    expected = [0, of.TRUNCATED, of.SATURATED, of.MASKED, of.FAINT, of.POOR_FIT]
+    assert flags.tolist() == [*expected, of.BLENDED, of.BLENDED, of.NO_FLUX]
     stars["photutils_flags"][:2] = [32, 8]
     flags = star_flags(stars, bad, saturated, 5, 3.0)
     assert flags[:2].tolist() == [of.OFF_CENTRE, of.TRUNCATED | of.POOR_FIT]

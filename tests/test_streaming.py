@@ -54,13 +54,13 @@ def test_streamed_product_is_that_of_one_write(tmp_path):
         with stream_product(tmp_path / name, "k", columns, {"seed": 1}) as data:
             for start in range(0, 70, 32):
                 data["a"][start : start + 32] = values[start : start + 32]
-    one, two = (read_product(tmp_path / name, "k") for name in ("one.h5", "two.h5"))
-    assert (one["a"] == two["a"]).all() and (one["n"] == two["n"]).all()
+    written_at_once, two = (read_product(tmp_path / name, "k") for name in ("one.h5", "two.h5"))
+    assert (written_at_once["a"] == two["a"]).all() and (written_at_once["n"] == two["n"]).all()
     assert (two["b"] == two["a"]).all()  # the same empty column is a link
-    assert one.config == two.config
+    assert written_at_once.config == two.config
     assert (tmp_path / "two.h5").read_bytes() == (tmp_path / "three.h5").read_bytes()
-    with h5py.File(tmp_path / "one.h5") as whole, h5py.File(tmp_path / "two.h5") as streamed:
-        assert dict(whole["a"].attrs) == dict(streamed["a"].attrs)
+    with h5py.File(tmp_path / "one.h5") as single_write, h5py.File(tmp_path / "two.h5") as streamed:
+        assert dict(single_write["a"].attrs) == dict(streamed["a"].attrs)
         assert streamed["a"].fletcher32
 
 
@@ -81,11 +81,11 @@ def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, mon
     stars.stars(config, fixed, tmp_path / "whole.h5")
     monkeypatch.setattr(stars, "STARS_AT_A_TIME", 17)
     stars.stars(config, fixed, tmp_path / "pieces.h5")
-    whole, pieces = (read_product(tmp_path / f"{n}.h5", "stars") for n in ("whole", "pieces"))
+    at_once, pieces = (read_product(tmp_path / f"{n}.h5", "stars") for n in ("whole", "pieces"))
     for name in ("field_index", "jitter", "peak", "seidel", "pupil_samples"):
-        assert (whole[name] == pieces[name]).all(), name
+        assert (at_once[name] == pieces[name]).all(), name
     for name in ("template", "realisation", "energy"):
-        assert pieces[name] == pytest.approx(whole[name], rel=1e-5, abs=1e-8), name
+        assert pieces[name] == pytest.approx(at_once[name], rel=1e-5, abs=1e-8), name
 
 
 def test_search_is_exact_for_large_pixels():
@@ -95,14 +95,14 @@ def test_search_is_exact_for_large_pixels():
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.
     source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]
     optics = config.optics.model_copy(update={"pupil_samples": [222]})
-    some = np.arange(4, 400, 39)
+    sampled_stars = np.arange(4, 400, 39)
     settings = (source, config.telescope)
-    found = Propagation(*settings, optics, config.framing, 12).brightest(some)
+    peak = Propagation(*settings, optics, config.framing, 12).brightest(sampled_stars)
     fine = optics.model_copy(update={"precision": "complex128"})
     exact = Propagation(*settings, fine, config.framing, 12)
-    images = exact.stamps(24, np.zeros((some.size, 2), dtype=int), some)
+    images = exact.stamps(24, np.zeros((sampled_stars.size, 2), dtype=int), sampled_stars)
     expected = np.array([brightest_pixel(image, config.framing.tie) for image in images]) - 12
-    assert (found == expected).all()
+    assert (peak == expected).all()
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def memory(cheap, tmp_path_factory):
     folder = tmp_path_factory.mktemp("memory")
     tree = dict(compose([*CHEAP, "dae.kernels=[3,3]", "dae.widths=[2]"]))
     stars, cube, bundle = (folder / name for name in ("stars.h5", "stars.fits", "m.safetensors"))
-    found = {"simulate": [], "predict": []}
+    peak_memory = {"simulate": [], "predict": []}
     for count in (4000, 20_000):
         tree["stars"] = {**tree["stars"], "count": count}
         costs = {
@@ -124,16 +124,16 @@ def memory(cheap, tmp_path_factory):
         words = ["predict", cube, "--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
         costs["predict"] = isolated(1, cost_of_command, words, folder / "psf.fits")
         for job, cost in costs.items():
-            found[job].append((cost["peak_b"] - cost["resting_b"]) / 2**20)
-    return found
+            peak_memory[job].append((cost["peak_b"] - cost["resting_b"]) / 2**20)
+    return peak_memory
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("job", ["simulate", "predict"])
 def test_memory_does_not_grow_with_the_stars(memory, job):
-    few, many = memory[job]
+    few_stars, many_stars = memory[job]
     # Images alone would need 16 000 × 3 kB = 48 MB more; the drawn numbers 100 bytes a star.
-    assert many - few < 20
+    assert many_stars - few_stars < 20
 
 
 @pytest.mark.slow

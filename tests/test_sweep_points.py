@@ -261,8 +261,8 @@ def test_sweep_is_a_parent_run_with_a_child_per_point(site):  # noqa: F811
     assert parent.data.metrics["best_validation_mse_1e-6"] == pytest.approx(10)
     assert parent.data.tags["best_point"] == f"{3:012x}"
     assert children["width=8, train.lr=0.001"].info.status == "FAILED"
-    best = children["width=8, train.lr=0.004"].data
-    assert best.metrics["test_mse_1e-6"] == pytest.approx(11)
+    best_run = children["width=8, train.lr=0.004"].data
+    assert best_run.metrics["test_mse_1e-6"] == pytest.approx(11)
     # A grid that has grown is another parent: old points move to it and are not doubled.
     space = {**DEFINITION["space"], "width": {"values": [4, 8, 16]}}
     summarise(site.results, [*OUTCOMES, (16, 0.004, 2e-5)], space=space)

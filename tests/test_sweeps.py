@@ -31,10 +31,10 @@ SEARCH = {"seed": 3, "startup": 4, "metric": "validation_mse", "direction": "min
 def sweep(config_folder):
     """Writes a sweep into a copy of the configuration and plans it."""
 
-    def plan(tree, *given, name="tried"):
+    def plan(tree, *overrides, name="tried"):
         text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
         (config_folder / f"sweep/{name}.yaml").write_text(text)
-        return plan_sweep(name, ("preset=smoke", *given))
+        return plan_sweep(name, ("preset=smoke", *overrides))
 
     return plan
 
@@ -120,8 +120,8 @@ def axes(**space):
 def test_draws_extend_and_each_axis_is_on_its_own():
     space = axes(a={"low": 1, "high": 9, "integer": True}, b={"low": 1e-4, "high": 1, "log": True})
     assert draws(space, 9, seed=5)[:4] == draws(space, 4, seed=5)
-    alone = [point["b"] for point in draws({"b": space["b"]}, 4, seed=5)]
-    assert alone == [point["b"] for point in draws(space, 4, seed=5)]
+    single_axis = [point["b"] for point in draws({"b": space["b"]}, 4, seed=5)]
+    assert single_axis == [point["b"] for point in draws(space, 4, seed=5)]
     assert draws(space, 4, seed=6) != draws(space, 4, seed=5)
 
 
@@ -132,11 +132,11 @@ def test_draws_fill_their_range_evenly():
         log={"low": 1e-4, "high": 1, "log": True},
         listed=["x", "y"],
     )
-    drawn = pd.DataFrame(draws(space, 500, seed=1))
+    points = pd.DataFrame(draws(space, 500, seed=1))
     # Five standard deviations of a binomial with 500 trials of probability 1/4 and 1/2.
-    assert np.abs(np.bincount(drawn.whole)[1:] - 125).max() < 5 * np.sqrt(500 * 0.25 * 0.75)
-    assert abs((drawn.listed == "x").sum() - 250) < 5 * np.sqrt(500 * 0.25)
-    for unit in ((drawn.even - 2) / 2, np.log10(drawn.log) / 4 + 1):
+    assert np.abs(np.bincount(points.whole)[1:] - 125).max() < 5 * np.sqrt(500 * 0.25 * 0.75)
+    assert abs((points.listed == "x").sum() - 250) < 5 * np.sqrt(500 * 0.25)
+    for unit in ((points.even - 2) / 2, np.log10(points.log) / 4 + 1):
         # Mean 1/2 and variance 1/12, whose own variances are 1/12n and 1/180n.
         assert abs(unit.mean() - 0.5) < 5 / np.sqrt(12 * 500)
         assert abs(unit.var() - 1 / 12) < 5 / np.sqrt(180 * 500)
@@ -168,16 +168,16 @@ def run_trials(count):
 def test_asking_is_a_function_of_what_is_known():
     results = run_trials(8)
     assert run_trials(8) == results
-    again = adaptive.ask(SPACE, SEARCH, 8, results)
-    assert adaptive.ask(SPACE, SEARCH, 8, results[::-1]) == again
-    assert again["list"] in ([1, 2], [3, 4])
-    assert adaptive.ask(SPACE, {**SEARCH, "seed": 4}, 8, results) != again
+    repeated = adaptive.ask(SPACE, SEARCH, 8, results)
+    assert adaptive.ask(SPACE, SEARCH, 8, results[::-1]) == repeated
+    assert repeated["list"] in ([1, 2], [3, 4])
+    assert adaptive.ask(SPACE, {**SEARCH, "seed": 4}, 8, results) != repeated
 
 
 def test_trial_waits_for_all_but_those_beside_it(sweep):
     tree = {**GRID, "kind": "adaptive", "trials": 5, "parallel": 2}
     plan = sweep(tree)
-    slots = [[other.slot for other in plan.earlier_trials(p)] for p in plan.points.values()]
+    slots = [[trial.slot for trial in plan.earlier_trials(p)] for p in plan.points.values()]
     assert slots == [[], [], [0], [0, 1], [0, 1, 2]]
 
 

@@ -110,7 +110,7 @@ def test_ray_trace_is_that_of_scene_3(traced):
 
 
 def test_ray_traced_stamps_are_those_of_scene_3(traced):
-    """In pixels, to which the sign of every term and both axes count."""
+    """Positions in pixels, to which the sign of every term and both axes count."""
     alignment = load(Alignment.choice)
     source = template_wavefronts(traced)
     leaning = source.coefficients[[0, 4, 8]]

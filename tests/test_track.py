@@ -125,7 +125,7 @@ def site(tmp_path, empty_database, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(registry, "bundle_of", lambda *given: None)
+    monkeypatch.setattr(registry, "bundle_of", lambda *arguments: None)
     monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
     return Site(tmp_path, empty_database)
 
@@ -155,9 +155,11 @@ def test_run_holds_what_the_files_say(site):
     ):
         points = [(p.step, p.value) for p in site.history(dae, name)]
         assert points == [pytest.approx(point) for point in expected]
-    (given,) = dae.inputs.dataset_inputs
+    (dataset_input,) = dae.inputs.dataset_inputs
     digest = hashlib.sha256(site.stars["dataset3"].read_bytes()).hexdigest()
-    assert given.dataset.name == "dataset3" and digest.startswith(given.dataset.digest)
+    assert dataset_input.dataset.name == "dataset3" and digest.startswith(
+        dataset_input.dataset.digest
+    )
     # Copies of the files lie beside the database.
     artifacts = site.results / "mlartifacts/scene1"
     copies = artifacts / dae.info.run_id / "artifacts"
@@ -193,10 +195,10 @@ def test_changed_files_replace_a_run_and_another_config_supersedes_it(site):
         return {run.info.run_id: run.data.tags["superseded"] for run in site.runs()}
 
     site.track()
-    before = site.rows(), [run.to_dictionary() for run in site.runs()]
+    runs_before = site.rows(), [run.to_dictionary() for run in site.runs()]
     (site.dae / "dae.safetensors").touch()
     assert site.track() == {"dae": "unchanged", "pca_som": "unchanged"}
-    assert (site.rows(), [run.to_dictionary() for run in site.runs()]) == before
+    assert (site.rows(), [run.to_dictionary() for run in site.runs()]) == runs_before
     write_history(site.dae / "history.csv", [(1, 5e-5, 4e-5, 2.0), (2, 4e-5, 6e-5, 3.0)])
     assert site.track() == {"dae": "updated", "pca_som": "unchanged"}
     (run,) = site.runs()

@@ -101,7 +101,7 @@ def test_sigma_covers_the_errors(stars, data, fitted, noisy):
 
 
 def test_one_posterior_serves_both_references(data, fitted, noisy):
-    """That of the template is the mean of static PSFs, each of which is possible."""
+    """The estimate of the template is the mean of static PSFs, each of which is possible."""
     kind = fitted["wavefront_position"]
     for_templates = replace(kind, data=replace(data, reference="template"))
     position = data.positions[-TEST:][:4]

@@ -162,17 +162,17 @@ FITTED = {"baseline": 3, "train": 5}
 
 
 @pytest.mark.parametrize(
-    ("module", "repeated", "left"),
+    ("module", "repeated", "unchanged"),
     [
         ("psfdae/optics/propagation", {**SIMULATED, **FITTED, "evaluate": 5}, {}),
         ("psfdae_paper/evaluation/curves", {"figure_curves": 2}, {**SIMULATED, "evaluate": 5}),
     ],
 )
-def test_code_repeats_what_is_made_with_it_and_nothing_before(jobs, module, repeated, left):
+def test_code_repeats_what_is_made_with_it_and_nothing_before(jobs, module, repeated, unchanged):
     plan = jobs(f"src/{module}.py", "\nCHANGED = 1\n", "dataset3", "dataset7")
     assert plan == {**plan, **repeated}
     assert "track" in plan
-    assert not left.keys() & plan.keys()
+    assert not unchanged.keys() & plan.keys()
 
 
 @pytest.mark.slow
@@ -182,16 +182,16 @@ def test_keys_of_one_scene_leave_the_others_alone(smoke):
 
 
 @pytest.mark.parametrize(
-    ("target", "included", "others"),
+    ("target", "included", "excluded"),
     [
         ("dataset3", "dataset3", "dataset[1245678]|50pct|turbulence"),
         nightly("scene3", "alignment_network", "dataset[1-8]|seidel|turbulence"),
     ],
 )
-def test_a_target_lists_no_job_of_another(tmp_path, target, included, others):
+def test_a_target_lists_no_job_of_another(tmp_path, target, included, excluded):
     out = snakemake(tmp_path, "--dry-run", target)
     assert included in out
-    assert not re.search(others, out)
+    assert not re.search(excluded, out)
 
 
 # Refusals

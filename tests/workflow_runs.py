@@ -22,14 +22,14 @@ KERNELS = {
     for name, value in os.environ.items()
     if name.startswith("OPENBLAS_") and "THREADS" not in name
 }
-"""What chooses the kernels of linear algebra; like another processor it changes last digits."""
+"""Variable that chooses the kernels of linear algebra, which changes last digits."""
 
 
-def environment(**more):
+def environment(**variables):
     """The environment of a run, without what `make test` has in its own."""
     dropped = ("PSFDAE_RESULTS", "MAKEFLAGS", "MAKELEVEL")
     inherited = {key: value for key, value in os.environ.items() if key not in dropped}
-    return {**inherited, "PATH": PATH, **more}
+    return {**inherited, "PATH": PATH, **variables}
 
 
 def captured(args, **options):
@@ -51,14 +51,18 @@ def clone(folder):
     environment_of_make = Path(sys.prefix)
     if not (environment_of_make / ".complete").is_file():
         pytest.skip("the environment is not make's")
-    made = shutil.ignore_patterns(
+    patterns = shutil.ignore_patterns(
         *(".*_cache", ".cache", ".git", ".snakemake", ".venv*"),
         *("__pycache__", "dist", "site"),
     )
 
     def ignored(place, names):
         # Times are kept, so that make finds its environment newer than the lock file.
-        return set(names) - {"reference"} if Path(place) == ROOT / "results" else made(place, names)
+        return (
+            set(names) - {"reference"}
+            if Path(place) == ROOT / "results"
+            else patterns(place, names)
+        )
 
     shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
     (folder / ".venv").symlink_to(environment_of_make)

@@ -18,6 +18,7 @@ terminal, long calls show a bar of their progress. Refusals are of the class `Er
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -82,7 +83,9 @@ if not TYPE_CHECKING:  # for a type checker, a module with this function has eve
         """Import a public name on first use (PEP 562): nobody waits for what is not used."""
         if name in _MODULES:
             return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        # Python names the attribute that is like it, if it knows where it was looked for.
+        text = f"module {__name__!r} has no attribute {name!r}"
+        raise AttributeError(text, name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""What the stress tests share: settings, stars, error budgets, small trainings."""
+"""Common parts of the stress tests: settings, stars, error budgets, small trainings."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,7 +35,7 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What every case gets: the configuration of dataset 3, stars, scratch space."""
+    """Input of every case: the configuration of dataset 3, stars, scratch space."""
 
     config: Any
     seidel: Scene
@@ -82,8 +82,8 @@ class Bench:
     def training_set(self, count):
         """The first stars of scene 1 against themselves; one in ten validates."""
         images = self.seidel.images[:count]
-        held, levels = max(1, len(images) // 10), np.asarray(self.config.noise.levels)
-        parts = np.arange(held, len(images)), np.arange(held)
+        validation_count, levels = max(1, len(images) // 10), np.asarray(self.config.noise.levels)
+        parts = np.arange(validation_count, len(images)), np.arange(validation_count)
         return TrainingSet(images, images, *parts, levels, self.noise)
 
 

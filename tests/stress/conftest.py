@@ -59,12 +59,12 @@ class Record:
         """Both print alike; for counts, names and flags."""
         self.row(case, quantity, expected, measured, str(measured) == str(expected))
 
-    def one_of(self, case, quantity, measured, *allowed):
-        self.row(case, quantity, " or ".join(allowed), measured, measured in allowed)
+    def one_of(self, case, quantity, measured, *values):
+        self.row(case, quantity, " or ".join(values), measured, measured in values)
 
     @contextmanager
     def refused(self, case, error):
-        """What is done inside raises `error`."""
+        """Check that the block raises `error`."""
         outcome, passed = "no error", False
         try:
             yield
@@ -90,14 +90,14 @@ def record(request):
 
 @pytest.fixture(scope="package")
 def bench(request):
-    """What every case works with."""
+    """Input of every case."""
     # A run of all tests does not know the options.
-    given = {name: request.config.getoption(name, None) for name in OPTIONS}
+    options = {name: request.config.getoption(name, None) for name in OPTIONS}
     smoke = [load([f"dataset={name}", "preset=smoke"]) for name in ("dataset3", "dataset8")]
-    settings = load_settings(Path(given["settings"]), READS) if given["settings"] else smoke[0]
+    settings = load_settings(Path(options["settings"]), READS) if options["settings"] else smoke[0]
     with TemporaryDirectory() as folder, threadpool_limits(THREADS):
         torch.set_num_threads(1)
-        scenes = map(_scene, (given["stars"], given["turbulence"]), smoke, [Path(folder)] * 2)
+        scenes = map(_scene, (options["stars"], options["turbulence"]), smoke, [Path(folder)] * 2)
         yield Bench(settings, *scenes, Path(folder))
 
 
@@ -125,13 +125,13 @@ def pytest_runtest_setup(item):
 def pytest_runtest_call(item):
     """A test fails if a row does."""
     rows = item.config.stash[RECORD].rows
-    before = len(rows)
+    first_row = len(rows)
     # What a broken input does to intermediate numbers is not the point here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
-    said = "{1}: {2}: expected {3}, got {4}"
-    if failed := [said.format(*row) for row in rows[before:] if row[-1] == "fail"]:
+    sentence = "{1}: {2}: expected {3}, got {4}"
+    if failed := [sentence.format(*row) for row in rows[first_row:] if row[-1] == "fail"]:
         pytest.fail("\n".join(failed), pytrace=False)
 
 

@@ -95,7 +95,7 @@ def train(bench, data, settings):
 
 
 def fate(bench, *settings):
-    """What becomes of a training, in words."""
+    """Outcome of a training, in words."""
     try:
         outcome = train(bench, *settings)
     except Exception as error:  # which one is the question

@@ -20,8 +20,8 @@ def test_noisy_sum(bench, record, scene, level):
     stars, model = bench.test_stars(scene), bench.flux_models[scene]
     sampling = SIGMAS / np.sqrt(2 * len(stars))
     images = bench.noise.draw(stars, level, bench.stream("flux", scene, f"{level:.6g}"))
-    sky, own = bench.noise.kappa * level, 1.0 / float(bench.noise.flux(level))
-    expected = np.sqrt(stars[0].size * sky**2 + own)
+    sky, photon_noise = bench.noise.kappa * level, 1.0 / float(bench.noise.flux(level))
+    expected = np.sqrt(stars[0].size * sky**2 + photon_noise)
     # A star of known PSF and unknown flux cannot be measured better than this (Cramér–Rao).
     limit = rms(sky / np.sqrt((stars.astype(np.float64) ** 2).sum(axis=(1, 2))))
     by_sum = rms(images.sum(axis=(1, 2), dtype=np.float64) - 1)
@@ -30,8 +30,8 @@ def test_noisy_sum(bench, record, scene, level):
     if level == 3e-4:
         record.within(case, "relative error of the noisy sum", by_sum, expected * low, high)
     # From a noise level of 1e-3, the robust flux must beat the sum.
-    most = by_sum * low if level >= 1e-3 else high
-    record.within(case, "relative error of the robust flux", robust, limit * low, most)
+    rms_limit = by_sum * low if level >= 1e-3 else high
+    record.within(case, "relative error of the robust flux", robust, limit * low, rms_limit)
     record.point(f"{scene}, noisy sum", level, by_sum, expected)
     record.point(f"{scene}, robust flux", level, robust, expected)
 
@@ -39,25 +39,27 @@ def test_noisy_sum(bench, record, scene, level):
 def test_broken_stars(bench, record):
     """One broken star in a batch: its flags, its flux and its neighbours."""
     good = bright_stars(bench, 8)
-    before, star, middle = measured(bench, good), good[3], good.shape[-1] // 2
-    beside, alike, shifts = (middle + 2, middle - 1), [], []
-    for what, broken, flags in (
+    intact, star, middle = measured(bench, good), good[3], good.shape[-1] // 2
+    neighbour_px, equal_arrays, shifts = (middle + 2, middle - 1), [], []
+    for defect, broken, flags in (
         ("with negative sum", -star, "OUTLIER+NO_FLUX"),
         ("of a single photon and no sky", put(0 * star, (middle, middle), 1), "OUTLIER+NO_FLUX"),
         ("with all NaN", put(star, ..., np.nan), "MASKED+NO_FLUX"),
-        ("with a NaN", put(star, beside, np.nan), "MASKED"),
-        ("with a pixel of 1e30", put(star, beside, 1e30), "OUTLIER"),
+        ("with a NaN", put(star, neighbour_px, np.nan), "MASKED"),
+        ("with a pixel of 1e30", put(star, neighbour_px, 1e30), "OUTLIER"),
     ):
-        found = measured(bench, put(good, 3, broken))
-        record.equal(f"star {what}", "flags", names(found.flags[3]), flags)
-        others = ([np.delete(x, 3, axis=0) for x in (m.images, m.flux)] for m in (found, before))
-        alike += map(np.array_equal, *others)
+        photometry = measured(bench, put(good, 3, broken))
+        record.equal(f"star {defect}", "flags", names(photometry.flags[3]), flags)
+        intact_stars = (
+            [np.delete(x, 3, axis=0) for x in (m.images, m.flux)] for m in (photometry, intact)
+        )
+        equal_arrays += map(np.array_equal, *intact_stars)
         if "NO_FLUX" in flags:
-            alike.append(not found.images[3].any())
+            equal_arrays.append(not photometry.images[3].any())
         else:
-            shifts.append(abs(found.flux[3] - before.flux[3]) / found.flux_error[3])
+            shifts.append(abs(photometry.flux[3] - intact.flux[3]) / photometry.flux_error[3])
     case = "broken stars"
-    record.equal(case, "image zero without flux, neighbours bit by bit", all(alike), True)
+    record.equal(case, "image zero without flux, neighbours bit by bit", all(equal_arrays), True)
     # A few pixels less cost no more than the error that the estimate states.
     record.at_most(case, "change of the flux over its error", max(shifts), 2)
 
@@ -73,14 +75,17 @@ def test_hot_pixels(bench, record):
     """One pixel off the core too bright by 1e-3 … 1e6 times the star's flux."""
     model, stars = bench.flux_models["seidel"], bench.test_stars()
     images = bench.noise.draw(stars, bench.level, bench.stream("hot pixel")).astype(np.float64)
-    usual = rms(robust_flux(images, model).flux - 1)
+    clean_rms = rms(robust_flux(images, model).flux - 1)
     # An excess that hides in the range of the training set counts in full at most.
     tolerated = model.pixel_range[1].reshape(stars.shape[1:])[3, 4]
     hidden = tolerated + (FluxModel.clip_sigma + SIGMAS) * bench.noise.kappa * bench.level
     for excess in (1e-2, 1.0, 1e6):
         hot = put(images, (slice(None), 3, 4), images[:, 3, 4] + excess)
         robust, by_sum = rms(robust_flux(hot, model).flux - 1), rms(hot.sum(axis=(1, 2)) - 1)
-        case, bound = f"hot pixel of {excess:g} times", np.hypot(1.1 * usual, min(excess, hidden))
+        case, bound = (
+            f"hot pixel of {excess:g} times",
+            np.hypot(1.1 * clean_rms, min(excess, hidden)),
+        )
         record.at_most(f"{case} the flux", "error of the flux", robust, bound)
         record.point("hot pixel, noisy sum", excess, by_sum, bound)
         record.point("hot pixel, robust flux", excess, robust, bound)

@@ -18,8 +18,10 @@ def test_kernel(bench, record, scene, number):
     config = getattr(bench, scene).config
     if scene == "seidel":
         field = relative_field(config.grid)
-        some = field[:: max(1, len(field) // 12)]
-        source = seidel_wavefronts(np.tile(config.wavefront.coefficients, (len(some), 1)), some)
+        sampled_fields = field[:: max(1, len(field) // 12)]
+        source = seidel_wavefronts(
+            np.tile(config.wavefront.coefficients, (len(sampled_fields), 1)), sampled_fields
+        )
     else:
         source = template_wavefronts(changed(config, grid={"points": 3}))
     reach, stamp_px = config.framing.search_px, config.framing.stamp_px

@@ -26,8 +26,11 @@ def test_streams(bench, record):
     seed = bench.config.seed
     every = [(s, *name) for s in (seed, seed + 1) for name in names]
     first = [int(stream(*name).integers(2**63)) for name in every]
-    case, alike = f"{len(first)} random streams", sum(a == b for a, b in combinations(first, 2))
-    record.equal(case, "pairs that start alike", alike, 0)
+    case, equal_pairs = (
+        f"{len(first)} random streams",
+        sum(a == b for a, b in combinations(first, 2)),
+    )
+    record.equal(case, "pairs that start alike", equal_pairs, 0)
     draws = np.stack([stream(seed, *name).standard_normal(1000) for name in names])
     largest = np.abs(np.corrcoef(draws) - np.eye(len(draws))).max()
     # Correlations of n independent normal draws scatter by 1/√n; the largest of k by √(2 ln k).

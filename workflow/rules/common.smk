@@ -1,3 +1,4 @@
+import atexit
 import os
 import shlex
 import sys
@@ -10,6 +11,7 @@ from inspect import getdoc
 from snakemake.report.common import data_uri_from_file
 from snakemake.utils import validate
 
+from psfdae.base.errors import did_you_mean
 from psfdae.base.files import ProductError, as_yaml, write_text
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError
@@ -55,6 +57,12 @@ config = {
     **(finished_run(CHOSEN_FOLDER) if CHOSEN_FOLDER else {}),
     **{key: value for key, value in config.items() if value},
 }
+schema = read_yaml(Path(workflow.source_path("../schemas/command_line.schema.yaml")))
+for word in set(config) - set(schema["properties"]):
+    hint = did_you_mean(word, schema["properties"])
+    sys.exit(
+        f"psfdae: --config {word}: there are {', '.join(schema['properties'])}{hint}"
+    )
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]

@@ -1,6 +1,7 @@
-"""The class of all refusals; where a package of an extra is missing, a line says which extra.
+"""The class of all refusals, and the words in which they name settings and missing packages.
 
-Everything that psfdae refuses is an `Error` with one line; a bug is any other exception.
+Everything that psfdae refuses is an `Error` with one line; a bug is any other exception. A line
+names keywords (`snr_min=20`) in Python, and options (`--snr-min 20`) in a command.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from difflib import get_close_matches
 from importlib.metadata import PackageNotFoundError, distribution, requires
 from pathlib import Path
@@ -30,6 +32,50 @@ class Error(Exception):
 
 class MissingExtraError(Error, ImportError):
     """A package of an extra is not installed; one line says which, and how to install it."""
+
+
+_in_command: ContextVar[bool] = ContextVar("in_command", default=False)
+
+
+@contextmanager
+def words_of_a_command() -> Iterator[None]:
+    """Make lines name options and commands meanwhile, in place of keywords and calls."""
+    token = _in_command.set(True)
+    try:
+        yield
+    finally:
+        _in_command.reset(token)
+
+
+def keyword(name: str, value: object = None) -> str:
+    """Return what a user types to state something: a keyword of Python, or an option.
+
+    Parameters
+    ----------
+    name : str
+        Name of the keyword.
+    value : object, optional
+        What is to be stated; True is an option without a value.
+
+    Examples
+    --------
+    >>> keyword("snr_min", 20), keyword("detect", True), keyword("mask")
+    ('snr_min=20', 'detect=True', 'mask=')
+    >>> with words_of_a_command():
+    ...     keyword("snr_min", 20), keyword("detect", True), keyword("pixel_scale_arcsec")
+    ('--snr-min 20', '--detect', '--pixel-scale')
+    """
+    number = f"{value:.6g}" if isinstance(value, float) else None
+    if not _in_command.get():
+        return f"{name}=" if value is None else f"{name}={number or repr(value)}"
+    # Options have no units in their names.
+    option = f"--{name.removesuffix('_arcsec').replace('_', '-')}"
+    return option if value is None or value is True else f"{option} {number or value}"
+
+
+def call(python: str, command: str) -> str:
+    """Return a call of Python, or in a command the command that does the same."""
+    return command if _in_command.get() else python
 
 
 @contextmanager
@@ -98,8 +144,19 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
     Names whose last part is the word's are the likeliest: train.lr for lr. Others are alike in
     their letters.
     """
-    names = [name for name in names if name != word]
+    names = [str(name) for name in names if name != word]
     last_part = word.rpartition(".")[2]
     alike = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
     alike = sorted(alike, key=len) or get_close_matches(word, names, n=1)
     return f"; did you mean {' or '.join(alike[:3])}?" if alike else ""
+
+
+def no_such_file(path: Path) -> str:
+    """Return the line that refuses a file which does not exist, with one of its folder like it."""
+    try:
+        names = [neighbour.name for neighbour in path.parent.iterdir()]
+    except OSError:
+        return f"{path}: no such file, nor is there a folder {path.parent}"
+    # File names are alike in their letters: parts between dots have no meaning of their own.
+    alike = get_close_matches(path.name, names, n=1)
+    return f"{path}: no such file" + "".join(f"; did you mean {name}?" for name in alike)

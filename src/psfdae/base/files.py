@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, no_such_file
 from psfdae.base.version import __version__
 
 if TYPE_CHECKING:
@@ -338,7 +338,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
             arrays = {name: file[name][()] for name in names}
             return Product(path, json.loads(file.attrs["config"]), arrays, kind)
     except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
+        raise ProductError(no_such_file(path)) from None
     except (OSError, KeyError, ValueError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
 

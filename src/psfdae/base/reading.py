@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from psfdae.base.errors import no_such_file
 from psfdae.base.files import ProductError
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def _text(path: Path) -> str:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
+        raise ProductError(no_such_file(path)) from None
     except OSError as error:
         raise ProductError(f"{path}: {error.strerror}") from None
     try:
@@ -145,7 +146,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     *columns : str
         Names of columns that it must have.
     **options
-        Options of pandas.
+        Options of `pandas.read_csv`.
 
     Raises
     ------
@@ -158,7 +159,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     try:
         table: DataFrame = pd.read_csv(path, **options)
     except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
+        raise ProductError(no_such_file(path)) from None
     except (ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -36,7 +36,7 @@ CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
 class Group(BaseModel):
     """Group of settings: immutable, and without keys beyond those that it declares."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 Config = Any
@@ -81,8 +81,10 @@ def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     """Yield the dotted keys of a pydantic model, those of its groups after each group's name."""
     for name, field in model.model_fields.items():
         yield prefix + name
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Group):
-            yield from keys_of(field.annotation, f"{prefix}{name}.")
+        # A group may be one of several classes.
+        for group in (field.annotation, *get_args(field.annotation)):
+            if isinstance(group, type) and issubclass(group, Group):
+                yield from keys_of(group, f"{prefix}{name}.")
 
 
 def _line(error: Mapping[str, Any], keys: Iterable[str]) -> str:
@@ -150,39 +152,36 @@ Seed = Annotated[int, Field(ge=0, lt=2**63)]
 class Stamp(Group):
     """Size and centring of stamps."""
 
-    stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)] = Field(
-        16, description="Side d of a stamp"
-    )
-    jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
-        1, description="Centring error, uniform in ± this many whole pixels per axis"
-    )
-    subpixel: bool = Field(
-        True,
-        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars",
-    )
+    stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)] = 16
+    """Side d of a stamp."""
+    jitter_px: Annotated[int, Field(ge=0, le=8)] = 1
+    """Centring error, uniform in ± this many whole pixels per axis."""
+    subpixel: bool = True
+    """Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars."""
 
 
 class Noise(Group):
     """Noise band: the levels λ that one dataset mixes."""
 
-    name: Name = Field(description="For titles and messages")
-    levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Noise levels λ of the paper"
-    )
-    kappa: Positive = Field(description="Pixel RMS of the normalised image per unit of λ")
-    background_photons: Annotated[float, Field(gt=0, le=1e12)] = Field(
-        description="Sky photons per pixel"
-    )
+    name: Name
+    """Name in titles and messages."""
+    levels: Annotated[list[Positive], Field(min_length=1)]
+    """Noise levels λ of the paper."""
+    kappa: Positive
+    """Pixel RMS of the normalised image per unit of λ."""
+    background_photons: Annotated[float, Field(gt=0, le=1e12)]
+    """Sky photons per pixel."""
 
 
 class Parts(Group):
     """Sizes of the training, validation and test parts."""
 
-    train_stars: Count = Field(3000, description="Training stars, validation included")
-    test_stars: Count = Field(300, description="Test stars of the random split")
-    validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = Field(
-        0.1, description="Part of the training stars that selects the best state"
-    )
+    train_stars: Count = 3000
+    """Training stars, validation included."""
+    test_stars: Count = 300
+    """Test stars of the random split."""
+    validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Part of the training stars that selects the best state."""
 
 
 # Settings that a function needs, by what of them it uses: the class of all settings is made when
@@ -208,9 +207,12 @@ class OfFit(WithNoise, Protocol):
 class Evaluation(Group):
     """Settings of image metrics and of the restoration of test stars."""
 
-    data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
-    batch: Count = Field(256, description="Stars per forward pass")
-    threads: Count = Field(1, description="Threads of the linear algebra")
+    data_range: Positive = 0.66
+    """SSIM dynamic range fitted to the paper's rows."""
+    batch: Count = 256
+    """Stars per forward pass."""
+    threads: Count = 1
+    """Threads of the linear algebra."""
 
 
 class OfTest(OfFit, Protocol):
@@ -223,47 +225,32 @@ class OfTest(OfFit, Protocol):
 class CalibrationStars(Group):
     """Choice of the stars of an image as training data, and the noise that they get."""
 
-    snr_min: Positive | None = Field(
-        None,
-        description="Least S/N of a star that is learnt from; null: 100, and lower, down to 10, "
-        "where fewer than 20 stars have that",
-    )
-    isolation_px: Positive = Field(
-        12.0, description="Distance within which a neighbour is too close"
-    )
-    neighbour_ratio: Positive = Field(
-        0.02,
-        description="Brightness of such a neighbour, in that of the star, from which it disturbs",
-    )
-    misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = Field(
-        2.5, description="Difference of a misfit from the nearest stars, in that of the median star"
-    )
-    search_px: Annotated[int, Field(ge=1, le=16)] = Field(
-        3, description="The brightest pixel is searched within ± this of the catalogue's position"
-    )
-    margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
-        8, description="Pixels around a stamp, in which the sky is measured"
-    )
-    stars_min: Annotated[int, Field(ge=1)] = Field(1, description="Fewest stars to learn from")
-    light_min: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.95,
-        description="Part of a star's light that stamps hold at least: where those of "
-        "framing.stamp_px hold less, they are as wide as 98 % take. A stamp_px that is stated "
-        "is taken as it is; so it is with 0",
-    )
-    centring_px: Annotated[float, Field(ge=0, le=64)] | None = Field(
-        None,
-        description="FWHM of the Gaussian that smooths a star before its brightest pixel is "
-        "searched; null: that of the stars, where their brightest pixels are off their middle",
-    )
-    bins: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="Parts of the field along a side; stars of a part are stacked"
-    )
-    snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        [5.0, 10.0, 20.0, 50.0],
-        description="S/N to which bright stars are degraded, ascending; those above snr_min / 2, "
-        "where the stars' own noise would count, are that",
-    )
+    snr_min: Positive | None = None
+    """Least S/N of a star that is learnt from; null: 100, and lower, down to 10, where fewer than
+    20 stars have that."""
+    isolation_px: Positive = 12.0
+    """Distance within which a neighbour is too close."""
+    neighbour_ratio: Positive = 0.02
+    """Brightness of such a neighbour, in that of the star, from which it disturbs."""
+    misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 2.5
+    """Difference of a misfit from the nearest stars, in that of the median star."""
+    search_px: Annotated[int, Field(ge=1, le=16)] = 3
+    """The brightest pixel is searched within ± this of the catalogue's position."""
+    margin_px: Annotated[int, Field(ge=0, le=64)] = 8
+    """Pixels around a stamp, in which the sky is measured."""
+    stars_min: Annotated[int, Field(ge=1)] = 1
+    """Fewest stars to learn from."""
+    light_min: Annotated[float, Field(ge=0, lt=1)] = 0.95
+    """Part of a star's light that stamps hold at least: where those of framing.stamp_px hold less,
+    they are as wide as 98 % take. A stamp_px that is stated is taken as it is; so it is with 0."""
+    centring_px: Annotated[float, Field(ge=0, le=64)] | None = None
+    """FWHM of the Gaussian that smooths a star before its brightest pixel is searched; null: that
+    of the stars, where their brightest pixels are off their middle."""
+    bins: Annotated[int, Field(ge=1, le=64)] = 4
+    """Parts of the field along a side; stars of a part are stacked."""
+    snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field([5.0, 10.0, 20.0, 50.0])
+    """S/N to which bright stars are degraded, ascending; those above snr_min / 2, where the stars'
+    own noise would count, are that."""
 
     @model_validator(mode="after")
     def _levels(self) -> CalibrationStars:

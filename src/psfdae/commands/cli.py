@@ -36,7 +36,7 @@ from typing import (
 
 import click
 
-from psfdae.base.errors import Error, did_you_mean, install_line, missing
+from psfdae.base.errors import Error, did_you_mean, install_line, missing, words_of_a_command
 from psfdae.base.joined import joined
 from psfdae.base.progress import displayed_by
 from psfdae.base.version import __version__
@@ -64,9 +64,10 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
     """Make a function the command `psfdae NAME`.
 
     Parameters of the function are options: required without a default, repeatable as
-    `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a
-    click type, or a dict of what click's option takes, where "flag" names it and "argument" makes
-    it positional. Help is the docstring.
+    `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated` adds a click type, or a
+    dict of what click's option takes, where "flag" names it and "argument" makes it positional.
+    Help of the command is the docstring; that of an option is its entry under Parameters, or a text
+    in `Annotated`.
 
     Parameters
     ----------
@@ -189,6 +190,11 @@ class SettingsCommand(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; `--quiet` is no parameter of its function."""
+        with words_of_a_command():
+            return self.invoke_displayed(ctx)
+
+    def invoke_displayed(self, ctx: click.Context) -> Any:
+        """Run the command with its progress and summary, or without them if it is quiet."""
         if not ctx.params.pop("quiet"):
             with displayed_by(bar_or_lines):
                 return super().invoke(ctx)
@@ -303,6 +309,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     """Return the click command of a function that `command` has marked."""
     spec: Stage = function.stage  # type: ignore[attr-defined]
     # Parameters of the function are options; a dataclass has an option for each of its fields.
+    help_text, meanings = described_parameters(function)
     dataclasses: dict[str, Any] = {}
     parameters: list[click.Parameter] = []
     for name, hint, default in _parameters(function):
@@ -312,7 +319,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
             dataclasses[name] = hint
             parameters += [_option(*field) for field in _parameters(hint)]
         else:
-            parameters.append(_option(name, hint, default))
+            parameters.append(_option(name, hint, default, meanings.get(name)))
     # A parameter `config` comes from a file, or from words group.key=value.
     read_settings = spec.settings if "config" in signature(function).parameters else None
     if read_settings is not None:
@@ -339,11 +346,18 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         function(**config, **values)
 
     # The last word is the command's own; the others are those of its groups.
-    help_text = cleandoc(function.__doc__ or "")
     word = spec.name.split()[-1]
     click_command = SettingsCommand(word, callback=run, params=parameters, help=help_text)
     click_command.foreign_options = getattr(spec.settings, "foreign_options", {})
     return click_command
+
+
+def described_parameters(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """Return the docstring of a function up to its parameters, and their meanings by name."""
+    # In numpydoc's form a name begins a line, and its meaning is indented below it.
+    text, _, section = cleandoc(function.__doc__ or "").partition("\n\nParameters\n----------\n")
+    entries = re.findall(r"^(\w+) : .*((?:\n +.*)+)", section, re.MULTILINE)
+    return text, {name: " ".join(meaning.split()) for name, meaning in entries}
 
 
 def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> Sequence[str]:
@@ -401,11 +415,12 @@ def _parameters(function: Any) -> list[tuple[str, Any, Any]]:
     return [(name, hints.get(name, Any), p.default) for name, p in parameters.items()]
 
 
-def _option(name: str, hint: Any, default: Any) -> click.Parameter:
+def _option(name: str, hint: Any, default: Any, meaning: str | None = None) -> click.Parameter:
     """Return click's option or argument for a parameter of a function; see `command`."""
     # What the annotation says overrules what follows from the type.
     value_type, attributes = _click_type(hint)
     attributes = {"type": value_type, **attributes}
+    attributes |= {"help": meaning} if meaning else {}
     if value_type is bool:
         attributes |= {"type": None, "is_flag": True}
     # A parameter without a default must be given.

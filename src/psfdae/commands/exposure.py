@@ -16,14 +16,23 @@ from psfdae.model.psf_model import load_model
 def exposure_command(
     image: Annotated[File, {"argument": True}],
     options: ImageStatements,
-    overwrite: Annotated[bool, "Replace a file that exists."] = False,
+    overwrite: bool = False,
     *,
-    model: Annotated[File, "Bundle of from-stars --method field, of another exposure."],
-    out: Annotated[File, "Bundle of IMAGE, by custom NAME.psf.safetensors."],
+    model: File,
+    out: File,
 ) -> None:
     """Adapt MODEL to IMAGE, another exposure of the same camera with few bright stars.
 
     The stars of IMAGE show how its PSF differs from that of MODEL; ten may be enough.
+
+    Parameters
+    ----------
+    overwrite : bool
+        Replace a file that exists.
+    model : Path
+        Bundle of from-stars --method field, of another exposure.
+    out : Path
+        Bundle of IMAGE, by custom NAME.psf.safetensors.
     """
     # Refuse wrong options and files that exist before anything is computed.
     source = ImageInput(image, **vars(options))

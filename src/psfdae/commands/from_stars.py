@@ -112,36 +112,47 @@ def from_stars(
     config: Settings | Mapping[str, Any],
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
     options: ImageStatements,
-    all_extensions: Annotated[
-        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
-    ] = False,
-    name: Annotated[str | None, "Name of the model.  [default: the image's; all]"] = None,
-    licence: Annotated[str, "Licence of the model."] = "not stated",
-    method_name: Annotated[
-        str | None,
-        {"flag": "--method"},
-        "Method of the model.  [default: the one with the smallest error on validation stars; of "
-        "several images field]",
-    ] = None,
+    all_extensions: bool = False,
+    name: str | None = None,
+    licence: str = "not stated",
+    method_name: Annotated[str | None, {"flag": "--method"}] = None,
     *,
-    out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
-    page: Annotated[
-        File | None, {"flag": "--report"}, "HTML page that shows whether to trust the model."
-    ] = None,
-    overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
-    snr_min: Annotated[
-        float | None, "Least S/N of a star that is learnt from.  [default: 100, less if few]"
-    ] = None,
-    stars_min: Annotated[int | None, "Fewest stars to learn from.  [default: 1]"] = None,
-    stamp_px: Annotated[
-        int | None, "Side of the stamps, even.  [default: 16, more if stars are larger]"
-    ] = None,
+    out: Folder,
+    page: Annotated[File | None, {"flag": "--report"}] = None,
+    overwrite: bool = False,
+    snr_min: float | None = None,
+    stars_min: int | None = None,
+    stamp_px: int | None = None,
 ) -> str:
     """Train a model on the bright stars of IMAGE.
 
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
+
+    Parameters
+    ----------
+    all_extensions : bool
+        All images of the file, each by itself and in parallel; OUT gets their names.
+    name : str, optional
+        Name of the model. [default: the image's; all]
+    licence : str
+        Licence of the model.
+    method_name : str, optional
+        Method of the model. [default: the one with the smallest error on validation stars; of
+        several images field]
+    out : Path
+        Folder for the model, its report and what they are made of.
+    page : Path, optional
+        HTML page that shows whether to trust the model.
+    overwrite : bool
+        Replace a model that the folder holds.
+    snr_min : float, optional
+        Least S/N of a star that is learnt from. [default: 100, less if few]
+    stars_min : int, optional
+        Fewest stars to learn from. [default: 1]
+    stamp_px : int, optional
+        Side of the stamps, even. [default: 16, more if stars are larger]
     """
     job = dict(locals())
     # The three options of the selection are settings of the configuration by shorter names.

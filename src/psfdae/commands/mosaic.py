@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, words_of_a_command
 from psfdae.base.threads import available_cores
 from psfdae.commands.cli import refusal
 from psfdae.image.errors import ObservationError
@@ -107,7 +107,8 @@ def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool
     """
     with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:
-            return True, work(**job)
+            with words_of_a_command():
+                return True, work(**job)
         except Exception as error:
             message = refusal(error)
             if message is None:

@@ -20,20 +20,37 @@ from psfdae.model.image_photometry import PhotometryError, photometry_of_image
 def photometry_command(
     image: Annotated[File, {"argument": True}],
     options: ImageStatements,
-    zero_point: Annotated[float | None, "Magnitude of a flux of 1."] = None,
-    reference: Annotated[File | None, "Star list with magnitudes, which give it."] = None,
-    magnitude_column: Annotated[str, "Column of --reference with the magnitudes."] = "mag",
-    residual: Annotated[File | None, "FITS image without its sky and stars."] = None,
-    overwrite: Annotated[bool, "Replace files that exist."] = False,
+    zero_point: float | None = None,
+    reference: File | None = None,
+    magnitude_column: str = "mag",
+    residual: File | None = None,
+    overwrite: bool = False,
     *,
-    model: Annotated[File, "Bundle of from-stars --method field, or .psf of PSFEx, of this image."],
-    out: Annotated[File, "Table of the stars: .fits, .ecsv or .csv."],
+    model: File,
+    out: File,
 ) -> None:
     """Measure the fluxes of all stars of IMAGE, overlapping ones together.
 
     --detect finds the stars, and in a second round those that brighter ones hide; those of
     --catalogue are measured where it says, and no others. Fluxes have the light beyond the
     stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
+
+    Parameters
+    ----------
+    zero_point : float, optional
+        Magnitude of a flux of 1.
+    reference : Path, optional
+        Star list with magnitudes, which give it.
+    magnitude_column : str
+        Column of --reference with the magnitudes.
+    residual : Path, optional
+        FITS image without its sky and stars.
+    overwrite : bool
+        Replace files that exist.
+    model : Path
+        Bundle of from-stars --method field, or .psf of PSFEx, of this image.
+    out : Path
+        Table of the stars: .fits, .ecsv or .csv.
     """
     # Refuse outputs that exist, or have a format that is not written.
     if out.suffix.lower() not in SUFFIXES:

@@ -42,34 +42,43 @@ def write_list(observation: Observation, path: Path) -> None:
 def predict_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
     options: ImageStatements,
-    all_extensions: Annotated[
-        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
-    ] = False,
-    flux_column: Annotated[
-        str | None, "Fluxes inside the stamp; estimated where not given."
-    ] = None,
-    background_column: Annotated[
-        str | None, "Sky levels per pixel; estimated where not given."
-    ] = None,
-    fixed_positions: Annotated[
-        bool, "The star list's centres are exact; for models that measure centres (field)."
-    ] = False,
-    model: Annotated[
-        Path | None,
-        click.Path(path_type=Path),
-        "Model bundle, or folder of from-stars.  [default: the shipped one]",
-    ] = None,
-    plot: Annotated[File | None, "PNG with a map of the PSF over the field."] = None,
-    overwrite: Annotated[bool, "Replace files that exist."] = False,
-    threads: Annotated[int | None, click.IntRange(min=1), "[default: all cores]"] = None,
+    all_extensions: bool = False,
+    flux_column: str | None = None,
+    background_column: str | None = None,
+    fixed_positions: bool = False,
+    model: Annotated[Path | None, click.Path(path_type=Path)] = None,
+    plot: File | None = None,
+    overwrite: bool = False,
+    threads: Annotated[int | None, click.IntRange(min=1)] = None,
     *,
-    out: Annotated[File, "FITS file for PSFs, residuals, uncertainties and a table of stars."],
+    out: File,
 ) -> str:
     """Predict the PSFs of the stars in INPUT.
 
     INPUT is a FITS cube of stamps, or a FITS image with --catalogue or --detect.
     Stars are flagged, never dropped. Files that cannot be used end with one line
     and exit code 2.
+
+    Parameters
+    ----------
+    all_extensions : bool
+        All images of the file, each by itself and in parallel; OUT gets their names.
+    flux_column : str, optional
+        Fluxes inside the stamp; estimated where not given.
+    background_column : str, optional
+        Sky levels per pixel; estimated where not given.
+    fixed_positions : bool
+        The star list's centres are exact; for models that measure centres (field).
+    model : Path, optional
+        Model bundle, or folder of from-stars. [default: the shipped one]
+    plot : Path, optional
+        PNG with a map of the PSF over the field.
+    overwrite : bool
+        Replace files that exist.
+    threads : int, optional
+        [default: all cores]
+    out : Path
+        FITS file for PSFs, residuals, uncertainties and a table of stars.
     """
     if all_extensions:
         # Images are worked on side by side, each by one thread, with its own model and outputs.

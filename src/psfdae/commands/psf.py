@@ -19,14 +19,12 @@ from psfdae.model.field_psfs import FieldPsfs, PredictionError
 @command("psf")
 def psf(
     model: Annotated[File, {"argument": True}],
-    at: Annotated[tuple[str, ...], "X,Y of a place, 0-based pixels; again for more."] = (),
-    grid: Annotated[str | None, "COLUMNSxROWS of places over the field of the training."] = None,
-    oversampling: Annotated[
-        int | None, click.IntRange(1, 32), "Values per pixel and axis.  [default: 4, of NAME.psf 8]"
-    ] = None,
-    overwrite: Annotated[bool, "Replace a file that exists."] = False,
+    at: tuple[str, ...] = (),
+    grid: str | None = None,
+    oversampling: Annotated[int | None, click.IntRange(1, 32)] = None,
+    overwrite: bool = False,
     *,
-    out: Annotated[File, "FITS cube for photutils, NAME.stdpsf.fits, or NAME.psf as of PSFEx."],
+    out: File,
 ) -> None:
     """Write the PSFs of MODEL, of from-stars --method field or of PSFEx, at places of the image.
 
@@ -34,6 +32,19 @@ def psf(
     a pixel. The header names the places, y before x, as the files of STScI's STPSF do; photutils
     3.1 reads one, or a grid. A grid in NAME.stdpsf.fits is as STScI's STDPSF, which older releases
     read, too. NAME.psf has the whole field, for SExtractor and other readers of PSFEx's models.
+
+    Parameters
+    ----------
+    at : sequence of str
+        X,Y of a place, 0-based pixels; again for more.
+    grid : str, optional
+        COLUMNSxROWS of places over the field of the training.
+    oversampling : int, optional
+        Values per pixel and axis. [default: 4, of NAME.psf 8]
+    overwrite : bool
+        Replace a file that exists.
+    out : Path
+        FITS cube for photutils, NAME.stdpsf.fits, or NAME.psf as of PSFEx.
     """
     # The ending of the name decides the format: PSFEx's, STDPSF, or photutils' cube.
     check_targets((model,), out, overwrite=overwrite)

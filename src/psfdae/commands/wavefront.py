@@ -37,25 +37,40 @@ if TYPE_CHECKING:
 def wavefront_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
     options: ImageStatements,
-    telescope: Annotated[File, "YAML file of the telescope, as in config/telescope."],
-    stamp_px: Annotated[int, click.IntRange(8, 64), "Side of the stamps."] = 16,
-    axis: Annotated[
-        tuple[float, float] | None,
-        {"type": (float, float)},
-        "Pixel x y (0-based) of the optical axis.  [default: the image's middle]",
-    ] = None,
-    joint: Annotated[bool, "Fit the telescope's state to all stars together."] = False,
-    plot: Annotated[File | None, "PNG: wavefronts over the field."] = None,
-    seed: Annotated[int, click.IntRange(min=0), "Seed of the search."] = 0,
-    overwrite: Annotated[bool, "Replace files that exist."] = False,
+    telescope: File,
+    stamp_px: Annotated[int, click.IntRange(8, 64)] = 16,
+    axis: Annotated[tuple[float, float] | None, {"type": (float, float)}] = None,
+    joint: bool = False,
+    plot: File | None = None,
+    seed: Annotated[int, click.IntRange(min=0)] = 0,
+    overwrite: bool = False,
     *,
-    out: Annotated[File, "FITS file for coefficients, PSFs and residuals."],
+    out: File,
 ) -> None:
     """Measure the aberrations of a known telescope from the stars in INPUT.
 
     INPUT is a FITS image with --catalogue or --detect, or a cube of stamps with a catalogue. The
     field angle of a star is in the columns x_deg, y_deg of the list, or follows from its position.
     Two modes of a star are two wavefronts that its image does not tell apart.
+
+    Parameters
+    ----------
+    telescope : Path
+        YAML file of the telescope, as in config/telescope.
+    stamp_px : int
+        Side of the stamps.
+    axis : tuple[float, float], optional
+        Pixel x y (0-based) of the optical axis. [default: the image's middle]
+    joint : bool
+        Fit the telescope's state to all stars together.
+    plot : Path, optional
+        PNG: wavefronts over the field.
+    seed : int
+        Seed of the search.
+    overwrite : bool
+        Replace files that exist.
+    out : Path
+        FITS file for coefficients, PSFs and residuals.
     """
     # Refuse options that do not fit together, and outputs that exist.
     if options.colour_column:

@@ -59,7 +59,7 @@ def find_bad_pixels(
     masked : ndarray of bool, shape (h, w)
         Pixels that are known to be bad; those that are not finite must be among them.
     headers : sequence of Header
-        Of the image, in which sections of the detector may be given.
+        Headers of the image, in which sections of the detector may be given.
     saturate : float, optional
         Counts from which a pixel is saturated.
 
@@ -341,7 +341,7 @@ def cosmic_rays(
 ) -> np.ndarray:
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
-    A pixel counts if its Laplacian L⁺ is 6 times the noise, and larger than the fine
+    A pixel counts if its Laplacian L⁺ (`edges`) is 6 times the noise, and larger than the fine
     structure F of the image around it by a factor: 5, or four times what the bright
     sources of this image have where they are so narrow that it is more. Stars are thus never
     taken for cosmic rays, and where they are nearly as narrow as these, only very high ones are
@@ -353,7 +353,7 @@ def cosmic_rays(
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
     noise : ndarray, shape (h, w)
-        Of the pixels (`pixel_noise`).
+        σ of the pixels (`pixel_noise`).
     saturate : float, optional
         Around areas of four or more pixels above it, edges are those of saturated stars.
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.sky_level import noise_correlation
@@ -287,7 +288,8 @@ def checked_camera(
     values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
     remarks.append(
         f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
-        "subtracted?): not used, errors come from the pixels; --gain states another one"
+        "subtracted?): not used, errors come from the pixels; "
+        f"{keyword('gain')} states another one"
     )
     # A scale on which the gain is none cannot have the saturation of the camera, either.
     level, origin = values["saturation"]
@@ -321,16 +323,18 @@ def checked_saturation(
     if level is not None and level <= sky.level:
         problem = f"saturation at {level:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
         if origin == "given":
-            raise ObservationError(image.path, f"{problem}; --saturate takes that of a pixel")
+            problem += f"; {keyword('saturate')} takes that of a pixel"
+            raise ObservationError(image.path, problem)
         saturation = CameraValue(None, f"not known, {origin} is below the sky")
-        remarks.append(f"{image.path}: {problem}: not used, --saturate states another one")
+        advice = f"not used, {keyword('saturate')} states another one"
+        remarks.append(f"{image.path}: {problem}: {advice}")
     # A pile-up of the largest value below the level of the header shows a lower saturation.
     clipped = None if origin == "given" else clipped_level(image, sky)
     if clipped is not None and (saturation.value is None or clipped[0] < saturation.value):
         saturation = CameraValue(clipped[0], "the largest value")
         remarks.append(
             f"{image.path}: {clipped[1]} pixels have exactly the largest value, {clipped[0]:g} "
-            f"{unit}: taken as saturated, --saturate states another level"
+            f"{unit}: taken as saturated, {keyword('saturate')} states another level"
         )
     return saturation, remarks
 

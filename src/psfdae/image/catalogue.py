@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from psfdae.base.errors import did_you_mean
 from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.list_formats import read_list_table
@@ -203,7 +204,18 @@ class Catalogue:
             ) from None
 
     def flags(self, positions: Positions) -> np.ndarray:
-        """Return flags of the list's own program as `StarFlag`s, (n,), uint16."""
+        """Return what the program that made the list flags of its stars, as `StarFlag`s.
+
+        Parameters
+        ----------
+        positions : Positions
+            Columns of the positions, whose names tell the program and its column of flags.
+
+        Returns
+        -------
+        ndarray of uint16, shape (n,)
+            0 without such a column.
+        """
         flags = np.zeros(len(self), dtype=np.uint16)
         if positions.flags is not None and positions.flags in self.table.colnames:
             values = np.nan_to_num(self.numbers(positions.flags), posinf=0, neginf=0)
@@ -286,9 +298,9 @@ class Catalogue:
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
         if resolved is None:
-            raise ObservationError(
-                self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
-            )
+            names = self.table.colnames
+            hint = did_you_mean(name, names)
+            raise ObservationError(self.path, f"no column {name!r}; found {shorten(names)}{hint}")
         # Coordinates and times are objects of astropy, not arrays.
         column = self.table[resolved]
         if not isinstance(column, np.ndarray):

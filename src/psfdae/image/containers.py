@@ -137,7 +137,7 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
         Names of astropy, separated by blanks; the others mean the same as the first, such as
         counts, adu and DN.
     name : str
-        What the value is, for the message.
+        Keyword of the value, for the message.
     path : Path
         The image, for the message.
 
@@ -157,7 +157,7 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
         except (u.UnitConversionError, TypeError):
             continue
     target_unit = " or ".join(units.split())
-    raise ObservationError(path, f"{name} {value}, expected a number of {target_unit}")
+    raise ObservationError(path, f"{name}={value}: expected a number of {target_unit}")
 
 
 def _of_nddata(data: NDData) -> fits.HDUList:

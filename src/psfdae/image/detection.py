@@ -93,7 +93,7 @@ class Sky:
         Parameters
         ----------
         threshold : float
-            In σ of the smoothed image.
+            Least height of a source, in σ of the smoothed image.
         fwhm_px : float, optional
             FWHM of stars; measured if it is not given.
         wide_px : float

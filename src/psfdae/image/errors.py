@@ -11,7 +11,7 @@ from traceback import walk_tb
 
 import numpy as np
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, no_such_file
 
 
 def one_line(text: object) -> str:
@@ -103,7 +103,8 @@ def reading(path: str | Path) -> Iterator[None]:
         except ObservationError:
             raise
         except FileNotFoundError:
-            raise ObservationError(path, "no such file") from None
+            reason = no_such_file(Path(path)).removeprefix(f"{path}: ")
+            raise ObservationError(path, reason) from None
         except IsADirectoryError:
             raise ObservationError(path, "a folder, not a file") from None
         except PermissionError:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
-from psfdae.base.errors import did_you_mean
+from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.options import Extension, File
+from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.containers import as_image, in_unit
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import PlainFile
@@ -183,10 +184,10 @@ class ImageInput(ImageStatements):
         """
         # Values with the units that they may have; the first is that of the number.
         stated: dict[str, tuple[Number | None, str]] = {
-            "pixel scale": (self.pixel_scale_arcsec, "arcsec/pix arcsec"),
+            "pixel_scale_arcsec": (self.pixel_scale_arcsec, "arcsec/pix arcsec"),
             "gain": (self.gain, "electron/adu electron/ct electron/DN"),
-            "read noise": (self.read_noise, "electron"),
-            "saturation": (self.saturate, f"adu ct DN {image_unit.replace(' ', '')}"),
+            "read_noise": (self.read_noise, "electron"),
+            "saturate": (self.saturate, f"adu ct DN {image_unit.replace(' ', '')}"),
         }
         numbers = {
             name: in_unit(value, units, name, self.path) for name, (value, units) in stated.items()
@@ -194,8 +195,9 @@ class ImageInput(ImageStatements):
         # A count, a scale or a threshold of 0 has no meaning.
         for name, number in {**numbers, "threshold": self.detection_sigma}.items():
             if number is not None and not (math.isfinite(number) and number > 0):
-                raise ObservationError(self.path, f"{name} {number!r}, expected a number above 0")
-        return numbers
+                typed = keyword(name, number)
+                raise ObservationError(self.path, f"{typed}: expected a number above 0")
+        return dict(zip(HEADER_KEYS, numbers.values(), strict=True))
 
     def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels, and describe the stars.
@@ -222,10 +224,9 @@ class ImageInput(ImageStatements):
         if margin < 0:
             raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
         if self.origin not in (None, 0, 1):
-            raise ObservationError(
-                self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
-            )
+            raise ObservationError(self.path, f"{keyword('origin', self.origin)}: expected 0 or 1")
         # A mask has up to 63 bits and a sign.
         if self.bad_bits is not None and not 0 < self.bad_bits < 2**63:
-            raise ObservationError(self.path, f"bad bits {self.bad_bits}, expected 1 to 2**63 - 1")
+            typed = keyword("bad_bits", self.bad_bits)
+            raise ObservationError(self.path, f"{typed}: expected 1 to 2**63 - 1")
         return open_observation(self, stamp_px, margin)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.base.progress import task
 from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
 from psfdae.image.camera import CameraValue
@@ -208,7 +209,10 @@ def _sky(layers: Layers) -> Sky:
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:
-                problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
+                problem += (
+                    f"; {keyword('bad_bits')} says which bits are bad, "
+                    f"{keyword('mask', 'none')} takes no mask"
+                )
             raise ObservationError(layers.image.path, problem) from None
     if layers.noise is None or not layers.noise.photons:
         return sky
@@ -285,7 +289,7 @@ def find_layers(
             if share > 0.2:
                 line += (
                     f"; {100 * share:.0f} % of the pixels have a bit of {mask.label}: "
-                    "state --bad-bits, or --mask none"
+                    f"state {keyword('bad_bits')}, or {keyword('mask', 'none')}"
                 )
         remarks.insert(0, line)
     return layers, remarks
@@ -331,7 +335,7 @@ def mask_and_bits(
     if source.mask is not None:
         mask = None if _is_none(source.mask) else _layer_of(image, source.mask, "a mask")
     if mask is None and source.bad_bits is not None:
-        raise ObservationError(source.path, "bits are given, but no mask that has them")
+        raise ObservationError(source.path, f"{keyword('bad_bits')} needs a mask that has bits")
     # Bits that are stated go before those by the header.
     bits_of_header = None if mask is None else bits_of_bad_pixels(mask)
     if mask is None or source.bad_bits is not None or bits_of_header is None:
@@ -396,7 +400,7 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
         raise ObservationError(
             noise.path,
             f"extension {noise.label} is {NOISE_MAPS[kind_by_name]}, not {NOISE_MAPS[kind]}: "
-            f"--{kind_by_name} {noise.label}",
+            f"{keyword(kind_by_name, noise.label)}",
         )
     with open_pixels(noise, in_pieces=False) as pixels:
         values = pixels[:]

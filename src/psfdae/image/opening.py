@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.base.progress import task
 from psfdae.image.camera import (
     LARGEST_STAMP_PX,
@@ -144,7 +145,9 @@ def image_or_cube(
     if not is_image and not (is_square and (len(shape) == 3 or shape[-1] == stamp_px)):
         if len(shape) == 2:
             raise ObservationError(
-                image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
+                image.path,
+                f"an image of {size} pixels needs {keyword('catalogue')}, a list of its stars, or "
+                f"{keyword('detect', True)}",
             )
         raise ObservationError(
             image.path,
@@ -152,7 +155,8 @@ def image_or_cube(
         )
     if is_searched and (not is_image or table is not None or source.origin is not None):
         raise ObservationError(
-            source.path, "--detect takes an image, no cube; no list, and no origin of one"
+            source.path,
+            f"{keyword('detect', True)} takes an image, no cube; no list, and no origin of one",
         )
     return image, not is_image
 
@@ -180,7 +184,10 @@ def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
         # The list has the columns of SExtractor, as a list in a file might.
         table = Table(sky.stars(threshold))
     if len(table) == 0:
-        raise ObservationError(path, f"no star {threshold:g} σ above the sky")
+        raise ObservationError(
+            path,
+            f"no star {threshold:g} σ above the sky; {keyword('threshold')} sets another limit",
+        )
     return Catalogue(path, table)
 
 

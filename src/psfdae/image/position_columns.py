@@ -49,7 +49,15 @@ class Positions:
 
     @classmethod
     def of_pairs(cls, pairs: str, **meaning: Any) -> tuple[Positions, ...]:
-        """Return the columns of pairs of names, `x,y` with blanks between them, of one meaning."""
+        """Return the position columns that pairs of names are, all with the same meaning.
+
+        Parameters
+        ----------
+        pairs : str
+            Pairs `x,y` of names, with blanks between them.
+        **meaning
+            Other fields that they share, such as `origin=1`.
+        """
         names = [pair.split(",") for pair in pairs.split()]
         return tuple(cls(first, second, **meaning) for first, second in names)
 

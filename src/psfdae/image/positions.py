@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile
@@ -43,8 +44,8 @@ def require_sky(stars: StarList, purpose: str) -> None:
     if not table.positions().sky:
         raise ObservationError(
             table.path,
-            f"{purpose} takes a list with sky coordinates, or --detect: pixels do not say which "
-            "image they are of",
+            f"{purpose} takes a list with sky coordinates, or {keyword('detect', True)}: pixels "
+            "do not say which image they are of",
         )
 
 
@@ -95,7 +96,7 @@ def positions_in_image(
             raise ObservationError(
                 table.path,
                 f"the origin of columns {names} must be stated: is the centre of the first pixel "
-                "0 or 1? --origin says it",
+                f"0 or 1? {keyword('origin')} says it",
             )
         listed = [table.pixels(name) for name in (columns.first, columns.second)]
         positions = np.stack(listed, axis=1) - columns.origin
@@ -130,7 +131,7 @@ def with_origin(
     sentence = (
         f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
         f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
-        "--origin states it"
+        f"{keyword('origin')} states it"
     )
     return replace(columns, origin=origin), [sentence]
 
@@ -231,15 +232,15 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
         origin = int(x1 < 0)
         raise ObservationError(
             path,
-            f"{sentence}: its positions count from {origin}? --origin {origin} says so "
-            "(--accept-offset takes it as it is)",
+            f"{sentence}: its positions count from {origin}? {keyword('origin', origin)} says so "
+            f"({keyword('accept_offset', True)} takes it as it is)",
         )
     # Half of the stars more than 1 px off: the list belongs to something else.
     if (distance > 1.0).any():
         raise ObservationError(
             path,
-            f"{sentence}: a list of another image or origin, or x and y exchanged? --accept-offset "
-            "takes it as it is",
+            f"{sentence}: a list of another image or origin, or x and y exchanged? "
+            f"{keyword('accept_offset', True)} takes it as it is",
         )
     return f"{path}: {sentence}"
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, keyword
 from psfdae.base.progress import task
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
@@ -121,9 +121,8 @@ class Candidates:
         if len(self.bright) < stars_min:
             problem = (
                 f"{path}: {len(self.bright)} stars are good enough to learn from, "
-                f"calibration_stars.stars_min = {stars_min} are needed "
-                f"(of {len(self.verdict)}: {self.count()}); --stars-min takes fewer, --snr-min "
-                "fainter ones"
+                f"{stars_min} are needed (of {len(self.verdict)}: {self.count()}); "
+                f"{keyword('stars_min')} takes fewer, {keyword('snr_min')} fainter ones"
             )
             raise CalibrationStarsError("; ".join([problem, *remarks]))
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.image.observation import Observation
 from psfdae.image.selection import Candidates
 from psfdae.image.stamps import cut
@@ -37,8 +38,8 @@ def saturation_advice(candidates: Candidates) -> str:
     )
     return (
         f"saturation: the brightest pixels of {piled} stars agree from {level:.6g} counts on, as "
-        f"if cut off; {flagged} stamps have such pixels and are not learnt from, --saturate "
-        f"{level:.6g} flags these, too"
+        f"if cut off; {flagged} stamps have such pixels and are not learnt from, "
+        f"{keyword('saturate', level)} flags these, too"
     )
 
 
@@ -54,7 +55,7 @@ def gain_advice(candidates: Candidates) -> str:
         return f"{sky_text}; it was probably subtracted, and says nothing of the gain"
     return (
         f"{sky_text}; if photons make it and no bias or sky was subtracted or added, "
-        f"--gain {sky / noise**2:.3g} is right"
+        f"{keyword('gain', float(f'{sky / noise**2:.3g}'))} is right"
     )
 
 
@@ -93,5 +94,6 @@ def stamp_advice(
     )
     return (
         f"stamp size: {100 * light_wanted:g} % of the median star's light are within {needed} px; "
-        f"another star of the list stands in {shared}: framing.stamp_px={needed} is worth a trial"
+        f"another star of the list stands in {shared}: {keyword('stamp_px', needed)} is worth a "
+        "trial"
     )

@@ -58,7 +58,7 @@ class SourceSize:
     def side(self, light_min: float) -> int:
         """Return the side of stamps, of 16, 24, 32, 48 and 64 px.
 
-        It is the least one if it holds `light_min` of the light, else the first that holds 98 %.
+        It is 16 px if these hold `light_min` of the light, else the first that holds 98 %.
         The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
         star lies, and 99 % of its light must.
         """
@@ -80,7 +80,7 @@ def measure_size(
     Parameters
     ----------
     flat : ndarray, shape (h, w)
-        Sky-subtracted.
+        Image without its sky.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
     position : ndarray, shape (n, 2)
@@ -88,7 +88,7 @@ def measure_size(
     reach_px : int
         Radius of the windows in which stars are measured.
     stars_max : int
-        Number of stars that are measured.
+        Number of stars that are measured, at most.
 
     Returns
     -------

@@ -31,7 +31,7 @@ def star_grid(position: np.ndarray) -> np.ndarray:
     """Return places of stars on a square lattice that keeps their order in the image.
 
     Columns of equally many stars follow each other in x, the stars of a column in y.
-    The pattern of `psfdae_paper.stars.fields.held_out_fields` then takes every fifth star,
+    The pattern of `psfdae.stars.splits.held_out_fields` then takes every fifth star,
     evenly over the field.
 
     Parameters

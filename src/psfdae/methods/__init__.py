@@ -14,6 +14,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from psfdae.base.errors import did_you_mean
 from psfdae.base.files import ProductError
 from psfdae.base.joined import joined
 from psfdae.methods.interface import Method
@@ -30,9 +31,7 @@ def method(name: str) -> type[Method]:
     # The package's own methods first: no other package replaces one.
     method_class = _of_module(f"{__name__}.{name}") or _joined().get(name)
     if method_class is None:
-        raise ProductError(
-            f"no method {name!r}; there are {', '.join(k.name for k in all_methods())}"
-        )
+        raise ProductError(_unknown(name))
     return method_class
 
 
@@ -74,10 +73,15 @@ def groups_of(name: str, **options: object) -> tuple[str, ...]:
 
 
 def _is_known(name: str) -> str:
-    names = [method_class.name for method_class in all_methods()]
-    if name not in names:
-        raise ValueError(f"no method {name!r}; there are {', '.join(names)}")
+    if name not in {method_class.name for method_class in all_methods()}:
+        raise ValueError(_unknown(name))
     return name
+
+
+def _unknown(name: str) -> str:
+    """Return the line that refuses a name which no method has."""
+    names = [method_class.name for method_class in all_methods()]
+    return f"no method {name!r}; there are {', '.join(names)}{did_you_mean(name, names)}"
 
 
 MethodName = Annotated[str, AfterValidator(_is_known)]

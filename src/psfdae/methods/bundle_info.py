@@ -23,7 +23,9 @@ Width = Annotated[int, Field(ge=1, le=1024)]
 class _Described(BaseModel):
     """Part of the description: immutable, and without unknown keys or infinite numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class Architecture(_Described):
@@ -66,48 +68,44 @@ class BundleInfo(_Described):
     created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
     stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)]
     pixel_scale_arcsec: Positive
-    pixel_lambda_d: Positive | None = Field(
-        description="side of a pixel over wavelength / aperture diameter; "
-        "None where the optics are unknown"
-    )
-    image_scale: Positive | None = Field(
-        None,
-        description="factor by which stamps of flux 1 are multiplied before they enter the network",
-    )
-    jitter_px: Annotated[int, Field(ge=0)] = Field(
-        description="the brightest pixel is within this of (d/2, d/2), row and column from 0"
-    )
-    subpixel: bool = Field(
-        description="centres of the training stars lay anywhere in their pixels, "
-        "not only in the middle"
-    )
-    kappa: Positive = Field(description="noise at the noise level λ = 1 of the training")
-    noise_min: Positive = Field(description="least noise of the training")
-    noise_max: Positive = Field(description="greatest noise of the training")
-    snr_min: Positive = Field(description="S/N of the typical star at the greatest noise")
-    snr_max: Positive = Field(description="S/N of the typical star at the least noise")
-    noise_equivalent_px: Positive = Field(description="A = 1 / ΣPSF² of the typical star")
-    components: Annotated[int, Field(ge=1, le=1024)] = Field(
-        description="number of leading eigenvectors of the training stars that are stored, "
-        "and in which the distance of a star from them is measured"
-    )
+    pixel_lambda_d: Positive | None
+    """Side of a pixel over wavelength / aperture diameter; None where the optics are unknown."""
+    image_scale: Positive | None = None
+    """Factor by which stamps of flux 1 are multiplied before they enter the network."""
+    jitter_px: Annotated[int, Field(ge=0)]
+    """The brightest pixel is within this of (d/2, d/2), row and column from 0."""
+    subpixel: bool
+    """Centres of the training stars lay anywhere in their pixels, not only in the middle."""
+    kappa: Positive
+    """Noise at the noise level λ = 1 of the training."""
+    noise_min: Positive
+    """Least noise of the training."""
+    noise_max: Positive
+    """Greatest noise of the training."""
+    snr_min: Positive
+    """S/N of the typical star at the greatest noise."""
+    snr_max: Positive
+    """S/N of the typical star at the least noise."""
+    noise_equivalent_px: Positive
+    """A = 1 / ΣPSF² of the typical star."""
+    components: Annotated[int, Field(ge=1, le=1024)]
+    """Number of leading eigenvectors of the training stars that are stored, and in which the
+    distance of a star from them is measured."""
     training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     training_stars: Count
     source: Literal["simulated", "stars"]
-    dae: Architecture | None = Field(
-        None, description="shape of the denoising autoencoder; None for other methods"
-    )
+    dae: Architecture | None = None
+    """Shape of the denoising autoencoder; None for other methods."""
     method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
-    reference: Literal["realisation", "template"] = Field(description="what is restored")
-    misfit: Annotated[float, Field(ge=0)] = Field(
-        0.0,
-        description="noise that stands for the method's error of the PSF: added in quadrature to "
-        "that of a star while its flux is found, but not while it is restored",
-    )
-    config: dict[str, Any] = Field(
-        description="resolved configuration of all stages, and the wings as Wings.plain gives them"
-    )
-    metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
+    reference: Literal["realisation", "template"]
+    """Image that is restored."""
+    misfit: Annotated[float, Field(ge=0)] = 0.0
+    """Noise that stands for the method's error of the PSF: added in quadrature to that of a star
+    while its flux is found, but not while it is restored."""
+    config: dict[str, Any]
+    """Resolved configuration of all stages, and the wings as Wings.plain gives them."""
+    metrics: list[dict[str, float]]
+    """Errors of the test stars by noise level."""
 
     def __repr_args__(self) -> Iterator[tuple[str, Any]]:
         """Yield what tells one model from another, with which a description is shown."""

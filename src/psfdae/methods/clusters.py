@@ -80,7 +80,7 @@ class ClusterInverses:
     ----------
     clusters : sequence of Cluster
     variance : ndarray, shape (P,)
-        Eigenvalues of S.
+        Eigenvalues of S, the covariance that all clusters have in common.
     """
 
     clusters: Sequence[Cluster]
@@ -94,6 +94,15 @@ class ClusterInverses:
         """Return G_k⁻¹ of cluster k in the leading coordinates for every noise variance (eq. 4).
 
         Axes with no more than the least variance are not used one by one.
+
+        Parameters
+        ----------
+        k : int
+            Number of the cluster.
+        width : int
+            Number of leading coordinates.
+        least_variance : float
+            Least noise variance of a pixel that the inverse will be asked for.
         """
         if (k, width) not in self._axes:
             # C_k = (X_kᵀ X_k + ν S) / (n_k + ν), with S diagonal in these coordinates (eq. 2).
@@ -106,7 +115,17 @@ class ClusterInverses:
         return self._axes[k, width].inverse(least_variance)
 
     def of_one_noise(self, k: int, width: int, s: float) -> WoodburyInverse:
-        """Return G_k⁻¹ of cluster k in the leading coordinates for one noise variance s (eq. 5)."""
+        """Return G_k⁻¹ of cluster k in the leading coordinates for one noise variance s (eq. 5).
+
+        Parameters
+        ----------
+        k : int
+            Number of the cluster.
+        width : int
+            Number of leading coordinates.
+        s : float
+            Noise variance of a pixel.
+        """
         # Only the inverses of the last noise variance are kept.
         if (width, s) not in self._woodbury:
             self._woodbury.clear()

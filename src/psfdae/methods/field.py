@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from psfdae.base.errors import call
 from psfdae.base.rng import stream
 from psfdae.methods.field_errors import draw_field_stars, flux_error_over_field
 from psfdae.methods.field_fit import FieldFit, FieldUncertainty
@@ -90,7 +91,10 @@ class FieldMixture(FieldLaw, Method):
             If there are no bright stars of an image.
         """
         if data.bright is None:
-            raise FitError("it learns from the bright stars of an image: psfdae from-stars")
+            raise FitError(
+                "it learns from the bright stars of an image: "
+                + call("psfdae.Stars.from_image", "psfdae from-stars")
+            )
         # The field is fitted in frames with a margin, so that residuals can be moved by 2 px.
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)

@@ -224,13 +224,13 @@ def flux_error_over_field(
     Returns
     -------
     error : float
-        RMS over the field; 0 of a fit that was stored.
+        RMS over the field; 0 for a fit that was read from a file.
     middle : ndarray, shape (2,)
-        x and y in the middle of the field; 0 of a fit that was stored.
+        x and y in the middle of the field; 0 for a fit that was read from a file.
     growth : ndarray, shape (4,)
         Coefficients a, b, c, d of the variance over its mean, a + b u² + c w² + d u² w² at u and w
         from the middle: towards the edge of the field, fewer stars say what the PSF is. They are
-        1, 0, 0, 0 of a fit that was stored.
+        1, 0, 0, 0 for a fit that was read from a file.
     """
     from scipy.optimize import nnls
 

@@ -120,14 +120,14 @@ class FitSettings:
 
 
 class FieldUncertainty(NamedTuple):
-    """Scatter of fields that are as likely as the fitted one; nothing of a fit that was stored.
+    """Scatter of fields that are as likely as the fitted one; empty for a fit read from a file.
 
     Attributes
     ----------
     redrawn : sequence of FieldModel
         Fields that the same stars give with other noise.
     parted : sequence of FieldModel
-        Fields as uncertain as without some stars after the others.
+        Fields that differ as those do that are fitted without one group of stars after the other.
     unknown_light : float
         Scatter of the light in stamps that the field takes for sky, over the flux.
     """

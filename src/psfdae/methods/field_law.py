@@ -71,28 +71,26 @@ class FieldSettings(Group):
     """
 
     orders: Annotated[list[Annotated[int, Field(ge=0, le=10)]], Field(min_length=1)] = Field(
-        [0, 1, 2, 3, 4, 6, 8],
-        description="Of the polynomial in the position, tried upwards until the next one "
-        "predicts stars that were left out no better",
+        [0, 1, 2, 3, 4, 6, 8]
     )
-    spacing_px: Annotated[float, Field(gt=0.1, le=2)] = Field(
-        0.5, description="Distance of the knots of the field's splines, at least"
-    )
-    smoothness: Positive = Field(
-        100.0, description="Of the splines: weight of their second differences"
-    )
-    step_px: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.25, description="Between two nodes, at most; less where stars are undersampled"
-    )
-    reach_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = Field(
-        1.75, description="Distance, per axis, of the outermost nodes from the stamp's middle"
-    )
-    centring_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = Field(
-        1.5, description="Distance, per axis, from the middle that centres may have"
-    )
-    modes: Count = Field(40, description="Leading modes of the residuals")
-    diagonal: Fraction = Field(0.2, description="Part of their variance that no mode knows")
-    threads: Count = Field(1, description="Threads of the linear algebra")
+    """Orders of the polynomial in the position, tried upwards until the next one predicts stars
+    that were left out no better."""
+    spacing_px: Annotated[float, Field(gt=0.1, le=2)] = 0.5
+    """Distance of the knots of the field's splines, at least."""
+    smoothness: Positive = 100.0
+    """Smoothness of the splines: weight of their second differences."""
+    step_px: Annotated[float, Field(gt=0, le=1)] = 0.25
+    """Distance of two nodes, at most; less where stars are undersampled."""
+    reach_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = 1.75
+    """Distance, per axis, of the outermost nodes from the stamp's middle."""
+    centring_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = 1.5
+    """Distance, per axis, from the middle that centres may have."""
+    modes: Count = 40
+    """Leading modes of the residuals."""
+    diagonal: Fraction = 0.2
+    """Part of their variance that no mode knows."""
+    threads: Count = 1
+    """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

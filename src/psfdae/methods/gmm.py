@@ -39,24 +39,21 @@ if TYPE_CHECKING:
 class Gmm(Group):
     """Mixture of Gaussians; of several values the validation stars choose."""
 
-    stars: Count | None = Field(None, description="Training stars that are learnt from; null: all")
-    components: Annotated[list[Count], Field(min_length=1)] = Field(
-        [16, 1, 4, 64, 128],
-        description="Clusters K among which a search goes, from the first one, as long as it "
-        "pays; more than stars are not",
-    )
-    shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
-        [10.0, 3.0, 30.0, 100.0],
-        description="Stars ν that the covariance of all clusters counts for in each; searched "
-        "from the first one, too",
-    )
-    principal: Count = Field(40, description="Principal components in which stars are clustered")
-    place: Positive = Field(
-        1.0,
-        description="RMS of the field position beside that of the principal components, "
-        "for methods that are given it",
-    )
-    threads: Count = Field(1, description="Threads of the linear algebra")
+    stars: Count | None = None
+    """Training stars that are learnt from; null: all."""
+    components: Annotated[list[Count], Field(min_length=1)] = Field([16, 1, 4, 64, 128])
+    """Clusters K among which a search goes, from the first one, as long as it pays; more than stars
+    are not."""
+    shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field([10.0, 3.0, 30.0, 100.0])
+    """Stars ν that the covariance of all clusters counts for in each; searched from the first one,
+    too."""
+    principal: Count = 40
+    """Principal components in which stars are clustered."""
+    place: Positive = 1.0
+    """RMS of the field position beside that of the principal components, for methods that are given
+    it."""
+    threads: Count = 1
+    """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,23 +121,25 @@ class GaussianMixture(MixtureLaw, Method):
                 f"{' without those that choose' if searched else ''}"
             )
         # The final mixture learns from the stars that have chosen, too.
-        k, nu, used = sizes[0], gmm.shrinkage[0], cls.needs.position
+        k, nu, uses_position = sizes[0], gmm.shrinkage[0], cls.needs.position
         if searched:
-            k, nu, used = best_on_validation(
-                lambda k, used: cls.clustered(data, learn, k, gmm.shrinkage[0], used, gmm),
+            k, nu, uses_position = best_on_validation(
+                lambda k, uses_position: cls.clustered(
+                    data, learn, k, gmm.shrinkage[0], uses_position, gmm
+                ),
                 data,
                 judge,
                 sizes,
                 gmm.shrinkage,
                 cls,
             )
-        return cls.clustered(data, data.train[: gmm.stars], k, nu, used, gmm)
+        return cls.clustered(data, data.train[: gmm.stars], k, nu, uses_position, gmm)
 
     @classmethod
     def clustered(
-        cls, data: TrainingSet, stars: np.ndarray, k: int, nu: float, used: bool, gmm: Gmm
+        cls, data: TrainingSet, stars: np.ndarray, k: int, nu: float, uses_position: bool, gmm: Gmm
     ) -> Self:
-        """Return the mixture of some stars, whose clusters follow the position if it is used.
+        """Return the mixture of some stars, whose clusters follow the position if that is wanted.
 
         Parameters
         ----------
@@ -150,15 +149,15 @@ class GaussianMixture(MixtureLaw, Method):
         k : int
             Number of clusters K.
         nu : float
-            ν.
-        used : bool
+            ν, the weight of the common covariance, as a number of stars.
+        uses_position : bool
             The position counts; otherwise all stars stand in one place.
         gmm : Gmm
         """
         # Positions that are not used keep their places in the arrays, but are all 0.
         p = np.empty((len(stars), 0))
         if cls.needs.position:
-            p = data.positions[stars].astype(np.float64) * used
+            p = data.positions[stars].astype(np.float64) * uses_position
         x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
         cluster = k_means(x, p, k, gmm.principal, gmm.place, data.seed)
         del x  # memory: it is needed again in another order

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from psfdae.base.errors import Error, needed_by
+from psfdae.base.errors import Error, needed_by, no_such_file
 from psfdae.base.files import ProductError, atomic_path
 from psfdae.base.version import __version__
 from psfdae.image.errors import one_line
@@ -253,7 +253,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         _require(is_intact, path, "damaged (the checksum differs)")
         info = BundleInfo.model_validate(text["info"])
     except FileNotFoundError:
-        raise BundleError(f"{path}: no such file") from None
+        raise BundleError(no_such_file(path)) from None
     except ValidationError as error:
         first = error.errors(include_input=False)[0]
         key = ".".join(str(part) for part in first["loc"])

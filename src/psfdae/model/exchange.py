@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.base.files import atomic_path, write_fits
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line, reading
@@ -247,7 +248,8 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     # Other programs take the middle sample for the centre.
     if oversampling == 1 and model.stamp_px % 2 == 0:
         raise PredictionError(
-            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
+            f"{path}: stamps of {model.stamp_px} px have no middle pixel; "
+            f"{keyword('oversampling')} takes 2 or more"
         )
     # A grid with about twice as many nodes along an axis as the polynomial has terms. A constant
     # PSF needs no field.

@@ -73,9 +73,17 @@ class FieldPsfs(ImageFluxes, ABC):
         """Columns and rows of the image that the model was trained on, if known."""
 
     def flux_error(self, place: np.ndarray) -> np.ndarray:
-        """Return the errors of stars' fluxes on a known sky that are due to the model.
+        """Return the errors of fluxes on a known sky that are due to the model, over the flux.
 
-        Over the flux, of stars at places (n, 2), x and y; 0 if they are not known.
+        Parameters
+        ----------
+        place : ndarray, shape (n, 2)
+            x and y of the stars.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            0 if the errors of the model are not known.
         """
         return np.zeros(len(place))
 

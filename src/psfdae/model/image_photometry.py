@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, keyword
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.image_input import ImageInput
@@ -167,10 +167,12 @@ def photometry_of_image(
     """
     # Refuse statements that do not fit together.
     if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
-        raise PhotometryError("--zero-point takes a number, or --reference gives it")
+        raise PhotometryError(
+            f"{keyword('zero_point')} takes a number, or {keyword('reference')} gives it"
+        )
     if source.colour_column:
         raise PhotometryError(
-            f"{source.path}: all stars get the PSF of the usual one: no --colour-column"
+            f"{source.path}: all stars get the PSF of the usual one: no {keyword('colour_column')}"
         )
     # With --detect, no list of the image needs an origin: it is that of the reference.
     origin = source.origin

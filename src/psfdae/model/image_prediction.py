@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from psfdae.base.errors import call, keyword
 from psfdae.image.camera import other_instruments
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
@@ -145,12 +146,13 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
     if model.info.source == "stars":
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assuming()
-    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
+    statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} states it)"
+    assumed = statement if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
     if fixed and not (model.method.knows_field and observation.shape):
         raise PredictionError(
-            f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
-            "psfdae from-stars --method field"
+            f"{source.path}: {call('fixed=True', '--fixed-positions')} takes an image with a star "
+            f"list, and a model of the method field"
         )
     return observation
 

@@ -367,10 +367,17 @@ def _normal_matrix(
 
 
 def standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
-    """Return the standard errors (m, k) of the parameters of m stars.
+    """Return the standard errors (m, k) of the k parameters of m stars.
 
     Those of a star are from the inverse of the part of the matrix that belongs to it and to the
     stars whose boxes overlap with its own; what these share with others changes little.
+
+    Parameters
+    ----------
+    matrix : sparse array, shape (m k, m k)
+        Normal matrix of all parameters, with 1 on its diagonal.
+    unit : ndarray, shape (m, k)
+        Factors by which its rows and columns were divided.
     """
     # Blocks of 3 × 3 numbers, one for each pair of stars that overlap.
     stars, parameters = unit.shape

@@ -82,8 +82,9 @@ class LeadingModes:
         Parameters
         ----------
         x : ndarray, shape (n, P)
-            Stamps above the known sky, or above the sky of the start.
+            Stamps above the known sky, or else above a first estimate of it.
         sky_known : ndarray of bool, shape (n,)
+            False for stars of which the sky left over is fitted, too.
         flux, noise : ndarray, shape (n,)
             Known values; they are estimated where they are NaN.
         used : ndarray of bool, shape (n, P), optional

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.base.errors import call, keyword
 from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.image.observation import Observation
@@ -57,9 +58,10 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     PsfModel('wfsat', 16×16 px of 0.1", S/N 3.3 … 1.1e+03)
     """
     if path is not None and Path(path).suffix in (".yaml", ".yml"):
+        wavefront = call("psfdae.wavefront", f"psfdae wavefront INPUT --telescope {path}")
         raise PredictionError(
-            f"{path}: describes a telescope, and is no model; psfdae wavefront INPUT --telescope "
-            f"{path} measures the wavefronts of its stars and writes their PSFs"
+            f"{path}: describes a telescope, and is no model; {wavefront} measures the wavefronts "
+            "of its stars, and gives their PSFs"
         )
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
@@ -290,9 +292,10 @@ class PsfModel(WholeImages, FieldPsfs):
         """Return the method as one that knows the PSF at every place of the field."""
         field = self.method
         if not field.knows_field:
+            training = call("psfdae.fit with method='field'", "psfdae from-stars --method field")
             raise PredictionError(
                 f"the model {self.name!r}: {field.look.title}: knows the PSF of a star alone, "
-                "not that of a place; psfdae from-stars --method field makes one that does"
+                f"not that of a place; {training} makes one that does"
             )
         return field
 
@@ -315,11 +318,12 @@ class PsfModel(WholeImages, FieldPsfs):
             If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
         """
         model_scale = self.info.pixel_scale_arcsec
-        advice = "; psfdae from-stars trains one on an image of yours"
+        advice = f"; {call('psfdae.fit', 'psfdae from-stars')} trains one on an image of yours"
         if pixel_scale_arcsec is None:
             raise PredictionError(
                 f"{source}: neither a WCS nor the header gives the pixel scale; "
-                f"state it with --pixel-scale (the model's is {model_scale:.6g} arcsec){advice}"
+                f"state it with {keyword('pixel_scale_arcsec')} (the model's is {model_scale:.6g} "
+                f"arcsec){advice}"
             )
         if not abs(pixel_scale_arcsec / model_scale - 1.0) <= SCALE_TOLERANCE:
             assumed = ", assumed" if self.info.scale_assumed else ""

@@ -7,6 +7,7 @@ as `train=onecycle` or `preset=smoke`, is read by the extra "paper", by its entr
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -15,7 +16,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field, create_model, model_validator
 
-from psfdae.base.errors import did_you_mean
+from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.joined import joined
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import (
@@ -186,13 +187,23 @@ def with_keywords(
     tree = settings.model_dump(exclude_unset=True)
     # A group without keys, such as the seed, is itself a key.
     group_keys = {group: _keys(group) or {group} for group in groups}
+    typed: dict[str, str] = {}
     for name, value in keywords.items():
         owner = next((group for group, keys in group_keys.items() if name in keys), None)
         if owner is None:
             names = ", ".join(key for keys in group_keys.values() for key in sorted(keys))
-            raise ConfigError(f"{name}: unknown setting; there are {names}")
+            hint = did_you_mean(name, names.split(", "))
+            raise ConfigError(f"{name}: unknown setting; there are {names}{hint}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
-    return parse_settings(settings_model(), tree)
+        typed[f"{owner}.{name}"] = keyword(name).removesuffix("=")
+    try:
+        return parse_settings(settings_model(), tree)
+    except ConfigError as error:
+        # Name a setting as it was typed, without its group.
+        message = str(error)
+        for key, word in typed.items():
+            message = re.sub(rf"^{re.escape(key)}\S* = ", f"{word} = ", message, flags=re.M)
+        raise ConfigError(message) from None
 
 
 def _keys(group: str) -> set[str]:

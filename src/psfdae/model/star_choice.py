@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.image.camera import other_instruments
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
@@ -66,7 +67,7 @@ def choose_bright_stars(
     if least_snr < stated_snr:
         notes.append(
             f"few stars: those of S/N {least_snr:g} and above are used, because fewer than 20 have "
-            f"S/N {stated_snr:g}; --snr-min sets another limit"
+            f"S/N {stated_snr:g}; {keyword('snr_min')} sets another limit"
         )
     return opened, candidates, relaxed, notes
 
@@ -195,7 +196,7 @@ def enlarge_stamps(
         old_part, new_part = (100 * largest.light_within(s) for s in (framing.stamp_px, side))
         note += (
             f"; stamps of {side} px, which hold {new_part:.1f} % of it, are used instead of "
-            f"{framing.stamp_px} px ({old_part:.0f} %); --stamp-px sets another size"
+            f"{framing.stamp_px} px ({old_part:.0f} %); {keyword('stamp_px')} sets another size"
         )
     if largest.hollow:
         note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import sky_level
@@ -143,9 +144,9 @@ class Wings:
         )
         if light / (1.0 + light) > 0.2:
             sentence += (
-                "; over a fifth of the flux: try wider stamps (--stamp-px), or a list without "
+                f"; over a fifth of the flux: try wider stamps ({keyword('stamp_px')}), or a list "
+                "without sources that are no stars"
             )
-            sentence += "sources that are no stars"
         return sentence
 
     @classmethod

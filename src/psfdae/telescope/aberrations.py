@@ -72,9 +72,12 @@ class Mirror(Group):
     R is the radius of curvature and k the conic constant: −1 is a paraboloid.
     """
 
-    radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
-    conic: Finite = Field(description="Conic constant")
-    vertex_m: Finite = Field(description="z of the vertex")
+    radius_m: Radius
+    """Radius of curvature, > 0: centre above the vertex."""
+    conic: Finite
+    """Conic constant."""
+    vertex_m: Finite
+    """Coordinate z of the vertex."""
 
 
 class Secondary(Mirror):
@@ -83,7 +86,8 @@ class Secondary(Mirror):
     Its misalignment is a decentre and a tilt about its vertex (`Raytraced`).
     """
 
-    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+    clear_radius_m: Positive
+    """Rays beyond this radius are vignetted."""
 
 
 class Lens(Group):
@@ -92,11 +96,16 @@ class Lens(Group):
     It is centred on the axis, in the vacuum, and of the prescription's glass.
     """
 
-    front_radius_m: Radius = Field(description="Radius of the front, > 0: centre above vertex")
-    back_radius_m: Radius = Field(description="Radius of the back, > 0: centre above vertex")
-    front_vertex_m: Finite = Field(description="z of the front vertex")
-    back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
-    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+    front_radius_m: Radius
+    """Radius of the front, > 0: centre above vertex."""
+    back_radius_m: Radius
+    """Radius of the back, > 0: centre above vertex."""
+    front_vertex_m: Finite
+    """Coordinate z of the front vertex."""
+    back_vertex_m: Finite
+    """Coordinate z of the back vertex, below the front."""
+    clear_radius_m: Positive
+    """Rays beyond this radius are vignetted."""
 
     @model_validator(mode="after")
     def check_thickness(self) -> Lens:
@@ -114,8 +123,10 @@ class Lens(Group):
 class Glass(Group):
     """Glass by Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
 
-    sellmeier_b: Resonances = Field(description="Strengths of the three resonances")
-    sellmeier_c_um2: Resonances = Field(description="Squared wavelengths of the resonances, µm²")
+    sellmeier_b: Resonances
+    """Strengths of the three resonances."""
+    sellmeier_c_um2: Resonances
+    """Squared wavelengths of the resonances, µm²."""
 
 
 class Prescription(Group):
@@ -125,17 +136,23 @@ class Prescription(Group):
     as in a Newtonian, is left out: it is nothing but the telescope's obscuration.
     """
 
-    name: Name = Field(description="For titles and messages")
-    entrance_pupil_m: Finite = Field(description="z of the plane that holds the pupil")
-    launch_distance_m: Positive = Field(description="Start of the rays above that plane")
-    reference_sphere_m: Positive = Field(description="Radius of the wavefront's reference")
+    name: Name
+    """Name in titles and messages."""
+    entrance_pupil_m: Finite
+    """Coordinate z of the plane that holds the pupil."""
+    launch_distance_m: Positive
+    """Start of the rays above that plane."""
+    reference_sphere_m: Positive
+    """Radius of the wavefront's reference."""
     primary: Mirror
-    secondary: Secondary | None = Field(default=None, description="Null: none, or a flat one")
-    lenses: dict[Name, Lens] = Field(
-        default_factory=dict, description="Lenses of the corrector, by name"
-    )
-    glass: Glass | None = Field(default=None, description="Glass of all lenses")
-    best_focus_m: Finite = Field(description="z of the detector in focus")
+    secondary: Secondary | None = None
+    """Null: none, or a flat one."""
+    lenses: dict[Name, Lens] = Field(default_factory=dict)
+    """Lenses of the corrector, by name."""
+    glass: Glass | None = None
+    """Glass of all lenses."""
+    best_focus_m: Finite
+    """Coordinate z of the detector in focus."""
 
     @property
     def ordered_lenses(self) -> list[tuple[str, Lens]]:
@@ -182,12 +199,18 @@ class Seidel(Group):
     The wavefront is that of `psfdae.optics.wavefronts`, a polynomial of pupil and field.
     """
 
-    kind: Literal["seidel"] = Field(description="Kind of aberrations; decides the other keys")
-    spherical: Finite = Field(description="W040, waves")
-    coma: Finite = Field(description="W131, waves")
-    astigmatism: Finite = Field(description="W222, waves")
-    field_curvature: Finite = Field(description="W220, waves")
-    distortion: Finite = Field(description="W311, waves")
+    kind: Literal["seidel"]
+    """Kind of aberrations; decides the other keys."""
+    spherical: Finite
+    """W040, waves."""
+    coma: Finite
+    """W131, waves."""
+    astigmatism: Finite
+    """W222, waves."""
+    field_curvature: Finite
+    """W220, waves."""
+    distortion: Finite
+    """W311, waves."""
 
     @property
     def coefficients(self) -> np.ndarray:
@@ -249,14 +272,12 @@ class Zernike(Group):
     disc. The field vector (x, y) has length 1 at `field_edge_deg`.
     """
 
-    kind: Literal["zernike"] = Field(description="Kind of aberrations; decides the other keys")
-    terms: Annotated[
-        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(check_noll)
-    ] = Field(
-        description="Waves RMS by Noll index and power of the field: "
-        "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
-    )
-    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
+    kind: Literal["zernike"]
+    """Kind of aberrations; decides the other keys."""
+    terms: Annotated[dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(check_noll)]
+    """Waves RMS by Noll index and power of the field: z8: {constant: 0.1, x: 0.3, xyy: 0.02}."""
+    jitter_waves: Jitter = 0.0
+    """Standard deviation of what is added to every term of each star."""
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -281,19 +302,19 @@ class Raytraced(OmitsLateKeys):
     """
 
     late_keys = ("decentre_m", "tilt_deg")
-    kind: Literal["raytraced"] = Field(description="Kind of aberrations; decides the other keys")
+    kind: Literal["raytraced"]
+    """Kind of aberrations; decides the other keys."""
     prescription: Prescription
-    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
-        default=0.0, description="Distance of the detector beyond best focus"
-    )
-    decentre_m: Pair = Field(default=(0.0, 0.0), description="Decentre of the secondary, x and y")
-    tilt_deg: Pair = Field(
-        default=(0.0, 0.0), description="Tilt of the secondary about its vertex, about x and y"
-    )
-    highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
-        default=22, description="Highest Noll index of the wavefront"
-    )
-    jitter_waves: Jitter = Field(default=0.0, description="σ added to every term of each star")
+    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = 0.0
+    """Distance of the detector beyond best focus."""
+    decentre_m: Pair = (0.0, 0.0)
+    """Decentre of the secondary, x and y."""
+    tilt_deg: Pair = (0.0, 0.0)
+    """Tilt of the secondary about its vertex, about x and y."""
+    highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = 22
+    """Highest Noll index of the wavefront."""
+    jitter_waves: Jitter = 0.0
+    """Standard deviation of what is added to every term of each star."""
 
     @property
     def misalignment(self) -> np.ndarray:

@@ -26,13 +26,16 @@ class Telescope(Group):
     The pupil is an annulus; the image is that of one wavelength.
     """
 
-    name: Name = Field(description="For titles, files and messages")
-    diameter_m: Positive = Field(description="Outer diameter of the aperture")
-    obscuration: Fraction = Field(description="Linear central obscuration")
-    wavelength_m: Annotated[float, Field(gt=1e-8, lt=1e-3)] = Field(
-        description="Monochromatic wavelength"
-    )
-    pixel_scale_arcsec: Positive = Field(description="Width of a pixel on the sky")
+    name: Name
+    """Name in titles, files and messages."""
+    diameter_m: Positive
+    """Outer diameter of the aperture."""
+    obscuration: Fraction
+    """Linear central obscuration."""
+    wavelength_m: Annotated[float, Field(gt=1e-8, lt=1e-3)]
+    """Monochromatic wavelength."""
+    pixel_scale_arcsec: Positive
+    """Width of a pixel on the sky."""
 
     @property
     def pixel(self) -> float:
@@ -46,11 +49,12 @@ class Seeing(Group):
     The image is the telescope's, convolved with a round profile (`psfdae.optics.seeing.Profile`).
     """
 
-    kind: Literal["gaussian", "moffat"] = Field(description="Profile")
-    fwhm_arcsec: Positive = Field(description="Full width at half maximum of the seeing alone")
-    beta: Annotated[float, Field(ge=1.5, le=20)] | None = Field(
-        default=None, description="Exponent of the Moffat profile (1 + r²/a²)^−β"
-    )
+    kind: Literal["gaussian", "moffat"]
+    """Profile."""
+    fwhm_arcsec: Positive
+    """Full width at half maximum of the seeing alone."""
+    beta: Annotated[float, Field(ge=1.5, le=20)] | None = None
+    """Exponent of the Moffat profile (1 + r²/a²)^−β."""
 
     @model_validator(mode="after")
     def check_beta(self) -> Seeing:
@@ -67,18 +71,18 @@ class Seeing(Group):
 class Prior(Group):
     """Prior of a telescope: how far it may be from its file, as `psfdae wavefront` assumes."""
 
-    fraction: Annotated[float, Field(ge=0, le=10)] = Field(
-        default=0.1, description="Relative standard deviation of every term"
-    )
-    waves: Jitter | None = Field(
-        default=None, description="Standard deviation in waves besides; null: jitter_waves"
-    )
-    defocus_m: Positive = Field(default=1e-4, description="σ of the detector's defocus (ray trace)")
-    decentre_m: Positive = Field(default=1e-3, description="σ of the secondary's decentre, x and y")
-    tilt_deg: Positive = Field(default=0.1, description="σ of the secondary's tilt about x and y")
-    seeing: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.0, description="Relative σ of the seeing's FWHM in a joint fit; 0: as given"
-    )
+    fraction: Annotated[float, Field(ge=0, le=10)] = 0.1
+    """Relative standard deviation of every term."""
+    waves: Jitter | None = None
+    """Standard deviation in waves besides; null: jitter_waves."""
+    defocus_m: Positive = 1e-4
+    """Standard deviation of the detector's defocus (ray trace)."""
+    decentre_m: Positive = 1e-3
+    """Standard deviation of the secondary's decentre, x and y."""
+    tilt_deg: Positive = 0.1
+    """Standard deviation of the secondary's tilt about x and y."""
+    seeing: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    """Relative σ of the seeing's FWHM in a joint fit; 0: as given."""
 
 
 def aberrations_by_kind(tree: Any) -> Any:
@@ -101,14 +105,14 @@ class OwnTelescope(OmitsLateKeys, Telescope):
     """Telescope of one's own, with its field and aberrations (config/dataset/_telescope.yaml)."""
 
     late_keys = ("seeing", "prior")
-    field_edge_deg: Annotated[float, Field(gt=0, le=45)] = Field(
-        description="Field angle of the outermost field on an axis, where the relative field is 1"
-    )
-    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(aberrations_by_kind)] = (
-        Field(description="Static aberrations over the field")
-    )
-    seeing: Seeing | None = Field(default=None, description="Null: a telescope above the air")
-    prior: Prior = Field(default=Prior(), description="Prior of the telescope's state")
+    field_edge_deg: Annotated[float, Field(gt=0, le=45)]
+    """Field angle of the outermost field on an axis, where the relative field is 1."""
+    aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(aberrations_by_kind)]
+    """Static aberrations over the field."""
+    seeing: Seeing | None = None
+    """Null: a telescope above the air."""
+    prior: Prior = Prior()
+    """Prior of the telescope's state."""
 
     @property
     def blur(self) -> Profile | None:

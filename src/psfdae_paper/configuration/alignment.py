@@ -42,46 +42,38 @@ class Alignment(Group):
     stamp_keys: ClassVar = (*wavefront_keys, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
 
     # The paper's ranges (section 3.3).
-    decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
-        1e-3, description="Decentre of the secondary in x and y: ± this"
-    )
-    tilt_range_deg: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.1, description="Tilt of the secondary about x and y: ± this"
-    )
+    decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = 1e-3
+    """Decentre of the secondary in x and y: ± this."""
+    tilt_range_deg: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Tilt of the secondary about x and y: ± this."""
     # In focus an astigmatic image is nearly the same for opposite signs of the astigmatism, so a
     # tilt and its opposite, each with a matching decentre, give nearly the same nine stamps; a
     # known defocus (0.3 waves RMS) tells them apart. The paper only says that the CCD stays in a
     # fixed position.
-    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
-        2e-4, description="Fixed distance of the CCD beyond best focus"
-    )
-    field_radius_deg: Annotated[float, Field(gt=0, le=5)] = Field(
-        0.5, description="Radius of the circle of field points; one more is in the centre"
-    )
-    field_points: Annotated[int, Field(ge=1, le=64)] = Field(
-        8, description="Field points on the circle"
-    )
+    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = 2e-4
+    """Fixed distance of the CCD beyond best focus."""
+    field_radius_deg: Annotated[float, Field(gt=0, le=5)] = 0.5
+    """Radius of the circle of field points; one more is in the centre."""
+    field_points: Annotated[int, Field(ge=1, le=64)] = 8
+    """Field points on the circle."""
     # Terms of higher order are small in this telescope; few terms make the model fast.
-    highest_zernike: Annotated[int, Field(ge=11, le=28)] = Field(
-        22, description="Highest Noll index of the wavefront"
-    )
-    model_tolerance_waves: Positive = Field(
-        5e-4, description="Largest RMS by which the quadratic model may differ from ray tracing"
-    )
+    highest_zernike: Annotated[int, Field(ge=11, le=28)] = 22
+    """Highest Noll index of the wavefront."""
+    model_tolerance_waves: Positive = 5e-4
+    """Largest RMS by which the quadratic model may differ from ray tracing."""
     # Stamps are centred on the centroid and not jittered, so that there is no shift to estimate.
-    stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = Field(
-        16, description="Side d of a stamp, centred on the image's centroid"
-    )
-    least_energy: Annotated[float, Field(gt=0, lt=1)] = Field(
-        0.9, description="A stamp with less than this part of the light is refused"
-    )
+    stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = 16
+    """Side d of a stamp, centred on the image's centroid."""
+    least_energy: Annotated[float, Field(gt=0, lt=1)] = 0.9
+    """A stamp with less than this part of the light is refused."""
     # 5 levels in each of 4 degrees of freedom: the paper's 625 states.
-    grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
-        5, description="Levels per degree of freedom of the grid of states"
-    )
+    grid_levels: Annotated[int, Field(ge=2, le=9)] = 5
+    """Levels per degree of freedom of the grid of states."""
     # As many states as the grid has, but drawn at random.
-    test_states: Count = Field(625, description="Uniform states of the independent test set")
-    train_states: Count = Field(12000, description="Uniform states of the large training set")
+    test_states: Count = 625
+    """Uniform states of the independent test set."""
+    train_states: Count = 12000
+    """Uniform states of the large training set."""
 
     @property
     def unit(self) -> np.ndarray:
@@ -98,19 +90,19 @@ class Cnn(Group):
     """Convolutions and a linear layer, the paper's network (section 3.3)."""
 
     # The paper does not state them; with these its training takes less than a minute.
-    widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        [64, 64, 128, 128, 128], description="Channels after every convolution"
-    )
+    widths: Annotated[list[Count], Field(min_length=1)] = Field([64, 64, 128, 128, 128])
+    """Channels after every convolution."""
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=15)]], Field(min_length=1)] = Field(
-        [5, 3, 3, 3, 3], description="Kernel sizes of the convolutions; odd"
+        [5, 3, 3, 3, 3]
     )
+    """Kernel sizes of the convolutions; odd."""
     strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
-        [2, 1, 2, 1, 2], description="Strides of the convolutions"
+        [2, 1, 2, 1, 2]
     )
+    """Strides of the convolutions."""
     # A neuron that is never active would not learn otherwise.
-    leak: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.01, description="Slope of the leaky ReLU below 0"
-    )
+    leak: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    """Slope of the leaky ReLU below 0."""
 
     @model_validator(mode="after")
     def check_layers(self) -> Cnn:
@@ -140,12 +132,10 @@ class Perceptron(Group):
     """Fully connected layers after the stamps' leading principal components; not in the paper."""
 
     # Fewer inputs than pixels, so that layers may be fully connected.
-    components: Count = Field(
-        128, description="Principal components of all stamps of a state together"
-    )
-    widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        [512, 256], description="Neurons of every inner layer"
-    )
+    components: Count = 128
+    """Principal components of all stamps of a state together."""
+    widths: Annotated[list[Count], Field(min_length=1)] = Field([512, 256])
+    """Neurons of every inner layer."""
 
 
 NETWORKS: dict[str, type[Cnn] | type[Perceptron]] = {"cnn": Cnn, "perceptron": Perceptron}
@@ -159,34 +149,32 @@ class NetworkTrain(Group):
     """
 
     # What is trained, and for how long.
-    network: Literal["cnn", "perceptron"] = Field("cnn", description="Network that is trained")
-    epochs: Count = Field(100, description="Passes over the training states")
-    batch: Annotated[int, Field(ge=2)] = Field(10, description="States per step")
+    network: Literal["cnn", "perceptron"] = "cnn"
+    """Network that is trained."""
+    epochs: Count = 100
+    """Passes over the training states."""
+    batch: Annotated[int, Field(ge=2)] = 10
+    """States per step."""
     # Course of the optimisation.
-    lr: Annotated[float, Field(gt=0, le=1)] = Field(
-        1e-3, description="Adam's learning rate (its maximum if one-cycle)"
-    )
-    schedule: Literal["steps", "onecycle"] = Field(
-        "steps", description="Course of the learning rate"
-    )
-    decay: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.1, description="Factor of the learning rate at each step of the schedule"
-    )
-    decay_epochs: Count = Field(30, description="Epochs between steps of the schedule")
+    lr: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    """Adam's learning rate (its maximum if one-cycle)."""
+    schedule: Literal["steps", "onecycle"] = "steps"
+    """Course of the learning rate."""
+    decay: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Factor of the learning rate at each step of the schedule."""
+    decay_epochs: Count = 30
+    """Epochs between steps of the schedule."""
     # What makes more of the training states.
-    mirrors: bool = Field(
-        False, description="Train on the telescope's mirror images and average estimates over them"
-    )
-    noise_draws: Count = Field(
-        1,
-        description="Draws of each field's noise where the DAE's output is learnt, whose "
-        "computation takes long; noisy stamps get new noise in every epoch",
-    )
+    mirrors: bool = False
+    """Train on the telescope's mirror images and average estimates over them."""
+    noise_draws: Count = 1
+    """Draws of each field's noise where the DAE's output is learnt, whose computation takes long;
+    noisy stamps get new noise in every epoch."""
     # These change no result but by rounding.
-    threads: Count = Field(1, description="Threads of the training")
-    checkpoint_seconds: CheckpointSeconds = Field(
-        20.0, description="Least time between checkpoints; repeats nothing"
-    )
+    threads: Count = 1
+    """Threads of the training."""
+    checkpoint_seconds: CheckpointSeconds = 20.0
+    """Least time between checkpoints; repeats nothing."""
 
 
 class Fit(Group):
@@ -196,20 +184,19 @@ class Fit(Group):
     """
 
     # With more states the fit is slower, and closer to the exact optics.
-    neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
-        60,
-        description="Computed states that a stamp is interpolated from, in all but the last step",
-    )
+    neighbours: Annotated[int, Field(ge=5, le=1000)] = 60
+    """Computed states that a stamp is interpolated from, in all but the last step."""
     # Without these states, estimates at the edge of the range would be less accurate.
-    outer_states: Count = Field(400, description="States beyond the range that are computed for it")
+    outer_states: Count = 400
+    """States beyond the range that are computed for it."""
     # A fit ends by its tolerance, or here.
-    iterations: Count = Field(12, description="Most steps of a fit")
+    iterations: Count = 12
+    """Most steps of a fit."""
     # After a step of 0.3 standard errors, a few hundredths remain to the maximum.
-    tolerance: Positive = Field(
-        0.3, description="A step of this many standard errors or fewer is the last"
-    )
+    tolerance: Positive = 0.3
+    """A step of this many standard errors or fewer is the last."""
     # Relative to the diagonal of the information matrix.
-    damping: Positive = Field(1e-3, description="Levenberg damping of the first step")
-    limit: Annotated[float, Field(ge=1, le=2)] = Field(
-        1.25, description="States are kept within ± this, in units of the range"
-    )
+    damping: Positive = 1e-3
+    """Levenberg damping of the first step."""
+    limit: Annotated[float, Field(ge=1, le=2)] = 1.25
+    """States are kept within ± this, in units of the range."""

@@ -94,13 +94,12 @@ class Groups:
 
 
 def command(
-    name: str,
-    reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
-    choice: tuple[str, ...] = (),
+    name: str, reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = ()
 ) -> Callable[[Function], Function]:
     """Make a function the command `name`; its `config` has groups of the configuration.
 
-    See `psfdae.commands.cli.command`, and `Groups` for `reads` and `choice`.
+    See `psfdae.commands.cli.command`, and `Groups` for `reads`. Those of "alignment …" are for
+    scene 3 alone, and choose its dataset.
 
     Parameters
     ----------
@@ -108,8 +107,7 @@ def command(
         Up to three words, such as "alignment figure stamps".
     reads : tuple of str, or callable
         Groups that the function gets as `config`; none if it has no such parameter.
-    choice : tuple of str
-        Overrides that precede those of the user.
     """
+    choice = ("dataset=alignment",) if name.startswith("alignment ") else ()
     # The command line calls `Groups` with the options, the file and the words that are left.
     return cli.command(name, Groups(reads, choice))

@@ -147,7 +147,7 @@ def _reason(error: Exception, folder: Path) -> str:
 
     # An option of a group that does not exist: those that there are, the likeliest first.
     if isinstance(error, MissingConfigException) and error.options:
-        group, _, option = str(error.missing_cfg_file).rpartition("/")
+        group, _, option = str(error.missing_cfg_file).partition("/")
         options = [name for name in error.options if not name.startswith("_")]
         hint = did_you_mean(option, options)
         return f"{group}={option}: no such option; there are {', '.join(options)}{hint}"
@@ -224,9 +224,9 @@ def _is_alignment(tree: Mapping[str, Any]) -> bool:
 def _require_known_groups(tree: Mapping[str, Any]) -> None:
     """Raise ConfigError if a tree has a group that the configuration does not have."""
     # Groups that a user adds by mistake would be ignored otherwise.
-    unknown = sorted(set(tree) - set(whole_config().model_fields))
-    if unknown:
-        raise ConfigError(f"{unknown[0]}: unknown key")
+    names = whole_config().model_fields
+    if unknown := sorted(set(tree) - set(names)):
+        raise ConfigError(f"{unknown[0]}: unknown key{did_you_mean(unknown[0], names)}")
 
 
 Model = TypeVar("Model", bound=Group)

@@ -49,22 +49,21 @@ class Grid(Group):
     """
 
     # Null values are derived in `consistency`.
-    points: Count = Field(description="Field points along a side")
-    spacing_deg: Positive = Field(
-        description="Distance of neighbouring field points; null: the outermost lie at edge_deg"
-    )
-    edge_deg: Positive = Field(
-        description="Field angle at which the relative field H is 1; null: that of the telescope"
-    )
+    points: Count
+    """Field points along a side."""
+    spacing_deg: Positive
+    """Distance of neighbouring field points; null: the outermost lie at edge_deg."""
+    edge_deg: Positive
+    """Field angle at which the relative field H is 1; null: that of the telescope."""
 
 
 class Scene(Group):
     """A family of static PSFs: what causes the aberrations of the telescope."""
 
-    name: Literal["seidel", "turbulence", "telescope"] = Field(
-        description="Module that makes its wavefronts"
-    )
-    experiment: Name = Field(description="The paper's scene, and the MLflow experiment")
+    name: Literal["seidel", "turbulence", "telescope"]
+    """Module that makes its wavefronts."""
+    experiment: Name
+    """The paper's scene, and the MLflow experiment."""
 
 
 class Stars(Group):
@@ -73,20 +72,18 @@ class Stars(Group):
     Aberrations of a star are those of its field, each times 1 + `aberration_fraction` · N(0, 1).
     """
 
-    name: Name = Field(description="Names the file of the stars")
+    name: Name
+    """Names the file of the stars."""
     # Stars of all splits together.
-    count: Count = Field(description="Number of stars")
+    count: Count
+    """Number of stars."""
     # The paper's 10 and 50 %; 0 makes every star its template.
-    aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
-        description="Relative standard deviation of every aberration term"
-    )
-    search_px: Annotated[int, Field(ge=4, le=512)] = Field(
-        description="Search distance for the brightest pixel of a star; null: search_lambda_d"
-    )
-    search_lambda_d: SearchDistance = Field(
-        default=search_distance(),
-        description="The same in λ/D of whatever telescope, if search_px is null",
-    )
+    aberration_fraction: Annotated[float, Field(ge=0, le=10)]
+    """Relative standard deviation of every aberration term."""
+    search_px: Annotated[int, Field(ge=4, le=512)]
+    """Search distance for the brightest pixel of a star; null: search_lambda_d."""
+    search_lambda_d: SearchDistance = search_distance()
+    """The same in λ/D of whatever telescope, if search_px is null."""
 
 
 class Framing(Stamp):
@@ -95,18 +92,14 @@ class Framing(Stamp):
     Side, centring error and sub-pixel position are keys of `Stamp`, which own images have, too.
     """
 
-    search_px: Annotated[int, Field(ge=4, le=512)] = Field(
-        description="A template's brightest pixel is searched within ± this of the chief ray; "
-        "null: search_lambda_d"
-    )
-    search_lambda_d: SearchDistance = Field(
-        default=search_distance(),
-        description="The same in λ/D of whatever telescope, if search_px is null",
-    )
+    search_px: Annotated[int, Field(ge=4, le=512)]
+    """A template's brightest pixel is searched within ± this of the chief ray; null:
+    search_lambda_d."""
+    search_lambda_d: SearchDistance = search_distance()
+    """The same in λ/D of whatever telescope, if search_px is null."""
     # Mirror-symmetric PSFs have equal maxima, between which rounding would choose.
-    tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
-        description="Pixels within this fraction of the maximum count as equally bright"
-    )
+    tie: Annotated[float, Field(ge=0, lt=0.1)]
+    """Pixels within this fraction of the maximum count as equally bright."""
 
 
 class WholePeriodOptics(Group):
@@ -116,17 +109,15 @@ class WholePeriodOptics(Group):
     number of samples, and by rounding on batch and threads.
     """
 
-    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
-        Field(description="Grid sizes N, ascending; each wavefront takes the first that suffices")
-    )
-    precision: Literal["complex64", "complex128"] = Field(
-        description="Precision of the propagation"
-    )
+    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)]
+    """Grid sizes N, ascending; each wavefront takes the first that suffices."""
+    precision: Literal["complex64", "complex128"]
+    """Precision of the propagation."""
     # More per batch need more memory.
-    batch: Count = Field(description="Wavefronts per batch")
-    threads: Count = Field(
-        description="Batches in parallel, each with one thread of linear algebra"
-    )
+    batch: Count
+    """Wavefronts per batch."""
+    threads: Count
+    """Batches in parallel, each with one thread of linear algebra."""
 
     @field_validator("pupil_samples")
     @classmethod
@@ -147,7 +138,8 @@ class Optics(WholePeriodOptics):
     """Numerical settings of the propagation by matrix products, which computes stamps only."""
 
     # Both give the same results but for rounding.
-    backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
+    backend: Literal["numpy", "torch"]
+    """Library of the matrix products."""
 
 
 def checked_optics(tree: object) -> object:
@@ -183,17 +175,15 @@ class Dataset(Group):
     Its name is that of its file. Every split and reference has trainings and tables of its own.
     """
 
-    name: Name = Field(description="Names folders, tables and figures")
+    name: Name
+    """Names folders, tables and figures."""
     # Each combination of split and reference is a training.
-    splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
-        description="Test stars of all fields, or of fields never seen in training"
-    )
-    references: Annotated[list[Reference], Field(min_length=1)] = Field(
-        description="The truth: the star's own noise-free image, or the PSF of its field"
-    )
-    shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Noise levels λ of the figure of restored stars; extremes if none is in band"
-    )
+    splits: Annotated[list[SplitKind], Field(min_length=1)]
+    """Test stars of all fields, or of fields never seen in training."""
+    references: Annotated[list[Reference], Field(min_length=1)]
+    """The truth: the star's own noise-free image, or the PSF of its field."""
+    shown_levels: Annotated[list[Positive], Field(min_length=1)]
+    """Noise levels λ of the figure of restored stars; extremes if none is in band."""
 
 
 class Calibration(Group):
@@ -203,34 +193,36 @@ class Calibration(Group):
     of the paper's tables that depend on no method.
     """
 
-    stars: Count = Field(description="Stars simulated per point of the scan")
-    pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)] = Field(
-        description="Pixel scales scanned, ascending"
-    )
-    r0_m: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Fried parameters scanned (scene 2; scene 1 has none)"
-    )
+    stars: Count
+    """Stars simulated per point of the scan."""
+    pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)]
+    """Pixel scales scanned, ascending."""
+    r0_m: Annotated[list[Positive], Field(min_length=1)]
+    """Fried parameters scanned (scene 2; scene 1 has none)."""
     # The SSIM has constants in proportion to the square of the dynamic range.
-    data_ranges: Annotated[list[Positive], Field(min_length=2)] = Field(
-        description="SSIM dynamic ranges scanned, ascending"
-    )
+    data_ranges: Annotated[list[Positive], Field(min_length=2)]
+    """SSIM dynamic ranges scanned, ascending."""
 
 
 class Benchmark(Group):
     """Run time against error; needs a quiet machine."""
 
     # A machine is never quite without other work.
-    repeats: Count = Field(description="Timings of every point; the median is reported")
-    stamps: Count = Field(description="Stamps per timing of a kernel")
-    peers: bool = Field(description="Time POPPY beside our kernels")
+    repeats: Count
+    """Timings of every point; the median is reported."""
+    stamps: Count
+    """Stamps per timing of a kernel."""
+    peers: bool
+    """Time POPPY beside our kernels."""
     # From these the growth of the costs is read.
-    star_counts: Annotated[list[Count], Field(min_length=2)] = Field(
-        description="Numbers of stars at which time, memory and disk are measured, ascending"
-    )
+    star_counts: Annotated[list[Count], Field(min_length=2)]
+    """Numbers of stars at which time, memory and disk are measured, ascending."""
     stamp_sizes: Annotated[
         list[Annotated[int, Field(ge=8, le=256, multiple_of=2)]], Field(min_length=2)
-    ] = Field(description="Stamp sides at which cost is measured, ascending")
-    threads: Count = Field(description="Largest number of threads timed")
+    ]
+    """Stamp sides at which cost is measured, ascending."""
+    threads: Count
+    """Largest number of threads timed."""
 
 
 class Bounds(Group):
@@ -240,24 +232,24 @@ class Bounds(Group):
     """
 
     # Accuracy of the bounds against time and memory.
-    bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    bank_stars: Count
+    """Fresh draws of the simulator in the bank."""
     # Stars of one field are few in a bank for all fields.
-    position_stars: Count = Field(
-        description="Further draws, which only the bound uses that is given the field"
-    )
-    star_draws: Annotated[int, Field(ge=20)] = Field(
-        description="Draws around the best matches of a star that few stars of the bank resemble"
-    )
-    test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
-    threads: Count = Field(description="Threads of the linear algebra")
+    position_stars: Count
+    """Further draws, which only the bound uses that is given the field."""
+    star_draws: Annotated[int, Field(ge=20)]
+    """Draws around the best matches of a star that few stars of the bank resemble."""
+    test_stars: Count
+    """Test stars that are bounded, the first of the part."""
+    threads: Count
+    """Threads of the linear algebra."""
 
 
 class Workflow(Group):
     """Datasets of the default target of the workflow."""
 
-    datasets: Annotated[list[Name], Field(min_length=1)] = Field(
-        description="Options of the group dataset"
-    )
+    datasets: Annotated[list[Name], Field(min_length=1)]
+    """Options of the group dataset."""
 
 
 class Config(Consistent):

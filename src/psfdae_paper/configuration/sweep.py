@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from psfdae.base.errors import did_you_mean
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import groups_of, method
 from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
@@ -34,24 +35,24 @@ class Axis(Group):
     """
 
     # One of three forms: values, choices or a range.
-    values: Annotated[list[Value], Field(min_length=1)] | None = Field(
-        default=None, description="Listed values; a bare list means the same"
-    )
-    choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = Field(
-        default=None, description="Name of each choice, and the keys with values that it stands for"
-    )
+    values: Annotated[list[Value], Field(min_length=1)] | None = None
+    """Listed values; a bare list means the same."""
+    choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = None
+    """Name of each choice, and the keys with values that it stands for."""
     # Both ends belong to the range.
-    low: Finite | None = Field(default=None, description="Lower end of a range")
-    high: Finite | None = Field(default=None, description="Upper end of a range")
-    log: bool = Field(default=False, description="A range that is even in the logarithm")
-    integer: bool = Field(default=False, description="A range of whole numbers")
+    low: Finite | None = None
+    """Lower end of a range."""
+    high: Finite | None = None
+    """Upper end of a range."""
+    log: bool = False
+    """A range that is even in the logarithm."""
+    integer: bool = False
+    """A range of whole numbers."""
     # What the value of the axis changes.
-    keys: Annotated[list[str], Field(min_length=1)] | None = Field(
-        default=None, description="Configuration keys that get the value; default: the axis' name"
-    )
-    repeat: Count | None = Field(
-        default=None, description="The key gets a list with the value this many times"
-    )
+    keys: Annotated[list[str], Field(min_length=1)] | None = None
+    """Configuration keys that get the value; default: the axis' name."""
+    repeat: Count | None = None
+    """The key gets a list with the value this many times."""
 
     @model_validator(mode="before")
     @classmethod
@@ -154,28 +155,35 @@ class Sweep(Group):
     """
 
     # What is trained, and on which data.
-    kind: Literal["grid", "random", "adaptive"] = Field(
-        description="Every combination, random draws, or draws that learn from earlier ones"
-    )
-    model: str = Field(description="Method, or one of scene 3's networks")
-    dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
-    split: SplitKind = Field(default="random", description="Split of the stars")
-    reference: Reference = Field(default="realisation", description="What the DAE is to restore")
+    kind: Literal["grid", "random", "adaptive"]
+    """Every combination, random draws, or draws that learn from earlier ones."""
+    model: str
+    """Method, or one of scene 3's networks."""
+    dataset: Name | None = None
+    """Dataset; none for scene 3's networks."""
+    split: SplitKind = "random"
+    """Split of the stars."""
+    reference: Reference = "realisation"
+    """Truth that the DAE is to restore."""
     # How the best point is chosen; errors on the test part choose nothing.
-    metric: Metric = Field(description="Chooses the best point: over all noise levels")
-    direction: Literal["minimize", "maximize"] = Field(description="Which metric is better")
+    metric: Metric
+    """Chooses the best point: over all noise levels."""
+    direction: Literal["minimize", "maximize"]
+    """Direction of a better metric."""
     # What all points share, and what is varied.
-    overrides: dict[AxisName, Value] = Field(
-        default={}, description="Configuration keys that all points share"
-    )
-    space: Annotated[dict[AxisName, Axis], Field(min_length=1)] = Field(
-        description="What is varied, by name"
-    )
+    overrides: dict[AxisName, Value] = Field(default={})
+    """Configuration keys that all points share."""
+    space: Annotated[dict[AxisName, Axis], Field(min_length=1)]
+    """Axes that are varied, by name."""
     # Of random and adaptive sweeps.
-    trials: Count | None = Field(default=None, description="Number of draws; a grid has none")
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Seed of the draws")
-    startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
-    parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
+    trials: Count | None = None
+    """Number of draws; a grid has none."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of the draws."""
+    startup: Count = 4
+    """Adaptive: random trials before it learns."""
+    parallel: Count = 2
+    """Adaptive: trials that may run at once."""
 
     @field_validator("model")
     @classmethod
@@ -325,6 +333,7 @@ def load_sweep(name: str) -> Sweep:
     name : str
         Name of the file, without its suffix.
     """
-    if name not in sweep_names():
-        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")
+    if name not in (names := sweep_names()):
+        hint = did_you_mean(name, names)
+        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(names)}{hint}")
     return load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")

@@ -19,21 +19,25 @@ class VonKarman(Group):
     its fraction s of the turbulence, r0_l = r0 s^(−3/5). Lengths are in metres.
     """
 
-    kind: Literal["von_karman"] = Field(description="Tells which keys follow")
+    kind: Literal["von_karman"]
+    """Tells which keys follow."""
     # The turbulence is static: one realisation for all stars.
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Seed of the turbulence")
-    r0_m: Positive = Field(description="Fried parameter of all layers at the telescope's band")
-    outer_scale_m: Positive = Field(description="Outer scale L0")
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    """Seed of the turbulence."""
+    r0_m: Positive
+    """Fried parameter of all layers at the telescope's band."""
+    outer_scale_m: Positive
+    """Outer scale L0."""
     # A layer at height h is seen from the field angle θ displaced by h θ.
-    layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)] = Field(
-        description="Heights of the layers above the telescope"
-    )
-    layer_strengths: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Fraction of the turbulence in each layer"
-    )
+    layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
+    """Heights of the layers above the telescope."""
+    layer_strengths: Annotated[list[Positive], Field(min_length=1)]
+    """Fraction of the turbulence in each layer."""
     # A layer is a sum of plane waves with random phases.
-    waves: Annotated[int, Field(ge=16, multiple_of=8)] = Field(description="Plane waves per layer")
-    remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
+    waves: Annotated[int, Field(ge=16, multiple_of=8)]
+    """Plane waves per layer."""
+    remove_tilt: bool
+    """Remove tip and tilt over the lit pupil."""
 
     @model_validator(mode="after")
     def check_layers(self) -> VonKarman:
@@ -59,4 +63,5 @@ class VonKarman(Group):
 class OfTelescope(Group):
     """Aberrations that are settings of the group telescope."""
 
-    kind: Literal["telescope"] = Field(description="Tells which keys follow")
+    kind: Literal["telescope"]
+    """Tells which keys follow."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from psfdae.base.figures import STAMP_MAP, new_figure, styled
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FieldOfPsfs:
-    """Static PSFs of F field points and their shapes.
+    """Static PSFs of F field points, and what was measured of them.
 
     Attributes
     ----------
@@ -31,19 +32,16 @@ class FieldOfPsfs:
         Grid index (ix, iy).
     field : ndarray, shape (F, 2)
         Field angle (x, y) in radians.
-    energy : ndarray, shape (F,)
-        Fraction of the light inside the stamp.
-    fwhm_arcsec, ellipticity, position_angle_deg : ndarray, shape (F,)
-        See `psfdae.stars.moments.Shapes`.
+    table : DataFrame
+        A row for each: x_deg, y_deg, the field angle in degrees; energy, the fraction of the light
+        inside the stamp; fwhm_arcsec, ellipticity and position_angle_deg, as
+        `psfdae.stars.moments.Shapes` explains them; pupil_samples.
     """
 
     psf: np.ndarray
     grid: np.ndarray
     field: np.ndarray
-    energy: np.ndarray
-    fwhm_arcsec: np.ndarray
-    ellipticity: np.ndarray
-    position_angle_deg: np.ndarray
+    table: pd.DataFrame
 
 
 def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
@@ -139,19 +137,20 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     bar.set_ticks(np.sqrt(ticks), labels=[f"{tick:g}" for tick in ticks])
     bar.set_label("pixel flux / maximum of the stamp")
     # Light inside the stamp, with numbers unless they would touch.
+    energy = fields.table.energy.to_numpy()
     light_axes = figure.add_subplot(grid[0, 1])
-    image = _draw_map(light_axes, fields, fields.energy, "viridis", "light inside the stamp")
+    image = _draw_map(light_axes, fields, energy, "viridis", "light inside the stamp")
     if fields.grid.max() < 7:
-        _write_values(light_axes, image, fields.energy, fields.field, fontsize=6.5)
+        _write_values(light_axes, image, energy, fields.field, fontsize=6.5)
     # FWHM, with whiskers: that of a line (ellipticity 1) is 1.6 distances of field points long.
     fwhm_axes = figure.add_subplot(grid[1, 1])
-    _draw_map(fwhm_axes, fields, fields.fwhm_arcsec, "cividis", "FWHM (arcsec)")
+    _draw_map(fwhm_axes, fields, fields.table.fwhm_arcsec.to_numpy(), "cividis", "FWHM (arcsec)")
     # Spacing of the field points in the unit of the axes, for the length of the whiskers.
     position, _ = in_field_unit(fields.field)
     points = int(fields.grid[:, 0].max()) + 1
     spacing = float(np.ptp(position[:, 0])) / (points - 1) if points > 1 else 1.0
-    angle = np.deg2rad(fields.position_angle_deg)
-    half_length = 0.5 * 1.6 * spacing * fields.ellipticity
+    angle = np.deg2rad(fields.table.position_angle_deg.to_numpy())
+    half_length = 0.5 * 1.6 * spacing * fields.table.ellipticity.to_numpy()
     half_whisker = half_length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     # A white line below each whisker sets it off from the map.
     for start, stop in zip(position - half_whisker, position + half_whisker, strict=True):

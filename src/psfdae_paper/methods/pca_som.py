@@ -31,19 +31,22 @@ if TYPE_CHECKING:
 class Baseline(Group):
     """PCA features clustered by a self-organising map."""
 
-    per_level: bool = Field(
-        True,
-        description="A fit for each noise level λ, on stars of its noise; else one for mixed λ",
-    )
-    components: Count = Field(20, description="Principal components K")
-    rows: Count = Field(11, description="Rows of the map")
-    columns: Count = Field(11, description="Columns of the map")
-    epochs: Count = Field(10, description="Passes over the training stars, t_max")
-    sigma: Positive = Field(1.0, description="Initial neighbourhood radius in map nodes")
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.5, description="Initial learning rate of the map"
-    )
-    threads: Count = Field(1, description="Threads of the linear algebra")
+    per_level: bool = True
+    """A fit for each noise level λ, on stars of its noise; else one for mixed λ."""
+    components: Count = 20
+    """Principal components K."""
+    rows: Count = 11
+    """Rows of the map."""
+    columns: Count = 11
+    """Columns of the map."""
+    epochs: Count = 10
+    """Passes over the training stars, t_max."""
+    sigma: Positive = 1.0
+    """Initial neighbourhood radius in map nodes."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Initial learning rate of the map."""
+    threads: Count = 1
+    """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True)

@@ -44,13 +44,8 @@ StatesFile = Annotated[File, "Product of `alignment states`."]
 TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-@command(
-    "alignment model", reads=("telescope", "prescription", "alignment"), choice=Alignment.choice
-)
-def model(
-    config: Config,
-    out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
-) -> None:
+@command("alignment model", reads=("telescope", "prescription", "alignment"))
+def model(config: Config, out: File) -> None:
     """Fit the quadratic model to few ray-traced states, verify it on the grid.
 
     Rays through the misaligned telescope give the Zernike coefficients at all fields. They are
@@ -60,6 +55,11 @@ def model(
 
     The product has the coefficients in waves for each field, and the RMS residual from ray tracing
     for each state of the grid and field.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with the quadratic model of the wavefront.
     """
     # Few small arrays: threads would not pay.
     limit_threads(1)
@@ -145,15 +145,12 @@ def read_states(
     return product
 
 
-@command("alignment states", reads=Alignment.state_groups, choice=Alignment.choice)
+@command("alignment states", reads=Alignment.state_groups)
 def states(
     config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
-    out: Annotated[File, "HDF5 product with states and their noise-free stamps."],
-    model: Annotated[
-        File | None,
-        "Product of `alignment model`: take wavefronts from it instead of tracing rays.",
-    ] = None,
+    out: File,
+    model: File | None = None,
 ) -> None:
     """Simulate the noise-free stamps of a set of states.
 
@@ -163,6 +160,13 @@ def states(
 
     Wavefronts come from traced rays or, with --model, from the quadratic model, which takes less
     time. The product also has the Zernike coefficients in waves, and the light inside each stamp.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with states and their noise-free stamps.
+    model : Path, optional
+        Product of `alignment model`: take wavefronts from it instead of tracing rays.
     """
     limit_threads(1)  # optics.threads batches run in parallel
     alignment = config.alignment
@@ -214,20 +218,23 @@ def _geometry(config: Config) -> dict[str, Column]:
     }
 
 
-@command("alignment telescope", reads=("telescope", "alignment"), choice=Alignment.choice)
-def telescope(
-    config: Config,
-    model: ModelFile,
-    grid: Annotated[File, "Product of `alignment states --set grid`."],
-    uniform: Annotated[File, "Product of `alignment states --set uniform`."],
-    out: Annotated[File, "CSV with key figures."],
-) -> None:
+@command("alignment telescope", reads=("telescope", "alignment"))
+def telescope(config: Config, model: ModelFile, grid: File, uniform: File, out: File) -> None:
     """Tabulate key figures of telescope, model and stamps.
 
     They say how well the model reproduces rays, how far the telescope is out of focus, how well
     images separate the four numbers of a state, and how much light the stamps hold.
 
     A row has a quantity, its value and its unit. Products of another telescope are refused.
+
+    Parameters
+    ----------
+    grid : Path
+        Product of `alignment states --set grid`.
+    uniform : Path
+        Product of `alignment states --set uniform`.
+    out : Path
+        CSV with key figures.
     """
     # The model, and the two sets that serve as tests.
     quadratic = read_product(model, "alignment_model")

@@ -63,15 +63,9 @@ Trained = Annotated[Folder, "Folder for weights, config and history."]
 DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 
 
-@command(
-    "alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=Alignment.choice
-)
+@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"))
 def train_dae(
-    config: Config,
-    grid: Annotated[File, "Product of `alignment states --set grid`."],
-    train: Annotated[File, "Product of `alignment states --set train`: its first states validate."],
-    checkpoint: Checkpoint,
-    out: Trained,
+    config: Config, grid: File, train: File, checkpoint: Checkpoint, out: Trained
 ) -> None:
     """Train the DAE on the stamps of the grid.
 
@@ -80,6 +74,13 @@ def train_dae(
 
     The folder gets weights, settings and the error of every epoch. An interrupted training goes on
     from the checkpoint, and ends with the same bytes.
+
+    Parameters
+    ----------
+    grid : Path
+        Product of `alignment states --set grid`.
+    train : Path
+        Product of `alignment states --set train`: its first states validate.
     """
     # Both sets must have stamps of the same telescope.
     grid_product = read_states(grid)
@@ -124,20 +125,14 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-network", reads=network_groups, choice=Alignment.choice)
+@command("alignment train-network", reads=network_groups)
 def train_network(
     config: Config,
-    kind: Annotated[
-        str,
-        click.Choice(trained_networks()),
-        "Clean stamps, noisy stamps, or the DAE's output for noisy stamps.",
-    ],
-    states: Annotated[File, "Product of `alignment states`: the grid or the large set."],
+    kind: Annotated[str, click.Choice(trained_networks())],
+    states: File,
     checkpoint: Checkpoint,
     out: Trained,
-    dae: Annotated[
-        DaeFolder | None, "Folder of `alignment train-dae`. For networks behind the DAE only."
-    ] = None,
+    dae: DaeFolder | None = None,
 ) -> None:
     """Train a network that estimates states of misalignment.
 
@@ -147,6 +142,15 @@ def train_network(
 
     With --dae the stamps are what the DAE makes of noisy ones. An interrupted training goes on from
     its checkpoint if stamps and settings are the same, and ends with the same bytes.
+
+    Parameters
+    ----------
+    kind : str
+        Clean stamps, noisy stamps, or the DAE's output for noisy stamps.
+    states : Path
+        Product of `alignment states`: the grid or the large set.
+    dae : Path, optional
+        Folder of `alignment train-dae`. For networks behind the DAE only.
     """
     from psfdae.methods.networks.training import fingerprint, progress, train
     from psfdae.methods.networks.weights import save_weights
@@ -342,15 +346,15 @@ def network_predictor(
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
 
-@command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
+@command("alignment estimate", reads=("seed", "noise", "evaluation"))
 def estimate(
     config: Config,
     test_set: TestSet,
     states: StatesFile,
     dae: DaeFolder,
     networks: NetworkFolders,
-    out: Annotated[File, "HDF5 product with the estimates of all learned methods."],
-    times: Annotated[File, "CSV that receives the run times."],
+    out: File,
+    times: File,
 ) -> None:
     """Estimate the states of a test set with every learned method.
 
@@ -358,6 +362,13 @@ def estimate(
 
     The product has the true states, the noise levels, and the estimates by level and method, all in
     units of the range; the table of run times has seconds for the whole set.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with the estimates of all learned methods.
+    times : Path
+        CSV that receives the run times.
     """
     limit_threads(config.evaluation.threads)
     product = read_states(states)
@@ -418,18 +429,17 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
 @command(
     "alignment fit",
     reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
-    choice=Alignment.choice,
 )
 def fit_alignment_method(
     config: Config,
     test_set: TestSet,
-    level: Annotated[float, AboveZero, "Noise level λ."],
+    level: Annotated[float, AboveZero],
     states: StatesFile,
-    train: Annotated[File, "Product of `alignment states --set train`: most steps go by it."],
+    train: File,
     model: ModelFile,
-    network: Annotated[Folder, "Folder of the network that starts the fit."],
-    out: Annotated[File, "HDF5 product with the fits."],
-    times: Annotated[File, "CSV that receives the run time."],
+    network: Folder,
+    out: File,
+    times: File,
 ) -> None:
     """Fit the states of a test set by maximum likelihood.
 
@@ -439,6 +449,19 @@ def fit_alignment_method(
 
     The product has, for each fit, the estimates in units of the range, the deviance, how many
     stamps were computed, whether it has converged, and whether the twin was better.
+
+    Parameters
+    ----------
+    level : float
+        Noise level λ.
+    train : Path
+        Product of `alignment states --set train`: most steps go by it.
+    network : Path
+        Folder of the network that starts the fit.
+    out : Path
+        HDF5 product with the fits.
+    times : Path
+        CSV that receives the run time.
     """
     from psfdae_paper.alignment.emulator import StampEmulator
     from psfdae_paper.alignment.likelihood import StateLikelihood, StateOptics, refit_twins
@@ -510,15 +533,9 @@ def fit_alignment_method(
     _write_times(times, rows)
 
 
-@command(
-    "alignment bound", reads=("telescope", "alignment", "optics", "noise"), choice=Alignment.choice
-)
+@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"))
 def bound(
-    config: Config,
-    test_set: TestSet,
-    states: StatesFile,
-    model: ModelFile,
-    out: Annotated[File, "HDF5 product with Cramér-Rao bounds."],
+    config: Config, test_set: TestSet, states: StatesFile, model: ModelFile, out: File
 ) -> None:
     """Bound the errors of any unbiased estimate.
 
@@ -526,6 +543,11 @@ def bound(
     of a state hold about its four numbers, with flux and place of the stars known and unknown.
 
     The product has a covariance (4, 4) in units of the range for each bound, noise level and state.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with Cramér-Rao bounds.
     """
     from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
 

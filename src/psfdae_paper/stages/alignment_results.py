@@ -185,8 +185,8 @@ def tables(
     estimates: Estimates,
     fits: Fits,
     bounds: Bounds,
-    errors: Annotated[File, "CSV that receives the errors."],
-    correlation: Annotated[File, "CSV that receives their correlations."],
+    errors: File,
+    correlation: File,
 ) -> None:
     """Tabulate errors and their correlations.
 
@@ -196,6 +196,13 @@ def tables(
 
     Errors are in units of the range, and in metres and radians. Rows of correlations have the
     measured coefficient of each pair of numbers, or that which the bound predicts.
+
+    Parameters
+    ----------
+    errors : Path
+        CSV that receives the errors.
+    correlation : Path
+        CSV that receives their correlations.
     """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
@@ -230,17 +237,18 @@ def tables(
 
 
 @command("alignment paper-tables")
-def alignment_paper_tables(
-    errors: ErrorTable,
-    correlation: ErrorTable,
-    out: Annotated[Folder, "Folder for CSV and Markdown files."],
-) -> None:
+def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Folder) -> None:
     """Set measured errors beside the paper's tables.
 
     One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
 
     Files are named alignment_paper_LEVEL and alignment_paper_correlation, with errors in units of
     the range. It is refused if a noise level of the paper was not measured.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for CSV and Markdown files.
     """
     test_sets = (
         "Test set `grid`: the very states that the networks were trained on, with new noise; "
@@ -269,11 +277,9 @@ def alignment_paper_tables(
 
 @command("alignment time-table")
 def time_table(
-    times: Annotated[tuple[File, ...], "CSV of `alignment estimate` or `alignment fit`."],
-    histories: Annotated[
-        tuple[str, ...], "A training.", {"flag": "--history", "metavar": "NAME=FILE"}
-    ],
-    out: Annotated[File, "CSV with the cost of an estimate and of the trainings."],
+    times: tuple[File, ...],
+    histories: Annotated[tuple[str, ...], {"flag": "--history", "metavar": "NAME=FILE"}],
+    out: File,
 ) -> None:
     """Tabulate the run times of the methods.
 
@@ -281,6 +287,15 @@ def time_table(
 
     Seconds per estimate are means over all states of all test sets; NAME of --history is that of a
     network, or dae.
+
+    Parameters
+    ----------
+    times : sequence of Path
+        CSV of `alignment estimate` or `alignment fit`.
+    histories : sequence of str
+        A training.
+    out : Path
+        CSV with the cost of an estimate and of the trainings.
     """
     # Seconds of each training, from the last row of its history.
     named = (text.partition("=") for text in histories)
@@ -301,7 +316,7 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=Alignment.choice)
+@command("alignment figure stamps", reads=("seed", "noise", "evaluation"))
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
@@ -328,16 +343,19 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
 
 @command("alignment figure predicted")
 def predicted(
-    estimates: Annotated[File, "Product of `alignment estimate`."],
-    fits: Annotated[
-        tuple[File, ...], "Product of `alignment fit` of the same states.", {"flag": "--fit"}
-    ],
-    out: Png,
+    estimates: File, fits: Annotated[tuple[File, ...], {"flag": "--fit"}], out: Png
 ) -> None:
     """Draw estimates against the truth, for each method, number of a state and noise level.
 
     A row of panels is a method, a column a number of the state, both axes in units of the range;
     points on the diagonal are exact. Bounds and fits with unknown flux are left out.
+
+    Parameters
+    ----------
+    estimates : Path
+        Product of `alignment estimate`.
+    fits : sequence of Path
+        Product of `alignment fit` of the same states.
     """
     # Estimated states of each method and noise level.
     by_method: dict[str, dict[float, np.ndarray]] = {
@@ -375,11 +393,9 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 
 
 @command(
-    "alignment figure twin",
-    reads=("telescope", "prescription", "alignment", "optics", "noise"),
-    choice=Alignment.choice,
+    "alignment figure twin", reads=("telescope", "prescription", "alignment", "optics", "noise")
 )
-def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
+def twin(config: Config, table: File, out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.
 
     The curve is the difference χ² of the stamps of multiples of a state from those of the state:
@@ -387,6 +403,11 @@ def twin(config: Config, table: Annotated[File, "CSV that receives the curves."]
 
     The table has a row for each noise level, defocus and multiple. The stamps of both states are
     shown above the curves.
+
+    Parameters
+    ----------
+    table : Path
+        CSV that receives the curves.
     """
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.

@@ -39,10 +39,7 @@ if TYPE_CHECKING:
 
 
 @command("bank", reads=(*SIMULATION, "bounds"))
-def bank(
-    config: Config,
-    out: Annotated[File, "HDF5 product with fresh stars, framed so that they can be mirrored."],
-) -> None:
+def bank(config: Config, out: File) -> None:
     """Simulate the bank of fresh stars behind the posterior mean.
 
     They are other draws of the simulator that made the test stars, with a margin, so that one
@@ -51,6 +48,11 @@ def bank(
     The product has the framed stars, the number of each one's field, its brightest pixel and the
     Seidel coefficients. Its first bounds.bank_stars serve all bounds; the others only those that
     are given the field.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with fresh stars, framed so that they can be mirrored.
     """
     limit_threads(1)  # batches run in parallel
     # Two draws of the simulator, one after the other: the second has its own random streams.
@@ -72,15 +74,13 @@ def bank(
 @command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
 def bounds(
     config: Config,
-    dataset: Annotated[str, "Name in the tables."],
-    stars: Annotated[File, "Product of the stage stars."],
-    templates: Annotated[File, "Product of the stage templates."],
-    growth: Annotated[File, "CSV: error by size of the bank."],
-    per_star: Annotated[File, "Parquet with every star."],
-    out: Annotated[File, "CSV with the bounds."],
-    bank: Annotated[
-        File | None, "Product of the stage bank; needed where stars have random aberrations."
-    ] = None,
+    dataset: str,
+    stars: File,
+    templates: File,
+    growth: File,
+    per_star: File,
+    out: File,
+    bank: File | None = None,
 ) -> None:
     """Bound the error that any estimator can reach on the test stars.
 
@@ -90,6 +90,23 @@ def bounds(
     Three tables come out: the bounds with their standard errors, by noise level and reference; the
     error for banks of growing size, which shows whether the bank is large enough; and the squared
     error of every star.
+
+    Parameters
+    ----------
+    dataset : str
+        Name in the tables.
+    stars : Path
+        Product of the stage stars.
+    templates : Path
+        Product of the stage templates.
+    growth : Path
+        CSV: error by size of the bank.
+    per_star : Path
+        Parquet with every star.
+    out : Path
+        CSV with the bounds.
+    bank : Path, optional
+        Product of the stage bank; needed where stars have random aberrations.
     """
     # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
@@ -131,12 +148,7 @@ def bounds(
 
 @command("optics", reads=(*SIMULATION, "noise", "parts", "bounds", "evaluation"))
 def optics(
-    config: Config,
-    dataset: Annotated[str, "Name in the tables."],
-    stars: Annotated[File, "Product of the stage stars."],
-    bank: Annotated[File, "Product of the stage bank."],
-    per_star: Annotated[File, "Parquet with every star."],
-    out: Annotated[File, "CSV with means and standard errors."],
+    config: Config, dataset: str, stars: File, bank: File, per_star: File, out: File
 ) -> None:
     """Measure the methods that are given the telescope, on the test stars that are bounded.
 
@@ -144,6 +156,19 @@ def optics(
 
     The table has the columns of `evaluate`. Such a method knows more than any other, and shows how
     near an estimate of a single star comes to the bound.
+
+    Parameters
+    ----------
+    dataset : str
+        Name in the tables.
+    stars : Path
+        Product of the stage stars.
+    bank : Path
+        Product of the stage bank.
+    per_star : Path
+        Parquet with every star.
+    out : Path
+        CSV with means and standard errors.
     """
     limit_threads(1)
     product = read_product(stars, "stars")
@@ -181,12 +206,15 @@ def optics(
 
 
 @command("collect-bounds")
-def collect_bounds(
-    out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
-) -> None:
+def collect_bounds(out: File, parts: Annotated[tuple[File, ...], {"argument": True}]) -> None:
     """Join the tables of several datasets' bounds; all must have the columns of the first.
 
     PARTS are CSV files of the stage bounds, or of the stage optics; the rows keep their order.
+
+    Parameters
+    ----------
+    out : Path
+        CSV.
     """
     write_csv(out, read_tables(parts))
 
@@ -194,10 +222,8 @@ def collect_bounds(
 @command("efficiency")
 def efficiency(
     bounds: tuple[File, ...],
-    bounds_per_star: Annotated[
-        tuple[File, ...], "Parquet of the stage bounds; repeat for more datasets."
-    ],
-    out: Annotated[File, "CSV: every method beside every bound."],
+    bounds_per_star: tuple[File, ...],
+    out: File,
     parts: Annotated[tuple[File, ...], {"argument": True}],
 ) -> None:
     """Compare methods with the bounds; PARTS are the evaluations' Parquet files.
@@ -210,6 +236,13 @@ def efficiency(
     bound (of the floor, which is no lower limit, 20 %), otherwise `ok`. Both are empty where a
     posterior mean is not tight. Stars without a posterior mean are left out on both sides; both
     are empty, too, where these are more than 1 %.
+
+    Parameters
+    ----------
+    bounds_per_star : sequence of Path
+        Parquet of the stage bounds; repeat for more datasets.
+    out : Path
+        CSV: every method beside every bound.
     """
     # Keys of the posterior means that are tight.
     limits = read_tables(bounds)
@@ -238,11 +271,7 @@ def efficiency(
 
 
 @command("paper-rows")
-def paper_rows_table(
-    bounds: Annotated[File, "CSV of the bounds of all datasets."],
-    efficiency: Annotated[File, "CSV of the stage efficiency."],
-    out: Annotated[File, "CSV: the paper's errors, measured errors and the least possible ones."],
-) -> None:
+def paper_rows_table(bounds: File, efficiency: File, out: File) -> None:
     """Set the paper's errors beside the posterior mean of the simulated scenes.
 
     The reference is the realisation. Measured errors and the bound are means over the bounded
@@ -252,6 +281,15 @@ def paper_rows_table(
 
     A row is a method at a noise level of a dataset: the paper's error, that of this run, the bound
     with its standard error, whether it is tight, the paper's error over the bound, and the verdict.
+
+    Parameters
+    ----------
+    bounds : Path
+        CSV of the bounds of all datasets.
+    efficiency : Path
+        CSV of the stage efficiency.
+    out : Path
+        CSV: the paper's errors, measured errors and the least possible ones.
     """
     key = ["dataset", "noise_level"]
     # The paper's errors under the names of the methods here.

@@ -37,27 +37,38 @@ SEEN_BY_TRAINING = ("seed", "noise", "parts")
 @command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
 def bundle(
     config: Config,
-    stars: Annotated[File, "Product of the stage stars that the network was trained on."],
+    stars: File,
     models: Models,
-    split: Annotated[
-        SplitKind | None, "Refuse a network of another split.  [default: that of the training]"
-    ] = None,
-    reference: Annotated[
-        Reference | None, "Of a method that serves both.  [default: realisation]"
-    ] = None,
-    name: Annotated[str | None, "Name of the model.  [default: the file's]"] = None,
-    licence: Annotated[str, "Of the model."] = "not stated",
-    largest_mb: Annotated[
-        float | None, AboveZero, "Size of the model, for which a mixture leaves out fine axes."
-    ] = None,
+    split: SplitKind | None = None,
+    reference: Reference | None = None,
+    name: str | None = None,
+    licence: str = "not stated",
+    largest_mb: Annotated[float | None, AboveZero] = None,
     *,
-    out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
+    out: File,
 ) -> None:
     """Pack a trained network with its errors and all that it takes to apply it.
 
     Errors are measured on test stars, at the noise levels of the configuration; `psfdae describe`
     prints them. Seed, noise and parts must be those of the training. A fit to other stars, or to
     those of another telescope, is refused.
+
+    Parameters
+    ----------
+    stars : Path
+        Product of the stage stars that the network was trained on.
+    split : SplitKind, optional
+        Refuse a network of another split. [default: that of the training]
+    reference : Reference, optional
+        Truth that is restored, by a method that serves both. [default: realisation]
+    name : str, optional
+        Name of the model. [default: the file's]
+    licence : str
+        Licence of the model.
+    largest_mb : float, optional
+        Size of the model, for which a mixture leaves out fine axes.
+    out : Path
+        Bundle, a file NAME.psf.safetensors.
     """
     # Exactly one option names a fit; its name is that of the method.
     limit_threads(config.evaluation.threads)
@@ -123,18 +134,22 @@ def _fit_config(
 
 
 @command("ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
-def ship(
-    config: Config,
-    bundle: Annotated[tuple[File, ...], "Model bundle to choose from; several times."],
-    stars: Annotated[File, "Product of the stage stars that they were trained on."],
-    out: Annotated[Folder, "Folder of the package's bundles."],
-) -> None:
+def ship(config: Config, bundle: tuple[File, ...], stars: File, out: Folder) -> None:
     """Make the bundle with the smallest error on validation stars the package's bundle.
 
     Flux and sky of these stars are estimated, and every noise level counts alike.
 
     It is refused if its stated errors do not hold 63 to 73 % of those of its test stars at a noise
     level, or if it is larger than 5 MB.
+
+    Parameters
+    ----------
+    bundle : sequence of Path
+        Model bundle to choose from; several times.
+    stars : Path
+        Product of the stage stars that they were trained on.
+    out : Path
+        Folder of the package's bundles.
     """
     # The candidate with the smallest error.
     product, errors = read_stars(stars), {}

@@ -42,11 +42,7 @@ from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 
 @command("scan", reads=(*SIMULATION, "noise", "calibration"))
-def scan(
-    config: Config,
-    dataset: Annotated[str, "A dataset that the paper tabulates."],
-    out: Annotated[File, "CSV with the SSIM over scale, r0 and dynamic range."],
-) -> None:
+def scan(config: Config, dataset: str, out: File) -> None:
     """Scan parameters that the paper does not state against its original-noise rows.
 
     The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
@@ -54,6 +50,13 @@ def scan(
 
     A row of the table is a point of the scan: pixel scale in arcsec, r0 in metres (empty in scene
     1), noise level, dynamic range, and the mean SSIM of noisy stars to their noise-free images.
+
+    Parameters
+    ----------
+    dataset : str
+        A dataset that the paper tabulates.
+    out : Path
+        CSV with the SSIM over scale, r0 and dynamic range.
     """
     limit_threads(1)  # batches run in parallel
     # Columns of the paper's tables with the noise as it was, before any method.
@@ -193,8 +196,8 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
 def calibrate(
     config: Config,
     scans: Annotated[tuple[File, ...], {"flag": "--scan"}],
-    stars: Annotated[tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."],
-    out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
+    stars: tuple[tuple[str, File], ...],
+    out: Folder,
 ) -> None:
     """Fit noise, dynamic range and pixel scales to the scans.
 
@@ -204,6 +207,13 @@ def calibrate(
     Four tables come out: fitted values beside the configured ones (fit.csv); each of the paper's
     columns beside simulated noise (columns.csv); residuals by pixel scale (scales.csv); and how
     well other r0 would do (degeneracy.csv). The configuration itself is not changed.
+
+    Parameters
+    ----------
+    stars : sequence of pairs
+        Dataset and its product of the stage stars.
+    out : Path
+        Folder for fit.csv, columns.csv and degeneracy.csv.
     """
     # Each of the paper's columns beside simulated stars with the configured parameters.
     products = dict(stars)

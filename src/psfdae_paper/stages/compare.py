@@ -57,8 +57,7 @@ class Run:
 
 @command("compare")
 def compare(
-    runs: Annotated[tuple[Folder, ...], {"argument": True}],
-    out: Annotated[File | None, "Write the Markdown to this file, too."] = None,
+    runs: Annotated[tuple[Folder, ...], {"argument": True}], out: File | None = None
 ) -> None:
     """Compare the first of some RUNS with each of the others.
 
@@ -69,6 +68,11 @@ def compare(
     which differ by more than seeds do.
 
     Differences are paired star by star where both runs have the same noisy images.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Write the Markdown to this file, too.
     """
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")

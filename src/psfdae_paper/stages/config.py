@@ -19,14 +19,17 @@ from psfdae_paper.configuration.compose import load, load_stage
 @command("config")
 def config(
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
-    only: Annotated[
-        str | None, "Only the groups that this stage reads.", {"flag": "--stage"}
-    ] = None,
+    only: Annotated[str | None, {"flag": "--stage"}] = None,
 ) -> None:
     """Check the configuration and print it, resolved, as YAML.
 
     What it prints is what a run would have with the same overrides, defaults included; a wrong key
     is refused with its allowed range.
+
+    Parameters
+    ----------
+    only : str, optional
+        Only the groups that this stage reads.
     """
     if only is None:
         settings = load(overrides)

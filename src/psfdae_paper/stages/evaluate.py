@@ -67,15 +67,15 @@ else:
 @command("evaluate", reads=READS)
 def evaluate(
     config: Config,
-    dataset: Annotated[str, "Name that goes into the table."],
-    stars: Annotated[File, "Product of the stage stars."],
+    dataset: str,
+    stars: File,
     models: Models,
     split: SplitKind = "random",
     reference: Reference = "realisation",
     *,
-    per_star: Annotated[File, "Parquet with every star."],
-    restored: Annotated[File, "HDF5 product with the images of eight stars, for figures."],
-    out: Annotated[File, "CSV with means and standard errors."],
+    per_star: File,
+    restored: File,
+    out: File,
 ) -> None:
     """Measure every method on the test stars at each noise level.
 
@@ -85,6 +85,19 @@ def evaluate(
     Every method of the list `methods` needs its model, but for those that are fitted in a moment.
     The table has a row for each method, noise level and metric; the Parquet file has one for each
     star, with its field and all metrics. The product has the images of stars spread over the field.
+
+    Parameters
+    ----------
+    dataset : str
+        Name that goes into the table.
+    stars : Path
+        Product of the stage stars.
+    per_star : Path
+        Parquet with every star.
+    restored : Path
+        HDF5 product with the images of eight stars, for figures.
+    out : Path
+        CSV with means and standard errors.
     """
     # All methods, and the test stars with their truth.
     limit_threads(config.evaluation.threads)
@@ -186,13 +199,18 @@ Metric = Literal["mse", "ssim"]
 
 
 @command("collect")
-def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
+def collect(evaluations: Evaluations, out: File) -> None:
     """Join evaluations into one tidy table, with the scatter of each method between seeds.
 
     The scatter, where it was measured, is that of a repeated fit with other random numbers.
 
     Columns are dataset, split, reference, method, noise_level, metric, value, stderr, seed_stderr
     and n, the number of stars.
+
+    Parameters
+    ----------
+    out : Path
+        Tidy CSV.
     """
     # The standard error of a mean over stars does not hold the scatter between seeds.
     table = comparison.with_seed_stderr(
@@ -202,16 +220,18 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
 
 
 @command("held-out")
-def held_out(
-    per_star: Annotated[tuple[File, ...], {"argument": True}],
-    out: Annotated[File, "CSV: held-out over seen fields, on the stars that both splits test."],
-) -> None:
+def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: File) -> None:
     """Compare errors in held-out fields with those in training fields, star by star.
 
     PER_STAR are the evaluations' Parquet files of both splits.
 
     A row is a method at a noise level: the ratio of the errors of the same stars, as seen and as
     held out, with its standard error. Above 1, the method is worse in fields that it has not seen.
+
+    Parameters
+    ----------
+    out : Path
+        CSV: held-out over seen fields, on the stars that both splits test.
     """
     columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
     # Errors in the same fields, as seen in training and as held out.
@@ -221,17 +241,18 @@ def held_out(
 
 @command("paper-tables")
 def paper_tables(
-    dataset: str,
-    evaluations: Evaluations,
-    out: Annotated[
-        tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
-    ],
+    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:
     """Write the paper's tables, with measured errors beside the published ones.
 
     Rows are methods, columns noise levels; measured errors are given for each reference.
 
     The table is written as CSV, and beside it as Markdown for the pages.
+
+    Parameters
+    ----------
+    out : sequence of pairs
+        Metric and its CSV, the Markdown beside; repeat for more.
     """
     # Each table as CSV, and beside it as Markdown.
     measured = read_tables(evaluations, MeasuredStars.columns)

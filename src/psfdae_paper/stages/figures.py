@@ -63,17 +63,18 @@ def figure_energy(templates: Templates, out: Png) -> None:
 @command("figure strip")
 def figure_strip(
     restored: Restored,
-    levels: Annotated[
-        tuple[Annotated[float, AboveZero], ...],
-        {"flag": "--level"},
-        "Noise level λ; repeat for more rows.",
-    ],
+    levels: Annotated[tuple[Annotated[float, AboveZero], ...], {"flag": "--level"}],
     out: Png,
 ) -> None:
     """Draw test stars before and after restoration.
 
     A row is a method at a noise level, a column a star; below each stamp stands its MSE × 10⁶. The
     first row is the reference.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        Noise level λ; repeat for more rows.
     """
     product = read_product(restored, "restored")
     dataset, reference = product.config["dataset"], product.config["reference"]
@@ -99,7 +100,7 @@ def figure_strip(
 @command("figure headline")
 def figure_headline(
     restored: Restored,
-    level: Annotated[float, AboveZero, "Noise level λ."],
+    level: Annotated[float, AboveZero],
     bounds: Bounds,
     efficiency: Efficiency,
     out: Png,
@@ -108,6 +109,11 @@ def figure_headline(
 
     At the left are five stars at one noise level, noisy and by every method, with the truth below;
     at the right is the MSE of each method against the noise level, with the bounds.
+
+    Parameters
+    ----------
+    level : float
+        Noise level λ.
     """
     product = read_product(restored, "restored")
     dataset, truth = product.config["dataset"], product["truth"]
@@ -170,13 +176,18 @@ def restored_rows(
 
 @command("figure curves")
 def figure_curves(
-    labels: Annotated[tuple[str, ...], {"flag": "--label"}, "One per history, in order."],
+    labels: Annotated[tuple[str, ...], {"flag": "--label"}],
     histories: Annotated[tuple[File, ...], {"argument": True}],
     out: Png,
 ) -> None:
     """Draw training and validation error of networks against the optimiser's steps.
 
     HISTORIES are tables of trainings, with the columns step, train_mse and validation_mse.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        One per history, in order.
     """
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
@@ -192,13 +203,16 @@ def figure_curves(
 
 @command("figure errors")
 def figure_errors(
-    dataset: str,
-    evaluations: Evaluations,
-    out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
+    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:
     """Draw metrics against the noise level, with the paper's points.
 
     Each metric is a figure; it is refused if the tables have no row of the dataset.
+
+    Parameters
+    ----------
+    out : sequence of pairs
+        Metric and its PNG; repeat for more.
     """
     metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
@@ -223,12 +237,14 @@ def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) ->
 
 
 @command("figure bank-growth")
-def figure_bank_growth(
-    dataset: DatasetName,
-    growth: Annotated[File, "CSV of the stage bounds: error by size of the bank."],
-    out: Png,
-) -> None:
-    """Draw the posterior mean's error against the size of the bank."""
+def figure_bank_growth(dataset: DatasetName, growth: File, out: Png) -> None:
+    """Draw the posterior mean's error against the size of the bank.
+
+    Parameters
+    ----------
+    growth : Path
+        CSV of the stage bounds: error by size of the bank.
+    """
     write_png(bound_figures.bank_growth(rows_of(growth, dataset), dataset), out)
 
 

@@ -45,12 +45,10 @@ def fit(
     stars: Stars,
     split: SplitKind = "random",
     reference: Reference = "realisation",
-    start: Annotated[
-        Folder | None, "Fit to the realisations, from which one to templates goes on."
-    ] = None,
-    checkpoint: Annotated[File | None, "State of an interrupted fit, if it keeps one."] = None,
+    start: Folder | None = None,
+    checkpoint: File | None = None,
     *,
-    out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
+    out: Annotated[Path, click.Path(path_type=Path)],
 ) -> None:
     """Fit METHOD, a name of the list `methods` in config.yaml.
 
@@ -59,6 +57,15 @@ def fit(
 
     Settings of the method are groups of the configuration, such as gmm.components=[4]. Beside the
     fit stands its resolved configuration, by which other stages refuse a fit of other stars.
+
+    Parameters
+    ----------
+    start : Path, optional
+        Fit to the realisations, from which one to templates goes on.
+    checkpoint : Path, optional
+        State of an interrupted fit, if it keeps one.
+    out : Path
+        Folder or HDF5 product.
     """
     # Stars of the split with their noise; training state goes to a file beside the fit.
     # The class of the method, and as many threads as its settings say.

@@ -10,7 +10,7 @@ from psfdae_paper.configuration.command import command
 
 
 @command("manifest")
-def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}]) -> None:
+def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
     """Write the checksums of a run to SHA256SUMS.
 
     `sha256sum --check --quiet SHA256SUMS` in the folder then names the files that are damaged.
@@ -18,6 +18,11 @@ def manifest(results: Annotated[Folder, "Folder of a run.", {"argument": True}])
     of this one.
 
     In goes the folder of a run; SHA256SUMS is in it, in the form that `sha256sum` reads.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run.
     """
     # Other runs, each with its settings, and the run of record may lie in folders of this one.
     other_runs = {path.parent for path in results.glob("*/**/.settings")} | {results / "reference"}

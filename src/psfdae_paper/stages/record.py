@@ -40,16 +40,20 @@ MAY_STAY = re.compile(r"(sweeps|paper)/.+")
 
 
 @command("runtime")
-def runtime(
-    results: Annotated[Folder, "Folder of a run."],
-    out: Annotated[File, "CSV with the cost of every job."],
-) -> None:
+def runtime(results: Folder, out: File) -> None:
     """Collect wall time, CPU time and memory of a run's jobs.
 
     Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
     line of its log, which has the name of its benchmark.
 
     Columns are the rule, its wildcards, wall_s and cpu_s in seconds, and peak_mb.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run.
+    out : Path
+        CSV with the cost of every job.
     """
     write_csv(out, job_costs(results), 6)
 
@@ -91,13 +95,7 @@ def _last_run(benchmark: Path) -> pd.Series[float]:
 
 @command("reference")
 def reference(
-    results: Annotated[Folder, "Folder of a finished run."],
-    out: Annotated[Folder, "Folder of the run of record."],
-    plans: Annotated[
-        tuple[File, ...],
-        {"flag": "--plan"},
-        "Output of `snakemake --summary` for the files of the record.",
-    ],
+    results: Folder, out: Folder, plans: Annotated[tuple[File, ...], {"flag": "--plan"}]
 ) -> None:
     """Replace the committed run of record by a finished run.
 
@@ -109,6 +107,15 @@ def reference(
 
     The folder gets tables, figures, runtime.csv and provenance.json; pages take their numbers from
     these files alone.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a finished run.
+    out : Path
+        Folder of the run of record.
+    plans : sequence of Path
+        Output of `snakemake --summary` for the files of the record.
     """
     from psfdae_paper.configuration.compose import load
 

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import click
 import numpy as np
+import pandas as pd
 
 from psfdae.base.errors import Error
 from psfdae.base.figures import write_png
@@ -22,7 +23,7 @@ from psfdae.base.files import (
     check_outputs,
     read_product,
     write_bytes,
-    write_columns,
+    write_csv,
     write_fits,
 )
 from psfdae.base.options import File, Folder
@@ -56,17 +57,11 @@ class StampSizeError(Error, ValueError):
 
 @command("simulate")
 def simulate(
-    out: Annotated[Folder | None, "Folder.  [default: name of the telescope]"] = None,
-    fits: Annotated[bool, "Also write the PSFs as FITS cube, psfs.fits."] = False,
-    image_snr: Annotated[
-        float | None,
-        click.FloatRange(min=0, min_open=True, max=1e6),
-        "Also write an image with a noisy star per field, image.fits, and stars.csv.",
-    ] = None,
-    seed: Annotated[int, click.IntRange(min=0), "Seed of the image's noise."] = 0,
-    least_energy: Annotated[
-        float, click.FloatRange(0, 1), "Refuse stamps with less than this part of the light."
-    ] = 0.1,
+    out: Folder | None = None,
+    fits: bool = False,
+    image_snr: Annotated[float | None, click.FloatRange(min=0, min_open=True, max=1e6)] = None,
+    seed: Annotated[int, click.IntRange(min=0)] = 0,
+    least_energy: Annotated[float, click.FloatRange(0, 1)] = 0.1,
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
     """Draw the PSFs of a telescope over its field: psfdae simulate telescope=NAME.
@@ -77,6 +72,19 @@ def simulate(
     PSFs at their places in the field; the table has, for each field point, the light inside the
     stamp, the FWHM in arcsec, ellipticity and position angle in degrees. Telescopes whose PSFs do
     not fit into their stamps are refused, before any file is written.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Folder. [default: name of the telescope]
+    fits : bool
+        Also write the PSFs as FITS cube, psfs.fits.
+    image_snr : float, optional
+        Also write an image with a noisy star per field, image.fits, and stars.csv.
+    seed : int
+        Seed of the image's noise.
+    least_energy : float
+        Refuse stamps with less than this part of the light.
     """
     # A user's telescope is put into the dataset that is made for it.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
@@ -102,40 +110,35 @@ def simulate(
     # Warnings come last, where they are read.
     for line in warnings:
         print(f"psfdae: {line}", file=sys.stderr)
-    telescope = config.telescope
+    telescope, energy, fwhm = config.telescope, fields.table.energy, fields.table.fwhm_arcsec
     print(
         f"{telescope.name}: {len(fields.psf)} fields, pixels of {telescope.pixel:.3g} λ/D, "
-        f"light inside the stamp {fields.energy.min():.3f} … {fields.energy.max():.3f}, "
-        f"FWHM {fields.fwhm_arcsec.min():.3g} … {fields.fwhm_arcsec.max():.3g} arcsec"
+        f"light inside the stamp {energy.min():.3f} … {energy.max():.3f}, "
+        f"FWHM {fwhm.min():.3g} … {fwhm.max():.3g} arcsec"
     )
     print(f"{folder}: {', '.join(names)}")
 
 
 @command("figure telescope")
-def figure_telescope(
-    templates: Annotated[File, "Product of the stage templates."],
-    table: Annotated[File, "CSV, a row per field point."],
-    out: Annotated[File, "PNG."],
-) -> None:
+def figure_telescope(templates: File, table: File, out: File) -> None:
     """Draw the static PSFs of a telescope with their light and their width, and tabulate them.
 
     The table has field angles in degrees, the light inside the stamp, FWHM in arcsec, ellipticity
     and position angle in degrees of every field point.
+
+    Parameters
+    ----------
+    templates : Path
+        Product of the stage templates.
+    table : Path
+        CSV, a row per field point.
+    out : Path
+        PNG.
     """
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
-    x, y = np.rad2deg(fields.field).T
-    columns = {
-        "x_deg": x,
-        "y_deg": y,
-        "energy": fields.energy,
-        "fwhm_arcsec": fields.fwhm_arcsec,
-        "ellipticity": fields.ellipticity,
-        "position_angle_deg": fields.position_angle_deg,
-        "pupil_samples": product["pupil_samples"],
-    }
-    write_columns(table, columns, digits=6)
+    write_csv(table, fields.table, digits=6)
     write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
 
 
@@ -152,20 +155,21 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     Returns
     -------
     FieldOfPsfs
-        PSFs (F, d, d), the light of each inside its stamp, FWHM in arcsec, ellipticity, and
+        PSFs (F, d, d) with the light of each inside its stamp, FWHM in arcsec, ellipticity, and
         position angle in degrees.
     """
-    psf = without_margin(product)
+    psf, (x, y) = without_margin(product), np.rad2deg(product["field"]).T
     shapes = measure_shapes(psf)
-    return FieldOfPsfs(
-        psf,
-        product["grid"],
-        product["field"],
-        product["energy"],
-        shapes.fwhm_px * product.config["telescope"]["pixel_scale_arcsec"],
-        shapes.ellipticity,
-        shapes.position_angle_deg,
-    )
+    columns = {
+        "x_deg": x,
+        "y_deg": y,
+        "energy": product["energy"],
+        "fwhm_arcsec": shapes.fwhm_px * product.config["telescope"]["pixel_scale_arcsec"],
+        "ellipticity": shapes.ellipticity,
+        "position_angle_deg": shapes.position_angle_deg,
+        "pupil_samples": product["pupil_samples"],
+    }
+    return FieldOfPsfs(psf, product["grid"], product["field"], pd.DataFrame(columns))
 
 
 def stamp_warnings(
@@ -190,7 +194,7 @@ def stamp_warnings(
     """
     warnings = []
     # Light of each PSF inside its stamp.
-    energy, side = fields.energy, config.framing.stamp_px
+    energy, side = fields.table.energy.to_numpy(), config.framing.stamp_px
     if energy.min() < enough_light:
         # The field with the least light decides which stamp suffices.
         worst_field = int(energy.argmin())
@@ -211,7 +215,7 @@ def stamp_warnings(
             raise StampSizeError(f"telescope = {config.telescope.name}: {message} (--least-energy)")
         warnings.append(message)
     # Below 1.5 pixels the FWHM has less than two samples across: the pixels alias.
-    fwhm_px = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
+    fwhm_px = np.median(fields.table.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
     if fwhm_px < 1.5:
         warnings.append(
             f"the PSFs are {fwhm_px:.2f} px wide (median FWHM with the pixel): undersampled; the "
@@ -271,6 +275,7 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
         FITS file.
     """
     from astropy.io import fits
+    from astropy.table import Table
 
     # Primary HDU: the PSFs, with what a reader needs to place their pixels on the sky.
     telescope = config.telescope
@@ -284,20 +289,12 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
         ("CREATOR", f"psfdae {__version__}", ""),
     ):
         cube.header.append(card)
-    # Table: name, FITS format, unit and values of each column.
-    x, y = np.rad2deg(fields.field).T
-    columns = (
-        ("id", "K", None, np.arange(len(fields.psf))),
-        ("x_deg", "D", "deg", x),
-        ("y_deg", "D", "deg", y),
-        ("energy", "D", None, fields.energy),
-        ("fwhm", "D", "arcsec", fields.fwhm_arcsec),
-        ("ellipticity", "D", None, fields.ellipticity),
-        ("position_angle", "D", "deg", fields.position_angle_deg),
-    )
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column(name=n, format=f, unit=u, array=a) for n, f, u, a in columns], name="FIELDS"
-    )
+    # Table of the fields; names say no units, which FITS has beside them.
+    names = {"fwhm_arcsec": "fwhm", "position_angle_deg": "position_angle"}
+    rows = fields.table.drop(columns="pupil_samples").rename(columns=names)
+    rows.insert(0, "id", np.arange(len(rows)))
+    units = {"x_deg": "deg", "y_deg": "deg", "fwhm": "arcsec", "position_angle": "deg"}
+    table = fits.BinTableHDU(Table.from_pandas(rows, units=units), name="FIELDS")
     write_fits(path, fits.HDUList([cube, table]))
 
 
@@ -343,7 +340,7 @@ def write_image(
         x,
         y,
         pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
-        columns=dict(zip(("x_deg", "y_deg"), np.rad2deg(fields.field).T, strict=True)),
+        columns={name: fields.table[name].to_numpy() for name in ("x_deg", "y_deg")},
         GAIN=1.0,
         TELESCOP=config.telescope.name,
     )
@@ -351,18 +348,31 @@ def write_image(
 
 @command("example-field")
 def write_example_field(
-    catalogue: Annotated[File, "CSV file for the star list."],
+    catalogue: File,
     seed: Annotated[int, click.IntRange(min=0)] = 1,
-    side: Annotated[int, click.IntRange(min=100), "Pixels along a side."] = FieldRecipe.side_px,
-    bright: Annotated[int, click.IntRange(min=1), "Bright stars."] = FieldRecipe.bright,
-    faint: Annotated[int, click.IntRange(min=0), "Faint stars."] = FieldRecipe.faint,
+    side: Annotated[int, click.IntRange(min=100)] = FieldRecipe.side_px,
+    bright: Annotated[int, click.IntRange(min=1)] = FieldRecipe.bright,
+    faint: Annotated[int, click.IntRange(min=0)] = FieldRecipe.faint,
     *,
-    out: Annotated[File, "FITS image."],
+    out: File,
 ) -> None:
     """Simulate an image of a star field with its star list, as an example.
 
     The list is what a catalogue of the image would have: numbers, pixel and sky coordinates of all
     stars but the faint halves of blends. The same seed gives the same image.
+
+    Parameters
+    ----------
+    catalogue : Path
+        CSV file for the star list.
+    side : int
+        Pixels along a side.
+    bright : int
+        Bright stars.
+    faint : int
+        Faint stars.
+    out : Path
+        FITS image.
     """
     check_outputs((out,), (catalogue,))
     write_example(out, catalogue, seed, side_px=side, bright=bright, faint=faint)
@@ -404,19 +414,26 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
 
 @command("example-night")
 def example_night(
-    out: Annotated[Folder, "Folder for images, truth.csv and reference.csv."],
+    out: Folder,
     seed: Annotated[int, click.IntRange(min=0)] = 1,
-    exposures: Annotated[int, click.IntRange(min=12), "Images."] = NightRecipe.exposures,
+    exposures: Annotated[int, click.IntRange(min=12)] = NightRecipe.exposures,
 ) -> None:
     """Simulate a night of a telescope, with bad images among them, as an example.
 
     truth.csv has a row for each image: what is wrong with it, and FWHM and ellipticity of its PSF
     in the middle and in the corners, without clouds or trail. reference.csv has the stars with
     their magnitudes. The same seed gives the same images.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for images, truth.csv and reference.csv.
+    exposures : int
+        Images.
     """
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
-    write_columns(reference, {name: stars[name] for name in stars.colnames})
+    write_csv(reference, stars.to_pandas())
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"
@@ -425,5 +442,5 @@ def example_night(
         if truth["fault"] == "truncated file":
             write_bytes(path, path.read_bytes()[: path.stat().st_size // 2])
         rows.append({"image": path, "reference": reference, **truth})
-    write_columns(out / "truth.csv", {name: [row[name] for row in rows] for name in rows[0]}, 6)
+    write_csv(out / "truth.csv", pd.DataFrame(rows), digits=6)
     print(f"next: snakemake night --config images='{out}/*.fits'")

@@ -7,8 +7,6 @@ of its field (template). Noise is added later, by the stages that need it.
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
 
 from psfdae.base import belonging
@@ -30,10 +28,7 @@ STARS_AT_A_TIME = 1024
 
 
 @command("templates", reads=STATIC)
-def templates(
-    config: Config,
-    out: Annotated[File, "HDF5 product with the static PSF of every field point."],
-) -> None:
+def templates(config: Config, out: File) -> None:
     """Propagate the static PSF of every field point.
 
     A PSF is the fraction of the light on each pixel. Its brightest pixel is in the middle, and it
@@ -41,6 +36,11 @@ def templates(
 
     The product also has the light inside each stamp, the place of the brightest pixel, the angle of
     each field point in radians, and the number of pupil samples.
+
+    Parameters
+    ----------
+    out : Path
+        HDF5 product with the static PSF of every field point.
     """
     limit_threads(1)  # batches run in parallel
     # PSFs have a margin, from which stamps with any centring error are cut.
@@ -68,11 +68,7 @@ def templates(
 
 
 @command("stars", reads=SIMULATION)
-def stars(
-    config: Config,
-    templates: Annotated[File, "Product of the stage templates."],
-    out: Annotated[File, "HDF5 product with noise-free stars."],
-) -> None:
+def stars(config: Config, templates: File, out: File) -> None:
     """Simulate noise-free stars with random aberrations.
 
     Each star has its own image (realisation) and the static PSF of its field (template), both on a
@@ -80,6 +76,13 @@ def stars(
 
     Without random aberrations (stars.aberration_fraction = 0) realisations and templates are the
     same. Noise is no part of the product: each stage draws it for the noise levels that it needs.
+
+    Parameters
+    ----------
+    templates : Path
+        Product of the stage templates.
+    out : Path
+        HDF5 product with noise-free stars.
     """
     # A realisation has static and random aberrations, a template static ones only. Both are
     # framed on their own brightest pixel, moved by the same jitter and normalised by the flux

@@ -83,12 +83,9 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
 @command("sweep point")
 def sweep_point(
     name: Annotated[str, {"argument": True}],
-    data: Annotated[
-        tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
-        "Role and product: stars; for scene 3 states, validation and test.",
-    ],
-    checkpoint: Annotated[File, "State of an interrupted training."],
-    out: Annotated[Folder, "Folder for the point's files; its name is the point's."],
+    data: tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
+    checkpoint: File,
+    out: Folder,
     overrides: Overrides = (),
 ) -> None:
     """Train one point of a sweep and measure it.
@@ -98,6 +95,15 @@ def sweep_point(
 
     The folder gets result.json with metrics and settings, cost.json with seconds, tables of errors,
     and the files of the model. A training that fails is a result, too.
+
+    Parameters
+    ----------
+    data : sequence of pairs
+        Role and product: stars; for scene 3 states, validation and test.
+    checkpoint : Path
+        State of an interrupted training.
+    out : Path
+        Folder for the point's files; its name is the point's.
     """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep

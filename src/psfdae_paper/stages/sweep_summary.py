@@ -28,8 +28,8 @@ from psfdae_paper.sweeps.points import SweepError, plan_sweep
 @command("sweep summary")
 def sweep_summary(
     name: Annotated[str, {"argument": True}],
-    points: Annotated[Folder, "Folder with a folder for each point."],
-    out: Annotated[Folder, "Folder for summary.csv, cost.csv, best.yaml and sweep.yaml."],
+    points: Folder,
+    out: Folder,
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
 ) -> None:
     """Tabulate the points of a sweep and choose the best by its validation metric.
@@ -37,6 +37,13 @@ def sweep_summary(
     All points must be finished; one that failed has a row with the reason.
 
     best.yaml has the best point as overrides, as `psfdae best` prints them.
+
+    Parameters
+    ----------
+    points : Path
+        Folder with a folder for each point.
+    out : Path
+        Folder for summary.csv, cost.csv, best.yaml and sweep.yaml.
     """
     plan = plan_sweep(name, overrides)
     # Points in the order of the plan, whatever the order in which they ended.
@@ -45,11 +52,14 @@ def sweep_summary(
 
 
 @command("best")
-def best(
-    name: Annotated[str, {"argument": True}],
-    results: Annotated[Folder, "Folder that the workflow writes to."] = Path("results"),
-) -> None:
-    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae best NAME)"."""
+def best(name: Annotated[str, {"argument": True}], results: Folder = Path("results")) -> None:
+    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae best NAME)".
+
+    Parameters
+    ----------
+    results : Path
+        Folder that the workflow writes to.
+    """
     print(" ".join(best_overrides(results, name)))
 
 
@@ -180,14 +190,23 @@ def best_overrides(results: Path, name: str) -> list[str]:
 @command("sweep figure")
 def sweep_figure(
     kind: Annotated[Literal["parallel", "response"], {"argument": True}],
-    definition: Annotated[File, "sweep.yaml of the command `sweep summary`."],
-    table: Annotated[File, "summary.csv of the same."],
-    out: Annotated[File, "PNG."],
+    definition: File,
+    table: File,
+    out: File,
 ) -> None:
     """Draw all points at once (parallel), or the metric against each axis (response).
 
     In the first figure a point is a line through its value on every axis, coloured by its rank; the
     second has a panel for each axis, with validation and test metric.
+
+    Parameters
+    ----------
+    definition : Path
+        sweep.yaml of the command `sweep summary`.
+    table : Path
+        summary.csv of the same.
+    out : Path
+        PNG.
     """
     described = read_yaml(definition)
     # Axes as text: they may be numbers or names of options.

@@ -56,15 +56,13 @@ class TrackingError(Error, RuntimeError):
 
 @command("track")
 def track(
-    results: Annotated[Folder, "Folder that the workflow writes to."],
-    preset: Annotated[str, "Goes into the tags."],
-    database: Annotated[File, "SQLite file; mlartifacts/ lies beside it."],
-    out: Annotated[File, "CSV with the MLflow id of every run and what was done."],
-    stars: Annotated[
-        tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
-    ] = (),
-    alignment: Annotated[bool, "The networks of scene 3."] = False,
-    sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
+    results: Folder,
+    preset: str,
+    database: File,
+    out: File,
+    stars: tuple[tuple[str, File], ...] = (),
+    alignment: bool = False,
+    sweeps: Annotated[tuple[str, ...], {"flag": "--sweep"}] = (),
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
 
@@ -74,6 +72,23 @@ def track(
     with the tag superseded = true, beside the new one.
 
     If a server fails there is a message and no error: it must not stop a workflow.
+
+    Parameters
+    ----------
+    results : Path
+        Folder that the workflow writes to.
+    preset : str
+        Goes into the tags.
+    database : Path
+        SQLite file; mlartifacts/ lies beside it.
+    out : Path
+        CSV with the MLflow id of every run and what was done.
+    stars : sequence of pairs
+        Dataset and its product of the stage stars.
+    alignment : bool
+        The networks of scene 3.
+    sweeps : sequence of str
+        The points of a sweep.
     """
     # Methods, networks of scene 3 and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))

@@ -46,7 +46,7 @@ FAULTS = {
     0.74: "clouds",
     0.87: "no stars",
 }
-"""What is wrong with the exposure after this part of the night."""
+"""Fault of the exposure after this part of the night."""
 
 
 @dataclass(frozen=True)

@@ -128,6 +128,13 @@ def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, flo
     """Return MSE and SSIM of a part, over all noise levels and at each.
 
     The MSE of different levels differ by orders of magnitude, and get the geometric mean.
+
+    Parameters
+    ----------
+    part : str
+        "validation" or "test", with which the names of the metrics begin.
+    rows : sequence of mapping
+        Rows of the part's table of errors: metric, noise_level and value.
     """
     # Name of the metric, and its mean over noise levels.
     metrics: dict[str, float] = {}

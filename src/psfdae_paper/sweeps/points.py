@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.base.errors import Error
+from psfdae.base.errors import Error, did_you_mean
 from psfdae.base.rng import stream
-from psfdae.base.settings import ConfigError
+from psfdae.base.settings import ConfigError, leaves
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
@@ -100,17 +100,17 @@ def with_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str,
     SweepError
         If the tree has no such key, or if it is a whole group.
     """
-    changed_tree = dict(tree)
+    changed_tree, known_keys = dict(tree), [key for key, _ in leaves(tree)]
     for dotted_key, value in keys.items():
         # Copy each group on the way to the key, so that the given tree does not change.
         node, (*groups, key) = changed_tree, dotted_key.split(".")
         for group in groups:
             if not isinstance(node.get(group), Mapping):
-                raise SweepError(f"{dotted_key}: unknown key")
+                raise SweepError(f"{dotted_key}: unknown key{did_you_mean(dotted_key, known_keys)}")
             node[group] = dict(node[group])
             node = node[group]
         if key not in node or isinstance(node[key], Mapping):
-            raise SweepError(f"{dotted_key}: unknown key")
+            raise SweepError(f"{dotted_key}: unknown key{did_you_mean(dotted_key, known_keys)}")
         node[key] = value
     return changed_tree
 

@@ -13,20 +13,17 @@ class DaeSettings(Group):
     """Settings of the denoising autoencoder: kernels, widths, initial weights, scale."""
 
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
-        [9, 7, 5, 3, 1, 1, 3, 5, 7, 9],
-        description="Kernel sizes of the convolutions, encoder then decoder; odd",
+        [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
     )
+    """Kernel sizes of the convolutions, encoder then decoder; odd."""
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        [16, 16, 16, 16, 16, 16, 16, 16, 16],
-        description="Channels between the convolutions, one fewer than kernels",
+        [16, 16, 16, 16, 16, 16, 16, 16, 16]
     )
-    init: Literal["linear", "he", "default"] = Field(
-        "linear",
-        description="A linear estimator fitted to the stars, He (2015) or PyTorch's default",
-    )
-    scale: Literal["mean", "none"] = Field(
-        "mean", description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
-    )
+    """Channels between the convolutions, one fewer than kernels."""
+    init: Literal["linear", "he", "default"] = "linear"
+    """A linear estimator fitted to the stars, He (2015) or PyTorch's default."""
+    scale: Literal["mean", "none"] = "mean"
+    """'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1."""
 
     @model_validator(mode="after")
     def check_shape(self) -> DaeSettings:
@@ -44,46 +41,39 @@ class DaeSettings(Group):
 class Train(Group):
     """Settings of the optimisation of the denoising autoencoder."""
 
-    epochs: Count = Field(24, description="Passes over the training stars")
-    batch: Count = Field(32, description="Stars per step")
-    lr: Annotated[float, Field(gt=0, le=1)] = Field(
-        6.0e-3, description="Adam's learning rate (its maximum if one-cycle)"
-    )
-    optimiser: Literal["adam", "muon"] = Field(
-        "muon", description="Optimiser of the inner layers' weights; all else is Adam's"
-    )
-    level_weight: Annotated[float, Field(ge=0, le=2)] = Field(
-        1.0, description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"
-    )
-    schedule: Literal["onecycle", "constant"] = Field(
-        "onecycle", description="Course of the learning rate"
-    )
-    grad_clip: Annotated[float, Field(ge=0)] = Field(
-        1.0, description="Maximum norm of the gradient; 0 switches clipping off"
-    )
-    threads: Count = Field(1, description="Threads of one training")
-    validate_every: Count = Field(2, description="Epochs between validations")
-    validation_draws: Count = Field(1, description="Noise draws per validation star")
-    dead_check_steps: Count = Field(50, description="Steps between looks for a dead network")
-    restarts: Annotated[int, Field(ge=0)] = Field(
-        3, description="New starts from another seed if the network dies"
-    )
-    checkpoint_seconds: CheckpointSeconds = Field(
-        20.0, description="Least time between checkpoints; repeats nothing"
-    )
-    noise: Literal["fresh", "fixed"] = Field(
-        "fresh", description="Noise drawn anew every epoch, or once for all epochs"
-    )
-    crop_epochs: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.0,
-        description="First part of the epochs, which sees the middle of stamps alone (two thirds "
-        "of it where templates are learnt); 0: none",
-    )
-    continued_epochs: Annotated[float, Field(ge=0, le=2)] = Field(
-        1.0,
-        description="Epochs, of those of the realisations, in which a network of templates goes on "
-        "from theirs; 0: as many, from a start of its own",
-    )
-    patience: Annotated[int, Field(ge=0)] = Field(
-        0, description="Stop after this many validations without a better one; 0 never stops"
-    )
+    epochs: Count = 24
+    """Passes over the training stars."""
+    batch: Count = 32
+    """Stars per step."""
+    lr: Annotated[float, Field(gt=0, le=1)] = 6.0e-3
+    """Adam's learning rate (its maximum if one-cycle)."""
+    optimiser: Literal["adam", "muon"] = "muon"
+    """Optimiser of the inner layers' weights; all else is Adam's."""
+    level_weight: Annotated[float, Field(ge=0, le=2)] = 1.0
+    """Power p by which the squared error of a star counts 1/λ^p; 0: all alike."""
+    schedule: Literal["onecycle", "constant"] = "onecycle"
+    """Course of the learning rate."""
+    grad_clip: Annotated[float, Field(ge=0)] = 1.0
+    """Maximum norm of the gradient; 0 switches clipping off."""
+    threads: Count = 1
+    """Threads of one training."""
+    validate_every: Count = 2
+    """Epochs between validations."""
+    validation_draws: Count = 1
+    """Noise draws per validation star."""
+    dead_check_steps: Count = 50
+    """Steps between looks for a dead network."""
+    restarts: Annotated[int, Field(ge=0)] = 3
+    """New starts from another seed if the network dies."""
+    checkpoint_seconds: CheckpointSeconds = 20.0
+    """Least time between checkpoints; repeats nothing."""
+    noise: Literal["fresh", "fixed"] = "fresh"
+    """Noise drawn anew every epoch, or once for all epochs."""
+    crop_epochs: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """First part of the epochs, which sees the middle of stamps alone (two thirds of it where
+    templates are learnt); 0: none."""
+    continued_epochs: Annotated[float, Field(ge=0, le=2)] = 1.0
+    """Epochs, of those of the realisations, in which a network of templates goes on from theirs; 0:
+    as many, from a start of its own."""
+    patience: Annotated[int, Field(ge=0)] = 0
+    """Stop after this many validations without a better one; 0 never stops."""

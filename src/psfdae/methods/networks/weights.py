@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from psfdae.base.errors import no_such_file
 from psfdae.base.files import ProductError, atomic_path
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
             metadata = dict(json.loads((file.metadata() or {}).get(METADATA_KEY, "{}")))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
+        raise ProductError(no_such_file(path)) from None
     except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
     # Weights of another program have no checksum, and nothing to compare with.
