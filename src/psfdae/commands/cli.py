@@ -355,9 +355,13 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 def described_parameters(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Return the docstring of a function up to its parameters, and their meanings by name."""
     # In numpydoc's form a name begins a line, and its meaning is indented below it.
-    text, _, section = cleandoc(function.__doc__ or "").partition("\n\nParameters\n----------\n")
+    help_text, _, section = cleandoc(function.__doc__ or "").partition(
+        "\n\nParameters\n----------\n"
+    )
     entries = re.findall(r"^(\w+) : .*((?:\n +.*)+)", section, re.MULTILINE)
-    return text, {name: " ".join(meaning.split()) for name, meaning in entries}
+    # Two blanks before a default, as click has them.
+    meanings = {name: " ".join(text.split()) for name, text in entries}
+    return help_text, {k: v.replace(" [default:", "  [default:") for k, v in meanings.items()}
 
 
 def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> Sequence[str]:

@@ -14,5 +14,5 @@ SECTIONS = {
 }
 """Headings of `psfdae --help` with the commands below each; all others are "The paper's stages"."""
 
-REQUIRED = {"simulate": "hydra", "*": "hydra"}
+REQUIRED = {"example-night": "pandas", "simulate": "hydra", "*": "hydra"}
 """Modules of an extra without which a command, or any other command (*), is not listed."""
