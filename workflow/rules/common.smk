@@ -321,16 +321,15 @@ def option_of(method, dataset, split, reference):
     return f"--{method.name.replace('_', '-')}={place}"
 
 
-def fitted(dataset, split, reference, drawn=False):
-    """Files of all models that restore stars of a split, or of those that figures show."""
-    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
-    return [path for m in wanted for path in files_of(m, dataset, split, reference)]
+def fitted(dataset, split, reference):
+    """Files of all models that restore stars of a split."""
+    models = methods_of(dataset)
+    return [path for m in models for path in files_of(m, dataset, split, reference)]
 
 
-def model_options(dataset, split, reference, drawn=False):
+def model_options(dataset, split, reference):
     """Options of a command that takes these models."""
-    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
-    return [option_of(m, dataset, split, reference) for m in wanted]
+    return [option_of(m, dataset, split, reference) for m in methods_of(dataset)]
 
 
 def bundles_of(dataset, networks):
