@@ -158,9 +158,9 @@ def night_table(
     night = with_verdicts(concat(tables, ignore_index=True).fillna({"reason": ""}))
     write_csv(out, night)
     table = QTable.from_pandas(night)
+    units = {"fwhm_px": "pix", "mag_20th": "mag", "zero_point": "mag"}
     for name in table.colnames:
-        if name.removeprefix("true_").startswith("fwhm_px"):
-            table[name].unit = "pix"
+        table[name].info.unit = next((u for key, u in units.items() if key in name), None)
     write_table(out.with_suffix(".ecsv"), table)
 
 
@@ -188,7 +188,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
             name = str(with_model.name.iloc[number])
             model = load_model(folder / f"{name}{SUFFIX}")
             assert model.image_px is not None  # of a model that was fitted to an image
-            psfs[f"{label}: {name}"] = model.on_pixels(positions_of_places(model.image_px))
+            psfs[f"{label}\n{name}"] = model.on_pixels(positions_of_places(model.image_px))
     links = os.path.relpath(folder, out.parent)
     write_text(out, night_page(night, psfs, links))
 
