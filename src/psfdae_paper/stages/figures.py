@@ -83,6 +83,8 @@ def figure_strip(
 
     Parameters
     ----------
+    reference : str
+        Truth: the star's own noise-free image, or the static PSF of its field.
     dataset : str
         Name that goes into the title.
     levels : sequence of float
@@ -118,6 +120,8 @@ def figure_headline(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     level : float
         Noise level λ.
     """
@@ -279,6 +283,8 @@ def figure_errors(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     out : sequence of pairs
         Metric and its PNG; repeat for more.
     """
