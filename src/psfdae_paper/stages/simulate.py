@@ -446,7 +446,7 @@ def example_night(
 
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
-    write_csv(reference, stars.to_pandas())
+    write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"
