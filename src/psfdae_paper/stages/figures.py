@@ -73,8 +73,6 @@ def figure_strip(
 
     Parameters
     ----------
-    reference : str
-        Truth: the star's own noise-free image, or the static PSF of its field.
     levels : sequence of float
         Noise level λ; repeat for more rows.
     """
