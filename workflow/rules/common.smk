@@ -1,4 +1,5 @@
 import atexit
+import hashlib
 import os
 import shlex
 import sys
@@ -76,8 +77,8 @@ RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PR
 def keep_finished_run():
     """Stop before a run with other overrides is replaced in a folder that was not named."""
     run = finished_run(RESULTS)
-    # Points of sweeps are named by their content, and replace none.
-    if CHOSEN_FOLDER or config["sweep"] or not run:
+    # Points of sweeps are named by their content, and replace none; a night has its own folder.
+    if CHOSEN_FOLDER or config["sweep"] or config["images"] or not run:
         return
     finished_words, words = shlex.split(run.get("set") or ""), GIVEN[1:]
     lost = " ".join(word for word in finished_words if word not in words)
@@ -95,7 +96,7 @@ def keep_finished_run():
 
 def record_finished_run():
     """Write preset and overrides of a run into its folder."""
-    if not config["sweep"]:
+    if not (config["sweep"] or config["images"]):
         record = {"preset": PRESET, "set": shlex.join(GIVEN[1:])}
         write_text(Path(RESULTS, "run.yaml"), as_yaml(record))
 

@@ -406,6 +406,26 @@ def typed_words(options: Any) -> list[str]:
     return words
 
 
+def typed_values(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return values of a dataclass's fields from texts by name, as options take them.
+
+    Names of no field and empty texts are left out.
+
+    Raises
+    ------
+    Error
+        If a text is no value of its field; names both.
+    """
+    values = {}
+    for name, hint, default in _parameters(options):
+        if text := texts.get(name):
+            try:
+                values[name] = _option(name, hint, default).type(text)
+            except click.BadParameter as error:
+                raise Error(f"{name} = {text}: {error.message}") from None
+    return values
+
+
 def program(*functions: Callable[..., Any]) -> None:
     """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
     Careful(commands=[as_click(function) for function in functions])()

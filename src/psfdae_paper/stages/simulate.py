@@ -370,6 +370,8 @@ def write_example_field(
 
     Parameters
     ----------
+    seed : int
+        Seed of the places, fluxes and noise of the stars.
     catalogue : Path
         CSV file for the star list.
     side : int
@@ -433,6 +435,8 @@ def example_night(
 
     Parameters
     ----------
+    seed : int
+        Seed of stars, noise and faults.
     out : Path
         Folder for images, truth.csv and reference.csv.
     exposures : int
@@ -442,7 +446,7 @@ def example_night(
 
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
-    write_csv(reference, stars.to_pandas())
+    write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"
