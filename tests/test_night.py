@@ -179,6 +179,13 @@ def test_list_without_images_is_refused(tmp_path, monkeypatch, text, message):
         listed_images(text)
 
 
+def test_images_of_one_name_have_files_of_different_names(tmp_path):
+    (tmp_path / "list.csv").write_text("image\na/x.fits\nb/x.fits\nx_2.fits\na/x.fits\n")
+    rows = listed_images(str(tmp_path / "list.csv"))
+    assert [row["name"] for row in rows] == ["x", "x_2", "x_2_2", "x_3"]
+    assert [row["reason"] for row in rows] == ["", "", "", "listed twice"]
+
+
 def test_wrong_statement_is_the_reason(tmp_path):
     """A cell that is no value of its column names the column."""
     rows = tmp_path / "rows.csv"

@@ -7,6 +7,7 @@ report page, and for the night one table and one page. What cannot be used is a 
 from __future__ import annotations
 
 import glob
+import itertools
 import math
 import os
 import traceback
@@ -67,14 +68,15 @@ def listed_images(text: str) -> list[dict[str, str]]:
     if not rows:
         raise NightError(f"images = {text}: no image, expected night/*.fits or a CSV list")
     # Names of files in different folders may be the same; the same image twice is an error.
-    names, paths = Counter[str](), set[tuple[str, str]]()
+    names, images = set[str](), set[tuple[str, str]]()
     for row in rows:
-        stem, path = ImageInput(Path(row["image"])).name, str(Path(row["image"]).absolute())
-        names[stem] += 1
-        row["name"] = stem if names[stem] == 1 else f"{stem}_{names[stem]}"
-        extension = row.get("extension", "")
-        row["reason"] = "listed twice" if (path, extension) in paths else ""
-        paths.add((path, extension))
+        stem = ImageInput(Path(row["image"])).name
+        numbered = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        row["name"] = next(name for name in numbered if name not in names)
+        image = str(Path(row["image"]).absolute()), row.get("extension", "")
+        row["reason"] = "listed twice" if image in images else ""
+        names.add(row["name"])
+        images.add(image)
     return rows
 
 
