@@ -33,7 +33,8 @@ from psfdae.base.settings import Group
 class Settings(Group):
     """How far."""
 
-    weight: Annotated[float, Field(ge=0, le=1)] = Field(description="0 gives the mean")
+    weight: Annotated[float, Field(ge=0, le=1)]
+    """Weight of the image; 0 gives the mean."""
 
 
 @dataclass(frozen=True)

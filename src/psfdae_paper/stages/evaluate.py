@@ -88,6 +88,10 @@ def evaluate(
 
     Parameters
     ----------
+    split : str
+        Split whose test stars are measured.
+    reference : str
+        Truth: the star's own noise-free image, or the static PSF of its field.
     dataset : str
         Name that goes into the table.
     stars : Path
@@ -251,6 +255,8 @@ def paper_tables(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     out : sequence of pairs
         Metric and its CSV, the Markdown beside; repeat for more.
     """

@@ -112,6 +112,8 @@ def figure_headline(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     level : float
         Noise level λ.
     """
@@ -211,6 +213,8 @@ def figure_errors(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     out : sequence of pairs
         Metric and its PNG; repeat for more.
     """

@@ -370,6 +370,8 @@ def write_example_field(
 
     Parameters
     ----------
+    seed : int
+        Seed of the places, fluxes and noise of the stars.
     catalogue : Path
         CSV file for the star list.
     side : int
@@ -433,6 +435,8 @@ def example_night(
 
     Parameters
     ----------
+    seed : int
+        Seed of stars, noise and faults.
     out : Path
         Folder for images, truth.csv and reference.csv.
     exposures : int
