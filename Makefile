@@ -5,6 +5,7 @@
 #   RESULTS=folder   folder that is written and read (default: results, or results/PRESET); a finished
 #                    run in it gives PRESET and SET where they are not given
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
+#   IMAGES="…"       images of `make night`: a pattern such as night/*.fits, or a CSV list
 #   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
 #   TRACK=live       shows trainings in MLflow while they run (default: once they are finished)
@@ -21,6 +22,7 @@ SET ?=
 RESULTS ?=
 TARGETS ?=
 AGAINST ?=
+IMAGES ?=
 TORCH_INDEX ?=
 PORT ?= 5000
 TRACK ?=
@@ -55,6 +57,7 @@ override SET := $(value SET)
 override RESULTS := $(value RESULTS)
 override TARGETS := $(value TARGETS)
 override AGAINST := $(value AGAINST)
+override IMAGES := $(value IMAGES)
 override PORT := $(value PORT)
 override TRACK := $(value TRACK)
 override TORCH_INDEX := $(value TORCH_INDEX)
@@ -62,7 +65,7 @@ override PART := $(value PART)
 override PYTHONS := $(value PYTHONS)
 override RESOLUTION := $(value RESOLUTION)
 PSFDAE_RESULTS := $(or $(RESULTS),results$(if $(filter-out fast,$(PRESET)),/$(PRESET)))
-export CORES PRESET SET RESULTS TARGETS AGAINST PORT TRACK TORCH_INDEX PART PYTHONS RESOLUTION PSFDAE_RESULTS
+export CORES PRESET SET RESULTS TARGETS AGAINST IMAGES PORT TRACK TORCH_INDEX PART PYTHONS RESOLUTION PSFDAE_RESULTS
 SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET" \
   results="$$RESULTS"
 # -f: a target is no pattern of file names.
@@ -86,7 +89,7 @@ $(if $(filter-out PYTHON,$(UNKNOWN)),$(error $(UNKNOWN): no variable of this Mak
 
 .DEFAULT_GOAL := help
 .PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons dist lint format lock clean \
-  benchmark stability bounds bundles shipped
+  benchmark stability bounds bundles shipped night
 
 help: ## List the targets
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -127,6 +130,9 @@ benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
 	*) $(LOCKED) -- $@;; esac
+
+night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list of images
+	@set -f; sh workflow/locked.sh $(SNAKEMAKE) images="$$IMAGES" -- night
 
 shipped: env ## Train the model that comes with the package and renew it
 	@$(LOCKED) --forcerun shipped -- shipped

@@ -1,7 +1,7 @@
 """Runs `psfdae` in forks of one process, in which the packages are imported once for all jobs.
 
-A job of the smallest sizes is mostly the start of an interpreter with torch and
-hydra. What it computes, its files, output and exit code are those of a process of its own.
+A job of the smallest sizes is mostly the start of an interpreter with torch, hydra and
+scikit-learn. What it computes, its files, output and exit code are those of a process of its own.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def import_stages() -> None:
 
     for module, _ in command_modules().values():
         import_module(module)
-    for late in ("matplotlib.pyplot", "scipy.cluster.vq", "skimage.metrics"):
+    for late in ("matplotlib.pyplot", "sklearn.cluster", "sklearn.mixture", "skimage.metrics"):
         import_module(late)
     import torch
 

@@ -50,7 +50,7 @@ def at(tmp_path_factory):
 
 def evaluate(at, stars="s.h5", dae="dae"):
     models = ("--pca-som", at / "pca_som.h5", "--dae", at / dae)
-    out = ("--per-star", at / "out.parquet", "--out", at / "out.csv")
+    out = ("--per-star", at / "out.parquet", "--restored", at / "out.h5", "--out", at / "out.csv")
     return ("evaluate", "--dataset", "d", "--stars", at / stars, *models, *out, *SIZES, METHODS)
 
 

@@ -47,6 +47,7 @@ DRY = {
     "make mlflow RESULTS=results/lr2e-3",
     *(f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")),
     *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
+    "snakemake night --config images=night/*.fits",
     "snakemake sweep --cores all --config sweep=dae_width",
     "snakemake tracking --forcerun track track_alignment",
     *(f"make {t}" for t in ("mlflow", "mlflow PORT=5001", "reference")),

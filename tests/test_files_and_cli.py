@@ -185,6 +185,13 @@ def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):
     assert lines[0] == "training: 10%  about 90 s left  epoch 10"
 
 
+def test_every_option_is_explained():
+    """A new option needs an entry under Parameters of its command."""
+    for name in command_modules():
+        options = [p for p in as_click(stage(name)).params if p.param_type_name == "option"]
+        assert options and all(option.help for option in options), name
+
+
 def test_every_command_takes_quiet(tmp_path):
     """A command says what it did, unless it is told to be quiet; an error is said in any case."""
     for name in command_modules():

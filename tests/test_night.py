@@ -1,11 +1,27 @@
 """A night of a telescope: the simulated example, and the tables and pages made of many images."""
 
+import signal
+import subprocess
+import time
+
 import numpy as np
+import pandas as pd
 import pytest
 from astropy.io import fits
 
 from psfdae.base.reading import read_table
+from psfdae_paper.evaluation.night import LIMITS, night_page, with_verdicts
+from psfdae_paper.stages.night import (
+    NightError,
+    listed_images,
+    night_count,
+    night_images,
+    night_table,
+    write_night_page,
+)
 from psfdae_paper.stages.simulate import example_night
+from psfdae_paper.stars.nights import PLACES
+from workflow_runs import QUIET, captured, copy_of_sources, environment
 
 
 @pytest.fixture(scope="module")
@@ -16,23 +32,187 @@ def folder(tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def truth(folder):
+    """What is wrong with the exposures, and their true shapes."""
+    return read_table(folder / "truth.csv", "image", "fault", "true_fwhm_px_centre")
+
+
+@pytest.fixture(scope="module")
+def rows(folder, truth):
+    """A list of good and bad images of two cameras, one twice, one that is missing."""
+    intact, bad = truth[truth.fault.isna()], truth[truth.fault.isin(["no stars", "truncated file"])]
+    other = folder / "other" / "exposure_000.fits"
+    other.parent.mkdir()
+    with fits.open(intact.image.iloc[1]) as hdus:
+        hdus[0].header["INSTRUME"] = "other camera"
+        hdus.writeto(other)
+    listed = pd.concat([intact.iloc[:2], bad]).assign(observer="Anna")
+    further = [{"image": path} for path in (intact.image.iloc[0], other, folder / "none.fits")]
+    path = folder / "list.csv"
+    pd.concat([listed, pd.DataFrame(further)]).to_csv(path, index=False)
+    out = folder / "rows.csv"
+    pd.DataFrame(listed_images(str(path))).to_csv(out, index=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def night(rows, folder):
+    """The table of the night."""
+    night_images(rows, folder / "images", folder / "part.csv")
+    night_table((folder / "part.csv",), folder / "night.csv")
+    return read_table(folder / "night.csv", "name", "verdict", "reason").set_index("name")
+
+
 def test_same_seed_gives_the_same_night(folder, tmp_path):
     example_night(tmp_path, seed=3, exposures=12)
-    for path in sorted(folder.glob("*.fits")):
-        assert (tmp_path / path.name).read_bytes() == path.read_bytes()
+    for path in sorted(tmp_path.glob("*.fits")):
+        assert (folder / path.name).read_bytes() == path.read_bytes()
 
 
-def test_truth_of_a_night_names_what_is_wrong(folder):
+def test_truth_of_a_night_names_what_is_wrong(truth):
     """The seeing grows with the airmass, and each of five faults is that of one image."""
-    truth = read_table(folder / "truth.csv", "image", "fault", "true_fwhm_px_centre")
-    assert sorted(truth.fault.dropna()) == [
-        *("clouds", "clouds", "no stars", "trailed", "truncated file")
-    ]
+    faults = ["clouds", "clouds", "no stars", "trailed", "truncated file"]
+    assert sorted(truth.fault.dropna()) == faults
     # The aberrations of the example grow towards the corners.
     assert (truth.true_fwhm_px_lower_left > truth.true_fwhm_px_centre).all()
     intact = truth[truth.fault.isna()].image
     headers = [fits.getheader(path) for path in intact]
     assert np.ptp([header["AIRMASS"] for header in headers]) > 0.3
     assert len({header["DATE-OBS"] for header in headers}) == len(headers)
-    with pytest.raises(TypeError, match=r"truncated|buffer"):
-        fits.getdata(truth[truth.fault == "truncated file"].image.iloc[0])
+
+
+def test_what_cannot_be_used_is_a_row_with_its_reason(night, truth):
+    reasons = night.reason[night.verdict == "failed"]
+    assert len(night) == 7 and len(reasons) == 4
+    by_fault = truth.set_index("fault").image.str.extract(r"(exposure_\d+)", expand=False)
+    assert "truncated" in reasons[by_fault["truncated file"]]
+    assert "no star" in reasons[by_fault["no stars"]]
+    assert reasons["exposure_000_2"] == "listed twice"
+    assert reasons["none"] == "no such file"
+
+
+def test_exposures_of_one_camera_share_a_start(night):
+    """An image of another camera is fitted by itself; further columns of the list are kept."""
+    good = night[night.verdict == "good"]
+    assert len(good) == 3
+    first, second, other = good.start.fillna("")
+    assert {first, second} == {"", good.index[0] if not first else good.index[1]}
+    assert other == ""
+    assert good.observer.iloc[0] == "Anna"
+
+
+def test_shapes_are_those_of_the_truth(night):
+    """FWHM within 2 % at all places, ellipticity within 0.02, and the zero point of the stars."""
+    good = night[night.verdict == "good"].dropna(subset="true_fwhm_px_centre")
+    assert len(good) == 2
+    for place in PLACES:
+        ratio = good[f"fwhm_px_{place}"] / good[f"true_fwhm_px_{place}"]
+        assert ratio.to_numpy() == pytest.approx(1.0, abs=0.02)
+        ellipticity = good[f"ellipticity_{place}"].to_numpy()
+        assert ellipticity == pytest.approx(good[f"true_ellipticity_{place}"].to_numpy(), abs=0.02)
+    # A count is of magnitude 25 at airmass 1, and 0.15 mag are lost for each airmass more.
+    expected = 25.0 - 0.15 * (good.airmass - 1.0)
+    assert good.zero_point.to_numpy() == pytest.approx(expected.to_numpy(), abs=0.01)
+    assert (good.zero_point_scatter < 0.02).all()
+
+
+def test_files_of_an_image(night, folder):
+    """A page for each image, which needs no other file; the night's page links it."""
+    images = folder / "images"
+    names = {path.name.partition(".")[0] for path in images.iterdir()}
+    assert names == {*night.index[night.verdict != "failed"]}
+    # A poor image is named in the figures as well.
+    table = night.reset_index()
+    table.loc[table.index[table.verdict == "good"][0], "verdict"] = "poor"
+    table.to_csv(folder / "poor.csv", index=False)
+    write_night_page(folder / "poor.csv", images, folder / "night.html")
+    page = (folder / "night.html").read_text(encoding="utf-8")
+    assert "listed twice" in page and "http" not in page
+    for name in names:
+        assert f'href="images/{name}.html"' in page and (images / f"{name}.html").is_file()
+
+
+def table_of(count, **columns):
+    """Rows of a quiet night, in which some values are replaced."""
+    values = {"fwhm_px_centre": 3.0, "ellipticity_centre": 0.02, "mag_20th": -12.0}
+    noise = np.random.default_rng(1).normal(0.0, 0.005, (len(LIMITS), count))
+    night = pd.DataFrame({name: values[name] + n for name, n in zip(LIMITS, noise, strict=True)})
+    night["reason"] = ""
+    for name, (row, value) in columns.items():
+        night.loc[row, name] = value
+    return night
+
+
+def test_verdicts_name_what_is_unlike_the_neighbours_in_time():
+    night = with_verdicts(
+        table_of(40, fwhm_px_centre=(5, 4.5), ellipticity_centre=(12, 0.5), mag_20th=(30, -9.0))
+    )
+    poor = night[night.verdict == "poor"].reason
+    assert [*poor.index] == [5, 12, 30]
+    assert "4.50 px" in poor[5] and "trailed" in poor[12] and "3.0 mag" in poor[30]
+
+
+def test_a_slow_change_of_the_focus_makes_no_image_poor():
+    night = table_of(40)
+    night["fwhm_px_centre"] += np.linspace(0.0, 4.0, 40)
+    assert (with_verdicts(night).verdict == "good").all()
+
+
+def test_a_night_without_any_model_is_refused(tmp_path, capsys):
+    """It has a table and a page nevertheless, which say why."""
+    night = with_verdicts(pd.DataFrame({"image": ["a.fits"], "name": ["a"], "reason": ["empty"]}))
+    assert [*night.verdict] == ["failed"]
+    assert "empty" in night_page(night, {}, "images")
+    night.to_csv(tmp_path / "night.csv")
+    with pytest.raises(NightError, match="0 good, 0 poor, 1 failed"):
+        night_count(tmp_path / "night.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("*.fits", "no image"), ("list.csv", "'image' is missing")]
+)
+def test_list_without_images_is_refused(tmp_path, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "list.csv").write_text("file\na.fits\n")
+    with pytest.raises(Exception, match=message):
+        listed_images(text)
+
+
+def test_images_of_one_name_have_files_of_different_names(tmp_path):
+    (tmp_path / "list.csv").write_text("image\na/x.fits\nb/x.fits\nx_2.fits\na/x.fits\n")
+    rows = listed_images(str(tmp_path / "list.csv"))
+    assert [row["name"] for row in rows] == ["x", "x_2", "x_2_2", "x_3"]
+    assert [row["reason"] for row in rows] == ["", "", "", "listed twice"]
+
+
+def test_wrong_statement_is_the_reason(tmp_path):
+    """A cell that is no value of its column names the column."""
+    rows = tmp_path / "rows.csv"
+    rows.write_text("image,gain,name,reason\na.fits,much,a,\n")
+    night_images(rows, tmp_path / "images", tmp_path / "part.csv")
+    assert "gain = much" in read_table(tmp_path / "part.csv", "reason").reason[0]
+
+
+@pytest.mark.slow
+@pytest.mark.workflow
+def test_killed_and_typed_again_gives_the_same_files(folder, tmp_path):
+    """The start of an image depends on the list, not on what was finished before."""
+    products = []
+    for is_killed in (False, True):
+        place = copy_of_sources(tmp_path / str(is_killed))
+        words = ["snakemake", "night", "--cores", "2", "--config", f"images={folder}/exp*.fits"]
+        options = {"cwd": place, "env": environment(SOURCE_DATE_EPOCH="0")}
+        if is_killed:
+            run = subprocess.Popen(words, **options, **QUIET)
+            while not [*place.glob("results/night/images/*.html")] and run.poll() is None:
+                time.sleep(0.2)
+            run.send_signal(signal.SIGTERM)
+            assert run.wait(120) != 0
+        run = captured(words, **options)
+        assert run.returncode == 0, run.stdout + run.stderr
+        assert "good, " in run.stdout + run.stderr
+        files = sorted(p for p in (place / "results/night").rglob("*.*") if p.is_file())
+        products.append({str(p.relative_to(place)): p.read_bytes() for p in files})
+    assert products[0] == products[1]
+    assert (tmp_path / "True/results/mlflow/night.csv").is_file()

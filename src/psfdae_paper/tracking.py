@@ -26,6 +26,7 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.methods.interface import CONFIG, HISTORY, Method
+from psfdae.model.bundle import SUFFIX
 from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_networks, trained_networks
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
@@ -342,6 +343,42 @@ def _network_files(folder: Path, weights: str) -> dict[str, Path]:
     """List the files of a network of scene 3 by their names within the run."""
     model = {f"{TrackedRun.model_prefix}{name}": folder / name for name in (weights, CONFIG)}
     return model | {HISTORY: folder / HISTORY}
+
+
+def runs_of_night(results: Path) -> list[TrackedRun]:
+    """Read the images of a night that have a model, each a run of the experiment "night".
+
+    Raises
+    ------
+    ProductError
+        If the table of the night or a model is missing.
+    """
+    night = read_table(results / "night/night.csv", "image", "name", "verdict")
+    runs = []
+    for row in night[night.verdict != "failed"].to_dict("records"):
+        name = str(row["name"])
+        source = f"night/images/{name}{SUFFIX}"
+        # All numbers of the row are metrics, and the texts tags.
+        numbers = {str(k): float(v) for k, v in row.items() if isinstance(v, int | float)}
+        texts = {str(k): v for k, v in row.items() if isinstance(v, str)}
+        runs.append(
+            TrackedRun(
+                kind="field",
+                dataset="night",
+                split="held_out",
+                reference="realisation",
+                source=source,
+                name=name,
+                experiment="night",
+                files={f"{TrackedRun.model_prefix}{name}{SUFFIX}": results / source},
+                config={"image": row["image"]},
+                last_file=results / source,
+                metrics={k: number for k, number in numbers.items() if math.isfinite(number)},
+                seconds=0.0,
+                tags={key: texts[key] for key in ("verdict", "reason", "time") if key in texts},
+            )
+        )
+    return runs
 
 
 def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:

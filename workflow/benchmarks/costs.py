@@ -109,7 +109,7 @@ def time_method(name, tree, stars, bound):
     from psfdae_paper.bounds.estimates import SPLIT, bounded_stars
 
     # Imports are no part of the fit.
-    for module in ("torch", "minisom", "scipy.cluster.vq", "skimage.restoration"):
+    for module in ("torch", "minisom", "sklearn.cluster", "skimage.restoration"):
         import_module(module)
     limit_threads(1)
     config, kind = part(groups(name), tree), method_class(name)

@@ -258,8 +258,7 @@ rule figure_bank_growth:
 
 rule figure_headline:
     input:
-        stars=lambda w: stars_of(HEADLINE_DATASET),
-        models=lambda w: fitted(*HEADLINE, drawn=True),
+        restored="{}/evaluation/{}/{}-{}.h5".format(RESULTS, *HEADLINE),
         bounds=rules.psf_bounds.output,
         efficiency=rules.psf_efficiency.output,
     output:
@@ -274,21 +273,15 @@ rule figure_headline:
         f"{RESULTS}/logs/figures/headline.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_headline.tsv"
-    threads: lambda w: dataset_config(HEADLINE_DATASET).evaluation.threads
     resources:
-        mem_mb=1000,
         runtime=5,
     params:
-        config=lambda w: settings("figure headline", f"dataset={HEADLINE_DATASET}"),
         source=lambda w: estimators_source("figure headline", HEADLINE_DATASET),
-        dataset=HEADLINE_DATASET,
-        models=lambda w: model_options(*HEADLINE, drawn=True),
         level=lambda w: shown_levels(HEADLINE_DATASET)[-1],
     message:
         "Drawing the figure of the README"
     shell:
-        "psfdae figure headline --config {params.config} --dataset {params.dataset}"
-        " --stars {input.stars} {params.models} --level {params.level}"
+        "psfdae figure headline --restored {input.restored} --level {params.level}"
         " --bounds {input.bounds} --efficiency {input.efficiency} --out {output}"
         " > {log} 2>&1"
 

@@ -1,4 +1,5 @@
 import atexit
+import hashlib
 import os
 import shlex
 import sys
@@ -76,8 +77,8 @@ RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PR
 def keep_finished_run():
     """Stop before a run with other overrides is replaced in a folder that was not named."""
     run = finished_run(RESULTS)
-    # Points of sweeps are named by their content, and replace none.
-    if CHOSEN_FOLDER or config["sweep"] or not run:
+    # Points of sweeps are named by their content, and replace none; a night has its own folder.
+    if CHOSEN_FOLDER or config["sweep"] or config["images"] or not run:
         return
     finished_words, words = shlex.split(run.get("set") or ""), GIVEN[1:]
     lost = " ".join(word for word in finished_words if word not in words)
@@ -95,7 +96,7 @@ def keep_finished_run():
 
 def record_finished_run():
     """Write preset and overrides of a run into its folder."""
-    if not config["sweep"]:
+    if not (config["sweep"] or config["images"]):
         record = {"preset": PRESET, "set": shlex.join(GIVEN[1:])}
         write_text(Path(RESULTS, "run.yaml"), as_yaml(record))
 
@@ -198,9 +199,32 @@ def templates_of(stars):
     return f"{RESULTS}/data/{tree['scene']['name']}/templates.h5"
 
 
+@cache
+@one_line()
 def stars_of(dataset):
+    """Stars of a dataset: those of a file of config/stars, or of its own telescope.
+
+    A file of stars serves several datasets, so that a dataset that changes them is refused.
+    """
     tree = dataset_config(dataset)
-    return f"{RESULTS}/data/{tree.scene.name}/{tree.stars.name}.h5"
+    name = tree.stars.name
+    # Datasets of own telescopes have stars of their own (own_telescope.smk).
+    if tree.scene.name != "telescope":
+        file = os.path.relpath(config_dir() / f"stars/{name}.yaml")
+        advice = "other stars have a file there, NAME.yaml with stars.name: NAME"
+        if name not in options("stars"):
+            raise ConfigError(
+                f"dataset={dataset}: stars.name = {name}: no {file}; {advice}"
+            )
+        stars_of_file = composed(f"stars={name}")["stars"]
+        for key, value in composed(f"dataset={dataset}")["stars"].items():
+            if value != stars_of_file.get(key):
+                raise ConfigError(
+                    f"dataset={dataset}: stars.{key} = {value}, but its stars are those of {file} "
+                    f"with {stars_of_file.get(key)}; {advice}, which a dataset chooses by "
+                    "'override /stars: NAME' among its defaults"
+                )
+    return f"{RESULTS}/data/{tree.scene.name}/{name}.h5"
 
 
 def evaluations_of(dataset, splits=None, folder="evaluation"):
@@ -320,16 +344,15 @@ def option_of(method, dataset, split, reference):
     return f"--{method.name.replace('_', '-')}={place}"
 
 
-def fitted(dataset, split, reference, drawn=False):
-    """Files of all models that restore stars of a split, or of those that figures show."""
-    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
-    return [path for m in wanted for path in files_of(m, dataset, split, reference)]
+def fitted(dataset, split, reference):
+    """Files of all models that restore stars of a split."""
+    models = methods_of(dataset)
+    return [path for m in models for path in files_of(m, dataset, split, reference)]
 
 
-def model_options(dataset, split, reference, drawn=False):
+def model_options(dataset, split, reference):
     """Options of a command that takes these models."""
-    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
-    return [option_of(m, dataset, split, reference) for m in wanted]
+    return [option_of(m, dataset, split, reference) for m in methods_of(dataset)]
 
 
 def bundles_of(dataset, networks):

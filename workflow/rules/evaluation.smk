@@ -5,6 +5,7 @@ rule evaluate:
     output:
         summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
         per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
+        restored=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.h5",
     log:
         f"{RESULTS}/logs/evaluate/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
@@ -22,7 +23,7 @@ rule evaluate:
         "psfdae evaluate --config {params.config} --dataset {wildcards.dataset}"
         " --split {wildcards.split} --reference {wildcards.reference}"
         " --stars {input.stars} {params.models} --per-star {output.per_star}"
-        " --out {output.summary} > {log} 2>&1"
+        " --restored {output.restored} --out {output.summary} > {log} 2>&1"
 
 
 rule paper_tables:

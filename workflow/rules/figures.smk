@@ -44,8 +44,7 @@ use rule figure_templates as figure_energy with:
 
 rule figure_strip:
     input:
-        stars=lambda w: stars_of(w.dataset),
-        models=lambda w: fitted(w.dataset, "random", w.reference, drawn=True),
+        f"{RESULTS}/evaluation/{{dataset}}/random-{{reference}}.h5",
     output:
         report(
             f"{RESULTS}/figures/{{dataset}}/strip_{{reference}}.png",
@@ -58,20 +57,14 @@ rule figure_strip:
         f"{RESULTS}/logs/figure_strip/{{dataset}}-{{reference}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_strip/{{dataset}}-{{reference}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).evaluation.threads
-    resources:
-        mem_mb=1000,
     params:
-        config=lambda w: settings("figure strip", f"dataset={w.dataset}"),
         source=lambda w: estimators_source("figure strip", w.dataset),
-        models=lambda w: model_options(w.dataset, "random", w.reference, drawn=True),
         levels=lambda w: [f"--level={level:g}" for level in shown_levels(w.dataset)],
     message:
         "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
     shell:
-        "psfdae figure strip --config {params.config} --dataset {wildcards.dataset}"
-        " --reference {wildcards.reference} --stars {input.stars} {params.models}"
-        " {params.levels} --out {output} > {log} 2>&1"
+        "psfdae figure strip --restored {input} {params.levels} --out {output}"
+        " > {log} 2>&1"
 
 
 rule figure_curves:

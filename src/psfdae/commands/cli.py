@@ -355,9 +355,13 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 def described_parameters(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Return the docstring of a function up to its parameters, and their meanings by name."""
     # In numpydoc's form a name begins a line, and its meaning is indented below it.
-    text, _, section = cleandoc(function.__doc__ or "").partition("\n\nParameters\n----------\n")
+    help_text, _, section = cleandoc(function.__doc__ or "").partition(
+        "\n\nParameters\n----------\n"
+    )
     entries = re.findall(r"^(\w+) : .*((?:\n +.*)+)", section, re.MULTILINE)
-    return text, {name: " ".join(meaning.split()) for name, meaning in entries}
+    # Two blanks before a default, as click has them.
+    meanings = {name: " ".join(text.split()) for name, text in entries}
+    return help_text, {k: v.replace(" [default:", "  [default:") for k, v in meanings.items()}
 
 
 def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> Sequence[str]:
@@ -400,6 +404,26 @@ def typed_words(options: Any) -> list[str]:
             flag = _option(name, hint, default).opts[0]
             words += [flag] if value is True else [flag, str(value)]
     return words
+
+
+def typed_values(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return values of a dataclass's fields from texts by name, as options take them.
+
+    Names of no field and empty texts are left out.
+
+    Raises
+    ------
+    Error
+        If a text is no value of its field; names both.
+    """
+    values = {}
+    for name, hint, default in _parameters(options):
+        if text := texts.get(name):
+            try:
+                values[name] = _option(name, hint, default).type(text)
+            except click.BadParameter as error:
+                raise Error(f"{name} = {text}: {error.message}") from None
+    return values
 
 
 def program(*functions: Callable[..., Any]) -> None:

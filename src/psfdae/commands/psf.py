@@ -74,10 +74,13 @@ def psf(
     # What the user should know of these places, then the file.
     for note in _notes(loaded, positions):
         print(f"{model}: {note}")
+    reader = "photutils, as STDPSF"
     if for_stdpsf and grid_shape is not None:
         exchange.write_stdpsf(out, loaded, *grid_shape)
     else:
         exchange.write_grid(out, loaded, positions, oversampling)
+        reader = "photutils 3.1 or newer (an older one reads NAME.stdpsf.fits)"
+    print(f"{out}: {len(positions)} PSFs, for {reader}")
 
 
 def _position(text: str) -> tuple[float, float]:

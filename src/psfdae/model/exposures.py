@@ -15,6 +15,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import creation_date
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.image_prediction import other_instrument
+from psfdae.model.packing import checksum
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import of_config
 from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
@@ -115,6 +116,27 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
         if isinstance(field, FieldMixture) and len(bright) >= MIN_STARS_WITH_ERROR:
             models[image.name] = _adapt(model, field, image.observation, bright, image.name)
     return models
+
+
+def adapted_to_stars(model: PsfModel, stars: Stars) -> PsfModel:
+    """Adapt a model to the stars of one other image, without those that are held out for a test.
+
+    Parameters
+    ----------
+    model : PsfModel
+        Model of the method field, with stamps as large as those of the stars, that was not adapted
+        itself.
+    stars : Stars
+        Bright stars of the other image.
+    """
+    field, train = model.method, stars.split.train
+    assert isinstance(field, FieldMixture)
+    bright = stars.candidates.bright.of(np.flatnonzero(~stars.held_out))
+    adapted = _adapt(model, field, stars.observation, bright, stars.name)
+    # The checksum of the stars that were learnt from shows a test that it saw no other.
+    learnt = checksum(stars.product["realisation"][train], stars.product[stars.reference][train])
+    info = adapted.info.model_copy(update={"training_sha256": learnt})
+    return PsfModel(replace(adapted.bundle, info=info))
 
 
 def _adapt(

@@ -186,7 +186,7 @@ def photometry_of_image(
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
     # Read the stars of the reference before the long work, in case they cannot be used.
-    magnitudes = None
+    magnitudes = scatter = None
     if reference is not None:
         listed = replace(source, catalogue=reference, origin=origin, detect=False)
         positions = replace(listed, on_image=False).open(model.stamp_px).positions
@@ -207,7 +207,7 @@ def photometry_of_image(
     )
     zero_point_note = None
     if magnitudes is not None:
-        zero_point, zero_point_note = measure_zero_point(measured, *magnitudes)
+        zero_point, scatter, zero_point_note = measure_zero_point(measured, *magnitudes)
     table = photometry_table(measured, observation, zero_point)
     table.meta |= {
         "INFILE": ascii_line(source.path.name),
@@ -216,6 +216,7 @@ def photometry_of_image(
         "FLUXRAD": measured.radius_px,
         "INMODEL": measured.part_of_model()[0],
         **({} if zero_point is None else {"ZEROPT": zero_point}),
+        **({} if scatter is None else {"ZEROPTSD": scatter}),
     }
     notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
     return ImagePhotometry(measured, table, tuple(filter(None, notes)), observation.wcs)
@@ -308,8 +309,10 @@ def measure_zero_point(
     positions: np.ndarray,
     magnitude: np.ndarray,
     reference: str,
-) -> tuple[float, str]:
-    """Return the zero point in magnitudes, and a sentence with its standard error.
+) -> tuple[float, float, str]:
+    """Return the zero point, the scatter of its stars, and a sentence with its standard error.
+
+    Both are in magnitudes; the scatter is the standard deviation of one star's zero point.
 
     Parameters
     ----------
@@ -348,9 +351,10 @@ def measure_zero_point(
             f"{reference}: {count} of its stars with a magnitude are stars of the image, 3 are "
             "needed for a zero point"
         )
-    error = float(robust_scatter(zero_points[:, None])[0]) / math.sqrt(count)
-    value = float(np.median(zero_points))
-    return value, f"zero point {value:.4f} ± {error:.4f} mag ({count} stars of {reference})"
+    scatter = float(robust_scatter(zero_points[:, None])[0])
+    value, error = float(np.median(zero_points)), scatter / math.sqrt(count)
+    note = f"zero point {value:.4f} ± {error:.4f} mag ({count} stars of {reference})"
+    return value, scatter, note
 
 
 def photometry_table(

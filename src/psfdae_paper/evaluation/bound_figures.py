@@ -216,7 +216,7 @@ def _shade_below(axes: Axes, floor: pd.DataFrame, bottom: float) -> str:
 @styled
 def headline(
     rows: Sequence[StripRow],
-    methods: Sequence[Method],
+    methods: Sequence[type[Method]],
     efficiency: pd.DataFrame,
     bounds: pd.DataFrame,
     titles: Sequence[str],
@@ -227,8 +227,8 @@ def headline(
     ----------
     rows : sequence of StripRow
         Stamps are on the colour scale of the last row, the truth, unless a row has `own_scale`.
-    methods : sequence of Method
-        Methods whose errors are drawn, by descending error.
+    methods : sequence of type
+        Classes of the methods whose errors are drawn, by descending error.
     efficiency, bounds : DataFrame
         Tables of the stages of these names, for one dataset and reference.
     titles : sequence of str
@@ -254,7 +254,7 @@ def headline(
 
 
 def _draw_errors(
-    axes: Axes, methods: Sequence[Method], efficiency: pd.DataFrame, bounds: pd.DataFrame
+    axes: Axes, methods: Sequence[type[Method]], efficiency: pd.DataFrame, bounds: pd.DataFrame
 ) -> None:
     """Draw errors of the methods and both bounds, each line with its name."""
 
@@ -267,14 +267,14 @@ def _draw_errors(
         axes.plot(rows["noise_level"], rows["mse"], **style)
         return rows
 
-    for estimator in methods:
-        line = draw_line(type(estimator), 5)
+    for method_class in methods:
+        line = draw_line(method_class, 5)
         # The name of the lowest line is below its first point, because the next line is near.
-        is_lowest = estimator is methods[-1]
+        is_lowest = method_class is methods[-1]
         named = line[:1] if is_lowest else line
         # The label in brackets, what the method is given, is beside its stars.
-        name = estimator.look.label.partition(" (")[0]
-        color = estimator.look.color
+        name = method_class.look.label.partition(" (")[0]
+        color = method_class.look.color
         _write_name(axes, named["noise_level"], named["mse"], name, color, below=is_lowest)
     # Errors if the optics of the telescope are known. The line nearly coincides with the posterior
     # mean: its name is below that one's name.

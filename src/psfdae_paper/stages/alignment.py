@@ -163,6 +163,8 @@ def states(
 
     Parameters
     ----------
+    kind : str
+        Set of states: the paper's grid, uniform states for the test, or many for the training.
     out : Path
         HDF5 product with states and their noise-free stamps.
     model : Path, optional

@@ -365,6 +365,8 @@ def estimate(
 
     Parameters
     ----------
+    test_set : str
+        Set of the states: the grid that networks are trained on, or uniform states.
     out : Path
         HDF5 product with the estimates of all learned methods.
     times : Path
@@ -452,6 +454,8 @@ def fit_alignment_method(
 
     Parameters
     ----------
+    test_set : str
+        Set of the states: the grid that networks are trained on, or uniform states.
     level : float
         Noise level λ.
     train : Path
@@ -546,6 +550,8 @@ def bound(
 
     Parameters
     ----------
+    test_set : str
+        Set of the states: the grid that networks are trained on, or uniform states.
     out : Path
         HDF5 product with Cramér-Rao bounds.
     """

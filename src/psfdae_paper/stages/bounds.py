@@ -239,6 +239,8 @@ def efficiency(
 
     Parameters
     ----------
+    bounds : sequence of Path
+        CSV of the stage bounds; repeat for more datasets.
     bounds_per_star : sequence of Path
         Parquet of the stage bounds; repeat for more datasets.
     out : Path

@@ -210,6 +210,8 @@ def calibrate(
 
     Parameters
     ----------
+    scans : sequence of Path
+        CSV of the stage scan; repeat for more datasets.
     stars : sequence of pairs
         Dataset and its product of the stage stars.
     out : Path

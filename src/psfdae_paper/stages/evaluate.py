@@ -1,7 +1,8 @@
 """Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars.
 
 In go the product "stars" and the fitted methods; out come the errors of every star (Parquet) and
-their means with standard errors (CSV). The other stages make tables of these errors.
+their means with standard errors (CSV), and the images of some stars, of which figures are drawn
+(product "restored"). The other stages make tables of the errors.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import pandas as pd
 
-from psfdae.base.files import Product, write_csv, write_parquet, write_text
+from psfdae.base.figures import spread_stars
+from psfdae.base.files import Column, Product, write_csv, write_parquet, write_product, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
 from psfdae.base.settings import ConfigError, Reference, SplitKind
@@ -28,6 +31,7 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
+from psfdae_paper.stars.fields import square_grid
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -70,6 +74,7 @@ def evaluate(
     reference: Reference = "realisation",
     *,
     per_star: File,
+    restored: File,
     out: File,
 ) -> None:
     """Measure every method on the test stars at each noise level.
@@ -79,16 +84,22 @@ def evaluate(
 
     Every method of the list `methods` needs its model, but for those that are fitted in a moment.
     The table has a row for each method, noise level and metric; the Parquet file has one for each
-    star, with its field and all metrics.
+    star, with its field and all metrics. The product has the images of stars spread over the field.
 
     Parameters
     ----------
+    split : str
+        Split whose test stars are measured.
+    reference : str
+        Truth: the star's own noise-free image, or the static PSF of its field.
     dataset : str
         Name that goes into the table.
     stars : Path
         Product of the stage stars.
     per_star : Path
         Parquet with every star.
+    restored : Path
+        HDF5 product with the images of eight stars, for figures.
     out : Path
         CSV with means and standard errors.
     """
@@ -101,7 +112,9 @@ def evaluate(
     test = split_stars(product, split, config).test
     test_stars = MeasuredStars.of(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
-    summary, stars_table = [], []
+    summary, stars_table, images = [], [], []
+    # Eight stars side by side fill the width of a page.
+    shown = spread_stars(test_stars.position, 8)
     for level in steps("noise levels", config.noise.levels):
         # The same noisy images for all methods: their errors are compared star by star.
         noisy = noisy_test_images(config, product, test, level)
@@ -111,9 +124,23 @@ def evaluate(
             rows, per_star_rows = test_stars.errors(row, estimate, config.evaluation.data_range)
             summary += rows
             stars_table.append(per_star_rows)
-    # Means with standard errors, and every star.
+            images.append(estimate.psf[shown])
+    # Means with standard errors, every star, and the stars of figures.
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
+    # Field angles (x, y) of all field points, of which each star has one.
+    grid = product.config["grid"]
+    angle_deg = square_grid(grid["points"], grid["spacing_deg"])[1][test_stars.field[shown]]
+    shape = (len(config.noise.levels), len(methods), *images[0].shape)
+    about = f"[λ, method, star, row, column]; {', '.join(methods)}"
+    columns = {
+        "field": Column(np.deg2rad(angle_deg), "rad", "field angle (x, y) of each star"),
+        "levels": Column(np.array(config.noise.levels), "1", "noise levels λ"),
+        "truth": Column(test_stars.truth[shown], "1", "what estimates are compared with"),
+        "noise_free": Column(product["realisation"][test[shown]], "1", "stars without noise"),
+        "restored": Column(np.reshape(images, shape), "1", about),
+    }
+    write_product(restored, "restored", columns, {**config.model_dump(), **key})
 
 
 def estimators(
@@ -122,7 +149,6 @@ def estimators(
     models: Mapping[str, Path | None],
     split: str,
     reference: str,
-    only_drawn: bool = False,
 ) -> dict[str, Method]:
     """Load or fit the methods of a configuration, for the test stars of a split.
 
@@ -136,8 +162,6 @@ def estimators(
         File or folder of each method that stores a model.
     split, reference : str
         Split and reference of the test stars.
-    only_drawn : bool
-        Return only the methods that are in figures of stars.
 
     Returns
     -------
@@ -151,7 +175,7 @@ def estimators(
     ProductError
         If a model is damaged, or does not belong to the stars.
     """
-    classes = [m for m in map(method, config.methods) if m.look.drawn or not only_drawn]
+    classes = [*map(method, config.methods)]
     # Check all models before any method is loaded or fitted.
     places: dict[str, Path] = {}
     for method_class in classes:
@@ -231,6 +255,8 @@ def paper_tables(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     out : sequence of pairs
         Metric and its CSV, the Markdown beside; repeat for more.
     """

@@ -1,40 +1,35 @@
 """Stages `figure ...`: PNG figures of data products and tables.
 
-In go products of stars, fitted methods or tables; out comes one PNG. The figures themselves are
+In go products of stars, restored stars or tables; out comes one PNG. The figures themselves are
 drawn by functions of `psfdae_paper.evaluation`, which take arrays and tables only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import pandas as pd
 
-from psfdae.base.figures import StripRow, restoration_strip, spread_stars, write_png
+from psfdae.base.figures import StripRow, restoration_strip, write_png
 from psfdae.base.files import Product, ProductError, read_product
 from psfdae.base.options import AboveZero, File
 from psfdae.base.reading import read_table
-from psfdae.base.settings import Reference
-from psfdae.base.threads import limit_threads
+from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae.methods.metrics import mse
-from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import bound_figures, curves
 from psfdae_paper.evaluation.drawing import reference_title
 from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import published
-from psfdae_paper.stages.evaluate import READS, Evaluations, Metric, Models, estimators
-from psfdae_paper.stars.fields import square_grid
+from psfdae_paper.stages.evaluate import Evaluations, Metric
 from psfdae_paper.stars.framing import without_margin
 
-Stars = Annotated[File, "Product of the stage stars."]
+Restored = Annotated[File, "Product of the stage evaluate: images of some stars."]
 Templates = Annotated[File, "Product of the stage templates."]
 Png = Annotated[File, "PNG."]
 DatasetName = Annotated[str, "Name in the tables."]
@@ -65,47 +60,46 @@ def figure_energy(templates: Templates, out: Png) -> None:
     write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
 
 
-@command("figure strip", reads=READS)
+@command("figure strip")
 def figure_strip(
-    config: Config,
-    dataset: str,
-    stars: Stars,
-    models: Models,
-    reference: Reference = "realisation",
-    *,
+    restored: Restored,
     levels: Annotated[tuple[Annotated[float, AboveZero], ...], {"flag": "--level"}],
     out: Png,
 ) -> None:
-    """Draw test stars of the split random before and after restoration.
+    """Draw test stars before and after restoration.
 
     A row is a method at a noise level, a column a star; below each stamp stands its MSE × 10⁶. The
-    first row is the reference. Eight stars spread over the field are shown.
+    first row is the reference.
 
     Parameters
     ----------
-    dataset : str
-        Name that goes into the title.
     levels : sequence of float
         Noise level λ; repeat for more rows.
     """
-    # Eight stars side by side fill the width of a page.
-    strip_stars = drawn_stars(config, stars, models, reference, 8)
+    product = read_product(restored, "restored")
+    dataset, reference = product.config["dataset"], product.config["reference"]
     # Field angles of the stars as titles of the columns.
-    angle, unit = in_field_unit(strip_stars.field)
-    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[strip_stars.selected]]
+    angle, unit = in_field_unit(product["field"])
+    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
         f"restored and measured {reference_title(reference)}"
     )
-    write_png(restoration_strip(strip_stars.rows(config, levels), columns, title), out)
+    truth, noise_free = product["truth"], product["noise_free"]
+    rows = [StripRow("reference", truth)]
+    if reference == "template":
+        # Against templates, even the star without noise has an error.
+        rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
+    # All methods at the first noise level, then all at the next.
+    for level in levels:
+        for row in restored_rows(product, level).values():
+            rows.append(replace(row, label=f"{row.label}\nλ = {level:g}"))
+    write_png(restoration_strip(rows, columns, title), out)
 
 
-@command("figure headline", reads=READS)
+@command("figure headline")
 def figure_headline(
-    config: Config,
-    dataset: str,
-    stars: Stars,
-    models: Models,
+    restored: Restored,
     level: Annotated[float, AboveZero],
     bounds: Bounds,
     efficiency: Efficiency,
@@ -118,128 +112,68 @@ def figure_headline(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     level : float
         Noise level λ.
     """
-    strip_stars = drawn_stars(config, stars, models, "realisation", 5)
+    product = read_product(restored, "restored")
+    dataset, truth = product.config["dataset"], product["truth"]
+    # Five of the stars, from one side of the field to the other.
+    five = np.linspace(0, len(truth) - 1, 5).round().astype(int)
     # Rows of restored stars, one for each method, and below them the truth.
-    truth, *restored = strip_stars.rows(config, [level])
-    # Labels and colours of the methods.
-    looks = [estimator.look for estimator in strip_stars.methods.values()]
+    restored_by_method = restored_rows(product, level, five)
     rows = [
-        replace(row, label=look.label if look.restores else f"{look.label} star")
-        for row, look in zip(restored, looks, strict=True)
+        row if kind.look.restores else replace(row, label=f"{row.label} star")
+        for kind, row in restored_by_method.items()
     ]
-    rows.append(replace(truth, label="truth"))
+    rows.append(StripRow("truth", truth[five]))
     # Errors of methods and bounds of the same dataset.
     errors, limits = (rows_of(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    methods = list(strip_stars.methods.values())
-    write_png(bound_figures.headline(rows, methods, errors, limits, titles), out)
+    write_png(bound_figures.headline(rows, [*restored_by_method], errors, limits, titles), out)
 
 
-@dataclass(frozen=True)
-class DrawnStars:
-    """Test stars of the split random, some of which are drawn, and the methods that restore them.
-
-    Attributes
-    ----------
-    product : Product
-        Product "stars".
-    reference : str
-        The truth: "realisation" or "template".
-    methods : dict of Method
-        Fitted methods by name.
-    test : ndarray of int, shape (n,)
-        Test stars.
-    field : ndarray, shape (n, 2)
-        Their field angles (x, y) in radians.
-    selected : ndarray of int, shape (k,)
-        Indices into `test` of the stars that are drawn, spread over the field.
-    """
-
-    product: Product
-    reference: str
-    methods: Mapping[str, Method]
-    test: np.ndarray
-    field: np.ndarray
-    selected: np.ndarray
-
-    def rows(self, config: Config, levels: Sequence[float]) -> list[StripRow]:
-        """Return rows of stamps: the reference, then the methods by noise level.
-
-        `config` is that of the stage `evaluate`.
-
-        Parameters
-        ----------
-        config : Config
-            That of the stage `evaluate`.
-        levels : sequence of float
-            Noise levels λ.
-
-        Returns
-        -------
-        list of StripRow
-            Stamps (k, d, d) of flux 1, with their errors.
-        """
-        stars = self.test[self.selected]
-        # The truth of each star that is drawn, and its field position for methods that use it.
-        truth, position = self.product[self.reference][stars], field_positions(self.product)[stars]
-        rows = [StripRow("reference", truth)]
-        if self.reference == "template":
-            # Against templates, even the star without noise has an error.
-            noise_free = self.product["realisation"][stars]
-            rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
-        for level in levels:
-            noisy = noisy_test_images(config, self.product, stars, level)
-            for estimator in self.methods.values():
-                look = estimator.look
-                images = estimator.estimate(noisy, level, position, with_sigma=False).psf
-                label = f"{look.label}\nλ = {level:g}"
-                # Images that are not restored have their own colour scale: noise exceeds the PSF.
-                rows.append(StripRow(label, images, mse(images, truth), not look.restores))
-        return rows
-
-
-def drawn_stars(
-    config: Config, stars: Path, models: Models, reference: Reference, count: int
-) -> DrawnStars:
-    """Read the stars of a figure, and load or fit the methods that figures show.
+def restored_rows(
+    product: Product, level: float, stars: slice | np.ndarray = slice(None)
+) -> dict[type[Method], StripRow]:
+    """Return a row of restored stamps at a noise level for each method that is drawn.
 
     Parameters
     ----------
-    config : Config
-        That of the stage `evaluate`.
-    stars : Path
-        Product of the stage stars.
-    models : Models
-        File or folder of each method that stores a model.
-    reference : str
-        The truth.
-    count : int
-        Number of stars to draw.
-
-    Returns
-    -------
-    DrawnStars
-        All test stars of the split, `count` of which are selected.
+    product : Product
+        Product "restored".
+    level : float
+        Noise level λ, one of the product's.
+    stars : slice or ndarray of int
+        Stars of the product, by default all.
 
     Raises
     ------
-    ConfigError, ProductError
-        If a model is not given, is damaged, or does not belong to the stars.
+    ProductError
+        If the product has no stars of this noise level.
+
+    Returns
+    -------
+    dict of StripRow
+        By class of the method: its label, and stamps (n, d, d) of flux 1 with their errors.
     """
-    limit_threads(config.evaluation.threads)
-    product = read_stars(stars, reference)
-    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
-    # Test stars of seen fields, in the order of the file.
-    test = split_stars(product, "random", config).test
-    # Field angles (x, y) of all field points, of which each star has one.
-    grid = product.config["grid"]
-    angle_deg = square_grid(grid["points"], grid["spacing_deg"])[1]
-    field: np.ndarray = np.deg2rad(angle_deg)[product["field_index"][test]]
-    return DrawnStars(product, reference, methods, test, field, spread_stars(field, count))
+    # Levels from two files may differ in the last bit.
+    (is_level,) = np.isclose(product["levels"], level, rtol=1e-5).nonzero()
+    if not is_level.size:
+        raise ProductError(f"{product.path}: no stars of λ = {level:g}")
+    rows, truth = {}, product["truth"][stars]
+    # One method after the other, in the order in which they have restored the stars.
+    for name, images in zip(
+        product.config["methods"], product["restored"][is_level[0]], strict=True
+    ):
+        kind = method(name)
+        # Images that are not restored have their own colour scale: noise exceeds the PSF.
+        if kind.look.drawn:
+            errors, is_noisy = mse(images[stars], truth), not kind.look.restores
+            rows[kind] = StripRow(kind.look.label, images[stars], errors, is_noisy)
+    return rows
 
 
 @command("figure curves")
@@ -279,6 +213,8 @@ def figure_errors(
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     out : sequence of pairs
         Metric and its PNG; repeat for more.
     """

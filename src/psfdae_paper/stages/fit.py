@@ -60,6 +60,10 @@ def fit(
 
     Parameters
     ----------
+    split : str
+        Split whose training stars the method learns from.
+    reference : str
+        Truth: the star's own noise-free image, or the static PSF of its field.
     start : Path, optional
         Fit to the realisations, from which one to templates goes on.
     checkpoint : Path, optional

@@ -263,7 +263,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         installation["install_s"] = round(seconds, 1)
         installation["environment_mb"] = round(_size_mb(environment), 1)
     # Packages whose versions can change a number.
-    packages = ("psfdae", "numpy", "scipy", "torch", "minisom")
+    packages = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
     return {
         "date": date.today().isoformat(),
         "cpu": cpu_model(),

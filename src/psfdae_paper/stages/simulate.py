@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
-import pandas as pd
 
 from psfdae.base.errors import Error
 from psfdae.base.figures import write_png
@@ -36,7 +35,6 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import (
     ExampleField,
@@ -49,6 +47,9 @@ from psfdae_paper.stars.example import example_field as simulate_field
 from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux, without_margin
 from psfdae_paper.stars.nights import NightRecipe, reference_stars, simulated_night
 from psfdae_paper.stars.scenes import template_wavefronts
+
+if TYPE_CHECKING:
+    from psfdae_paper.evaluation.figures import FieldOfPsfs
 
 
 class StampSizeError(Error, ValueError):
@@ -135,6 +136,8 @@ def figure_telescope(templates: File, table: File, out: File) -> None:
     out : Path
         PNG.
     """
+    from psfdae_paper.evaluation.figures import field_of_psfs
+
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
@@ -158,6 +161,10 @@ def measure_fields(product: Product) -> FieldOfPsfs:
         PSFs (F, d, d) with the light of each inside its stamp, FWHM in arcsec, ellipticity, and
         position angle in degrees.
     """
+    import pandas as pd
+
+    from psfdae_paper.evaluation.figures import FieldOfPsfs
+
     psf, (x, y) = without_margin(product), np.rad2deg(product["field"]).T
     shapes = measure_shapes(psf)
     columns = {
@@ -363,6 +370,8 @@ def write_example_field(
 
     Parameters
     ----------
+    seed : int
+        Seed of the places, fluxes and noise of the stars.
     catalogue : Path
         CSV file for the star list.
     side : int
@@ -426,14 +435,18 @@ def example_night(
 
     Parameters
     ----------
+    seed : int
+        Seed of stars, noise and faults.
     out : Path
         Folder for images, truth.csv and reference.csv.
     exposures : int
         Images.
     """
+    import pandas as pd
+
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
-    write_csv(reference, stars.to_pandas())
+    write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"

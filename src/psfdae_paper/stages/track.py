@@ -33,6 +33,7 @@ from psfdae_paper.tracking import (
     epoch_metrics,
     runs_of_alignment,
     runs_of_datasets,
+    runs_of_night,
     runs_of_sweep,
     settings_of,
     tracked_metric,
@@ -62,6 +63,7 @@ def track(
     out: File,
     stars: tuple[tuple[str, File], ...] = (),
     alignment: bool = False,
+    night: bool = False,
     sweeps: Annotated[tuple[str, ...], {"flag": "--sweep"}] = (),
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
@@ -87,12 +89,15 @@ def track(
         Dataset and its product of the stage stars.
     alignment : bool
         The networks of scene 3.
+    night : bool
+        The images of a night.
     sweeps : sequence of str
         The points of a sweep.
     """
-    # Methods, networks of scene 3 and sweeps; a sweep before its points.
+    # Methods, networks of scene 3, images of a night and sweeps; a sweep before its points.
     runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
+    runs += runs_of_night(results) if night else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
     import_runs(runs, preset, database, out)
 

@@ -77,8 +77,16 @@ class NightRecipe:
     trail_px: float = 8.0
 
 
+def positions_of_places(image_px: tuple[int, int]) -> np.ndarray:
+    """Return x and y (5, 2) of `PLACES` in an image of so many columns and rows.
+
+    They are in the middle of a pixel, so that sizes do not depend on a phase.
+    """
+    return np.asarray(np.rint(np.array(list(PLACES.values())) * (np.array(image_px) - 1)))
+
+
 def shapes_at_places(
-    psf_at: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int], prefix: str = ""
+    psf_at: Callable[[np.ndarray], np.ndarray], image_px: tuple[int, int], prefix: str = ""
 ) -> dict[str, float]:
     """Return FWHM (px) and ellipticity of the PSF at `PLACES`, by names such as `fwhm_px_centre`.
 
@@ -86,14 +94,12 @@ def shapes_at_places(
     ----------
     psf_at : callable
         Returns PSFs (n, d, d) at positions (n, 2), x and y in pixels.
-    shape : tuple of int
-        Rows and columns of the image.
+    image_px : tuple of int
+        Columns and rows of the image.
     prefix : str
         Begins each name.
     """
-    # In the middle of a pixel, so that sizes do not depend on a phase.
-    position = np.rint(np.array(list(PLACES.values())) * (shape[1] - 1, shape[0] - 1))
-    shapes = measure_shapes(psf_at(position))
+    shapes = measure_shapes(psf_at(positions_of_places(image_px)))
     return {
         f"{prefix}{name}_{place}": float(value)
         for name, values in (("fwhm_px", shapes.fwhm_px), ("ellipticity", shapes.ellipticity))

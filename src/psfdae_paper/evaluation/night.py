@@ -1,0 +1,143 @@
+"""Verdicts on the images of a night, and the page that shows them.
+
+In goes a table with a row for each image, in the order of time; out come a verdict and its reason
+for each, figures of size and shape of the PSF against time, and an HTML page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.base.figures import SERIES_COLORS, StripRow, new_figure, restoration_strip, styled
+from psfdae.image.tables import html_table
+from psfdae.model.report import image_tag
+from psfdae.stars.moments import SIGMA_OF_MAD
+from psfdae_paper.stars.nights import PLACES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+VERDICTS = ("good", "poor", "failed")
+"""Good images, those with a model that are unlike their neighbours in time, those without one."""
+
+LIMITS = {
+    "fwhm_px_centre": (0.5, "stars of {value:.2f} px, those of its neighbours in time {usual:.2f}"),
+    "ellipticity_centre": (0.1, "elongated stars, ellipticity {value:.2f}: trailed?"),
+    "mag_20th": (0.5, "stars fainter by {excess:.1f} mag than in its neighbours in time: clouds?"),
+}
+"""Least excess over the neighbours in time for which an image is poor, and what is said of it."""
+
+
+def with_verdicts(night: DataFrame) -> DataFrame:
+    """Return a table of a night with a verdict on each image, and the reason for it.
+
+    A quantity of an image is compared with its median over the eleven images about it in time. It
+    is unusual if it is larger by 5 σ, with the robust σ of all such differences of the night, and
+    by the least excess of `LIMITS`.
+
+    Parameters
+    ----------
+    night : DataFrame
+        Rows in the order of time, with the column `reason` of images that have no model.
+    """
+    # A night without any model has no measurements.
+    night = night.reindex(columns=[*night, *(name for name in LIMITS if name not in night)])
+    night = night.assign(verdict=np.where(night.reason == "", "good", "failed"))
+    for column, (least_excess, sentence) in LIMITS.items():
+        value = night[column].dropna()
+        usual = value.rolling(11, center=True, min_periods=1).median()
+        excess = value - usual
+        sigma = SIGMA_OF_MAD * (excess - excess.median()).abs().median()
+        for row in excess.index[excess > max(5.0 * sigma, least_excess)]:
+            words = {"value": value[row], "usual": usual[row], "excess": excess[row]}
+            reasons = [night.loc[row, "reason"], sentence.format(**words)]
+            night.loc[row, ["verdict", "reason"]] = "poor", "; ".join(filter(None, reasons))
+    return night
+
+
+@styled
+def night_figure(night: DataFrame) -> Figure:
+    """Draw FWHM and ellipticity at five places, and the brightness of stars, against time."""
+    import pandas as pd
+
+    figure = new_figure(6.5, layout="constrained")
+    panels: Any = figure.subplots(3, 1, sharex=True)
+    # Images without a time are drawn by their number.
+    time = pd.to_datetime(night.time, errors="coerce", format="ISO8601")
+    x = time if time.notna().sum() == night.fwhm_px_centre.notna().sum() else night.index
+    for axes, column, label in (
+        (panels[0], "fwhm_px", "FWHM (px)"),
+        (panels[1], "ellipticity", "ellipticity"),
+    ):
+        for place, color in zip(PLACES, SERIES_COLORS, strict=False):
+            values = night[f"{column}_{place}"]
+            axes.plot(x, values, ".-", ms=4, lw=0.7, color=color, label=place.replace("_", " "))
+        axes.set_ylabel(label)
+        # The range is that of good images: an outlier must not flatten all others.
+        usual = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
+        if len(usual) > 1:
+            low, high = usual.min().min(), usual.max().max()
+            axes.set_ylim(low - 0.2 * (high - low), high + 0.4 * (high - low))
+    panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
+    panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")
+    panels[2].set_xlabel("time (UT)" if x is time else "number of the image")
+    for row in night.index[night.verdict == "poor"]:
+        for axes in panels:
+            axes.axvline(x[row], color=SERIES_COLORS[5], lw=0.8, ls=":")
+        in_axes = {"transform": panels[0].get_xaxis_transform(), "rotation": 90, "ha": "right"}
+        panels[0].text(x[row], 0.02, night.name[row], fontsize=6, **in_axes)
+    for axes in panels:
+        axes.grid(True)
+    panels[0].legend(ncols=5, loc="upper center")
+    return figure
+
+
+def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) -> str:
+    """Return the page of a night as HTML.
+
+    Parameters
+    ----------
+    night : DataFrame
+        Table with verdicts.
+    psfs : mapping of str to ndarray, shape (5, d, d)
+        PSFs at `PLACES` of some images, by label.
+    folder : str
+        Folder of the report pages of the images, as the page links them.
+    """
+
+    def cells(row: Any) -> list[str]:
+        """Return the cells of an image; those with a model link its report."""
+        name, link = escape(str(row.name_)), escape(f"{folder}/{row.name_}.html")
+        word = f"<b class={row.verdict}>{row.verdict}</b>"
+        reason = escape(str(row.reason)) if isinstance(row.reason, str) else ""
+        if row.verdict == "failed":
+            return [name, word, reason, "", "", ""]
+        numbers = f"{row.fwhm_px_centre:.2f}", f"{row.ellipticity_centre:.3f}"
+        return [f'<a href="{link}">{name}</a>', word, reason, *numbers, f"{row.bright_stars:.0f}"]
+
+    head = ("image", "verdict", "reason", "FWHM (px)", "ellipticity", "bright stars")
+    rows = {row.Index: row for row in night.rename(columns={"name": "name_"}).itertuples()}
+    unusual = [cells(row) for row in rows.values() if row.verdict != "good"]
+    # Figures of a night with models: how the PSF moved, and its PSFs in the order of `PLACES`.
+    figures = ""
+    if psfs:
+        places = [place.replace("_", " ") for place in PLACES]
+        strip = [StripRow(label, stamps, own_scale=True) for label, stamps in psfs.items()]
+        figures = image_tag(night_figure(night))
+        figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
+    counts = ", ".join(f"{(night.verdict == verdict).sum()} {verdict}" for verdict in VERDICTS)
+    template = Path(__file__).with_name("night.html").read_text(encoding="utf-8")
+    return Template(template).substitute(
+        count=len(night),
+        verdicts=counts,
+        inspect=html_table(head, unusual) if unusual else "<p>None.</p>",
+        figures=figures,
+        images=html_table(head, [cells(row) for row in rows.values()]),
+    )

@@ -1,0 +1,319 @@
+"""Stages `night images`, `night table`, `night page`, `night count`: many images of a telescope.
+
+In goes a list of images, some at a time; out come, for each image, a model, a catalogue and a
+report page, and for the night one table and one page. What cannot be used is a row with a reason.
+"""
+
+from __future__ import annotations
+
+import glob
+import itertools
+import math
+import os
+import traceback
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from psfdae.base.errors import Error
+from psfdae.base.files import write_csv, write_text
+from psfdae.base.options import File, Folder
+from psfdae.base.reading import read_table
+from psfdae.commands.cli import refusal, typed_values
+from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.tables import write_table
+from psfdae.model.bundle import SUFFIX
+from psfdae_paper.configuration.command import command
+from psfdae_paper.evaluation.night import VERDICTS, night_page, with_verdicts
+from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
+
+if TYPE_CHECKING:
+    from psfdae.model.psf_model import PsfModel
+    from psfdae.model.stars import Stars
+
+Row = dict[str, object]
+
+
+class NightError(Error, ValueError):
+    """A list without images, or a night of which no image can be used."""
+
+
+def listed_images(text: str) -> list[dict[str, str]]:
+    """Return a row for each image of a pattern such as night/*.fits, or of a CSV list.
+
+    Parameters
+    ----------
+    text : str
+        A list has the column `image` and further ones; those that are named as a field of
+        `ImageStatements` are stated of the image, all are kept.
+
+    Returns
+    -------
+    list of dict of str to str
+        Cells by column; `name` begins the names of the image's files, `reason` says why it is not
+        to be used.
+
+    Raises
+    ------
+    NightError
+        If there is no image.
+    """
+    # Images of a pattern stand in the order of their names, which mostly is that of time.
+    rows = [{"image": path} for path in sorted(glob.glob(text))]  # noqa: PTH207  # any folder
+    if text.endswith(".csv"):
+        rows = text_rows(Path(text), "image")
+    if not rows:
+        raise NightError(f"images = {text}: no image, expected night/*.fits or a CSV list")
+    # Names of files in different folders may be the same; the same image twice is an error.
+    names, images = set[str](), set[tuple[str, str]]()
+    for row in rows:
+        stem = ImageInput(Path(row["image"])).name
+        numbered = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        row["name"] = next(name for name in numbered if name not in names)
+        image = str(Path(row["image"]).absolute()), row.get("extension", "")
+        row["reason"] = "listed twice" if image in images else ""
+        names.add(row["name"])
+        images.add(image)
+    return rows
+
+
+def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with some columns, every cell as it stands there."""
+    table = read_table(path, *columns, dtype=str, keep_default_na=False)
+    return [{str(name): text for name, text in row.items()} for row in table.to_dict("records")]
+
+
+@command("night images")
+def night_images(rows: File, folder: Folder, out: File) -> None:
+    """Model images that follow each other in time, and measure all of their stars.
+
+    The most usual image of each camera is fitted; the others start from the model of the image
+    whose stars are most like their own, or are fitted as well if none is. An image that cannot be
+    used is a row with its reason.
+
+    Parameters
+    ----------
+    rows : Path
+        CSV with a row for each image.
+    folder : Path
+        Folder for models, catalogues and report pages.
+    out : Path
+        CSV with a row for each image and what was measured in it.
+    """
+    from pandas import DataFrame
+
+    listed = text_rows(rows, "image", "name", "reason")
+    results: dict[str, Row] = {row["name"]: {**row} for row in listed}
+    # Bright stars of the images, by camera, filter and size of stamps, which a model cannot change.
+    groups: dict[tuple[object, ...], dict[str, Stars]] = {}
+    for name, row in results.items():
+        try:
+            if not row["reason"]:
+                stars = bright_stars(row)
+                camera = *stars.observation.instrument.items(), stars.observation.shape
+                stated = row.get("camera"), row.get("filter"), stars.settings.framing.stamp_px
+                groups.setdefault((*camera, *stated), {})[name] = stars
+        except Exception as error:
+            row["reason"] = reason_of(error, row)
+    for stars_by_name in groups.values():
+        sizes = log_sizes(stars_by_name)
+        starts: dict[str, PsfModel] = {}
+        for name in from_most_usual(stars_by_name, sizes):
+            try:
+                stars = stars_by_name[name]
+                # Stars that differ by more than 4 % in size show another field than a start has.
+                distance = {start: np.abs(sizes[start] - sizes[name]).max() for start in starts}
+                nearest = min(distance, key=distance.__getitem__, default="")
+                start = starts[nearest] if nearest and distance[nearest] < 0.04 else None
+                model = model_of_image(stars, start)
+                results[name] |= measured(results[name], stars, model, folder)
+                results[name]["start"] = nearest if model.info.adapted else ""
+                starts |= {} if model.info.adapted else {name: model}
+            except Exception as error:
+                results[name]["reason"] = reason_of(error, results[name])
+            print(name, results[name]["reason"] or "done", flush=True)
+    write_csv(out, DataFrame(list(results.values())))
+
+
+@command("night table")
+def night_table(
+    parts: Annotated[tuple[File, ...], {"argument": True}],
+    out: File,
+) -> None:
+    """Join the images of a night in one table, with a verdict on each.
+
+    Parameters
+    ----------
+    parts : sequence of Path
+        Tables of `night images`, in the order of time.
+    out : Path
+        CSV of the night; an ECSV with units is written beside it.
+    """
+    from astropy.table import QTable
+    from pandas import concat
+
+    # A part without a usable image lacks the columns of measurements.
+    tables = [read_table(path, "image", "name", "reason") for path in parts]
+    night = with_verdicts(concat(tables, ignore_index=True).fillna({"reason": ""}))
+    write_csv(out, night)
+    table = QTable.from_pandas(night)
+    units = {"fwhm_px": "pix", "mag_20th": "mag", "zero_point": "mag"}
+    for name in table.colnames:
+        table[name].info.unit = next((u for key, u in units.items() if key in name), None)
+    write_table(out.with_suffix(".ecsv"), table)
+
+
+@command("night page")
+def write_night_page(table: File, folder: Folder, out: File) -> None:
+    """Draw what an observer wants to know in the morning: bad images, and how the PSF moved.
+
+    Parameters
+    ----------
+    table : Path
+        CSV of the night.
+    folder : Path
+        Folder with the models of the images.
+    out : Path
+        HTML page that needs no other file, but links the images' reports.
+    """
+    from psfdae.model.psf_model import load_model
+
+    night = read_table(table, "name", "verdict", "reason")
+    # PSFs over the field of the best, the median and the worst image, by the FWHM in the middle.
+    psfs = {}
+    with_model = night.dropna(subset="fwhm_px_centre").sort_values("fwhm_px_centre")
+    for label, number in (("best", 0), ("median", len(with_model) // 2), ("worst", -1)):
+        if len(with_model):
+            name = str(with_model.name.iloc[number])
+            model = load_model(folder / f"{name}{SUFFIX}")
+            assert model.image_px is not None  # of a model that was fitted to an image
+            psfs[f"{label}\n{name}"] = model.on_pixels(positions_of_places(model.image_px))
+    links = os.path.relpath(folder, out.parent)
+    write_text(out, night_page(night, psfs, links))
+
+
+@command("night count")
+def night_count(table: Annotated[File, {"argument": True}]) -> None:
+    """Print how many images are good, poor and failed; refuse a night without any model.
+
+    Parameters
+    ----------
+    table : Path
+        CSV of the night.
+    """
+    verdicts = Counter(read_table(table, "verdict").verdict)
+    sentence = ", ".join(f"{verdicts[verdict]} {verdict}" for verdict in VERDICTS)
+    if verdicts["failed"] == verdicts.total():
+        raise NightError(f"{table}: {sentence}: no image could be used")
+    print(f"{table}: {sentence}")
+
+
+def reason_of(error: Exception, row: Mapping[str, object]) -> str:
+    """Return why an image cannot be used, in one line; a bug is printed with its traceback."""
+    message = refusal(error)
+    if message is None:
+        traceback.print_exception(error)
+        message = f"{type(error).__name__}: {error}"
+    # The row names the image already.
+    return " ".join(message.removeprefix(f"{row['image']}: ").split())
+
+
+def bright_stars(row: Mapping[str, object]) -> Stars:
+    """Return the bright stars of an image of the list; without a catalogue they are detected."""
+    from psfdae.model.settings import settings_model
+    from psfdae.model.stars import Stars
+
+    stated = typed_values(ImageStatements, {name: str(text) for name, text in row.items()})
+    source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in stated, **stated})
+    return Stars.of([source], settings_model()())
+
+
+def log_sizes(stars_by_name: Mapping[str, Stars]) -> dict[str, np.ndarray]:
+    """Return the logarithms of the FWHM (px) and axis ratio of an image's mean PSF, by its name."""
+    from psfdae.stars.moments import measure_shapes
+
+    shapes = measure_shapes(np.stack([stars.mean_psf for stars in stars_by_name.values()]))
+    sizes = np.log([shapes.fwhm_px, 1.0 - shapes.ellipticity]).T
+    return dict(zip(stars_by_name, sizes, strict=True))
+
+
+def from_most_usual(
+    stars_by_name: Mapping[str, Stars], sizes: Mapping[str, np.ndarray]
+) -> list[str]:
+    """Return the names of images, that which is most like the median image of the group first.
+
+    Of those with at least the median number of stars, it is the one with the most usual size and
+    shape of stars (`log_sizes`): neither cloudy nor trailed. All others keep their order.
+    """
+    least_count = np.median([len(stars) for stars in stars_by_name.values()])
+    middle = np.median([*sizes.values()], axis=0)
+    usual = min(
+        (name for name, stars in stars_by_name.items() if len(stars) >= least_count),
+        key=lambda name: np.abs(sizes[name] - middle).sum(),
+    )
+    return [usual, *(name for name in stars_by_name if name != usual)]
+
+
+def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
+    """Return the field model of an image, changed from that of another image if there is one."""
+    from psfdae.model.exposures import adapted_to_stars
+    from psfdae.model.fitting import fit
+    from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
+
+    # Fewer stars than this cannot show how the field has changed.
+    if start is None or np.count_nonzero(~stars.held_out) < MIN_STARS_WITH_ERROR:
+        return fit(stars, method="field")
+    return adapted_to_stars(start, stars)
+
+
+def measured(row: Mapping[str, object], stars: Stars, model: PsfModel, folder: Path) -> Row:
+    """Write model, catalogue and report page of an image, and return what its row tells.
+
+    Parameters
+    ----------
+    row : mapping
+        Row of the list; its `reference` is a star list with magnitudes.
+    stars : Stars
+    model : PsfModel
+    folder : Path
+        Files begin with the row's name.
+
+    Returns
+    -------
+    dict
+        Time, airmass; FWHM (px) and ellipticity at places of the field, order of the field; numbers
+        of bright, measured and flagged stars; magnitude of the 20th brightest star in counts;
+        zero point and its scatter; median χ² of the stars.
+    """
+    from psfdae.model.image_photometry import photometry_of_image
+    from psfdae.model.validation import validate
+
+    path = folder / str(row["name"])
+    reference = Path(str(row["reference"])) if row.get("reference") else None
+    photometry = photometry_of_image(model, stars.source, reference=reference)
+    table = photometry.table
+    write_table(path.with_name(f"{path.name}.fits"), table)
+    validate(model, stars).save(path.with_name(f"{path.name}.html"))
+    model.save(path.with_name(f"{path.name}{SUFFIX}"))
+    # The flux of the 20th brightest star that has no flag tells clouds from few stars.
+    cards = {key: value for key, value, _ in stars.observation.header_cards}
+    flux, has_flag = np.array(table["flux"], float), np.array(table["flags"]) > 0
+    brightest = np.sort(flux[~has_flag & (flux > 0)])[::-1][:20]
+    shape = stars.observation.shape
+    assert shape is not None  # of an image
+    return {
+        "time": cards.get("DATE-OBS", cards.get("MJD-OBS", "")),
+        "airmass": cards.get("AIRMASS", math.nan),
+        **shapes_at_places(model.on_pixels, (shape[1], shape[0])),
+        "order": model.order,
+        "bright_stars": len(stars),
+        "stars": len(table),
+        "flagged": int(has_flag.sum()),
+        "mag_20th": -2.5 * math.log10(brightest[-1]) if len(brightest) else math.nan,
+        "zero_point": table.meta.get("ZEROPT", math.nan),
+        "zero_point_scatter": table.meta.get("ZEROPTSD", math.nan),
+        "chi2": float(np.nanmedian(np.array(table["chi2"], float))),
+    }
