@@ -121,8 +121,12 @@ def test_files_of_an_image(night, folder):
     """A page for each image, which needs no other file; the night's page links it."""
     images = folder / "images"
     names = {path.name.partition(".")[0] for path in images.iterdir()}
-    assert names == {*night.index[night.verdict == "good"]}
-    write_night_page(folder / "night.csv", images, folder / "night.html")
+    assert names == {*night.index[night.verdict != "failed"]}
+    # A poor image is named in the figures as well.
+    table = night.reset_index()
+    table.loc[table.index[table.verdict == "good"][0], "verdict"] = "poor"
+    table.to_csv(folder / "poor.csv", index=False)
+    write_night_page(folder / "poor.csv", images, folder / "night.html")
     page = (folder / "night.html").read_text(encoding="utf-8")
     assert "listed twice" in page and "http" not in page
     for name in names:
@@ -173,6 +177,13 @@ def test_list_without_images_is_refused(tmp_path, monkeypatch, text, message):
     (tmp_path / "list.csv").write_text("file\na.fits\n")
     with pytest.raises(Exception, match=message):
         listed_images(text)
+
+
+def test_images_of_one_name_have_files_of_different_names(tmp_path):
+    (tmp_path / "list.csv").write_text("image\na/x.fits\nb/x.fits\nx_2.fits\na/x.fits\n")
+    rows = listed_images(str(tmp_path / "list.csv"))
+    assert [row["name"] for row in rows] == ["x", "x_2", "x_2_2", "x_3"]
+    assert [row["reason"] for row in rows] == ["", "", "", "listed twice"]
 
 
 def test_wrong_statement_is_the_reason(tmp_path):

@@ -141,6 +141,16 @@ def test_climb_reaches_maxima_and_stays_within_its_limit():
     assert limited.parameters[1] == pytest.approx([3.0, 1.6], abs=1e-4)
 
 
+def test_a_step_that_fails_is_shortened_at_once():
+    """Undamped steps fail where the information is less than half of the curvature, here 2."""
+
+    def evaluate(rows, x):
+        return -(x[:, 0] ** 2), -2.0 * x, np.full((len(x), 1, 1), 0.9)
+
+    steps = Steps(initial_damping=1e-6, max_steps=2)
+    assert climb(evaluate, np.ones((1, 1)), 10.0, steps).height[0] > -0.6
+
+
 # --- Draws
 
 

@@ -13,7 +13,7 @@ import pytest
 from skimage.metrics import mean_squared_error, structural_similarity
 
 from docs_pages import read
-from psfdae.base.files import write_text
+from psfdae.base.files import read_product, write_text
 from psfdae.methods import method
 from psfdae.model.bundle import read_bundle
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
@@ -67,6 +67,20 @@ def test_errors_of_single_stars_are_scikit_image_s(smoke):
         for metric, data_range in {**ranges, "ssim_peak": np.ptp(true_image)}.items():
             expected = structural_similarity(image, true_image, data_range=data_range)
             assert row[metric] == pytest.approx(expected, abs=1e-6)
+
+
+def test_figures_show_stars_that_the_tables_measure(smoke):
+    """Images of every method whose errors are those of stars in the table, level by level."""
+    place = smoke / "results/evaluation/dataset3/random-template"
+    shown, table = (
+        read_product(place.with_suffix(".h5"), "restored"),
+        pd.read_parquet(f"{place}.parquet"),
+    )
+    for level, images_of_methods in zip(shown["levels"], shown["restored"], strict=True):
+        for name, images in zip(shown.config["methods"], images_of_methods, strict=True):
+            rows = table[(table.method == name) & np.isclose(table.noise_level, level)]
+            errors = np.square(images - shown["truth"].astype(float)).mean(axis=(1, 2))
+            assert np.isclose(errors[:, None], rows.mse.to_numpy(), rtol=1e-5).any(axis=1).all()
 
 
 def test_the_data_card_describes_the_files(smoke):

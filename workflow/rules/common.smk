@@ -199,9 +199,32 @@ def templates_of(stars):
     return f"{RESULTS}/data/{tree['scene']['name']}/templates.h5"
 
 
+@cache
+@one_line()
 def stars_of(dataset):
+    """Stars of a dataset: those of a file of config/stars, or of its own telescope.
+
+    A file of stars serves several datasets, so that a dataset that changes them is refused.
+    """
     tree = dataset_config(dataset)
-    return f"{RESULTS}/data/{tree.scene.name}/{tree.stars.name}.h5"
+    name = tree.stars.name
+    # Datasets of own telescopes have stars of their own (own_telescope.smk).
+    if tree.scene.name != "telescope":
+        file = os.path.relpath(config_dir() / f"stars/{name}.yaml")
+        advice = "other stars have a file there, NAME.yaml with stars.name: NAME"
+        if name not in options("stars"):
+            raise ConfigError(
+                f"dataset={dataset}: stars.name = {name}: no {file}; {advice}"
+            )
+        stars_of_file = composed(f"stars={name}")["stars"]
+        for key, value in composed(f"dataset={dataset}")["stars"].items():
+            if value != stars_of_file.get(key):
+                raise ConfigError(
+                    f"dataset={dataset}: stars.{key} = {value}, but its stars are those of {file} "
+                    f"with {stars_of_file.get(key)}; {advice}, which a dataset chooses by "
+                    "'override /stars: NAME' among its defaults"
+                )
+    return f"{RESULTS}/data/{tree.scene.name}/{name}.h5"
 
 
 def evaluations_of(dataset, splits=None, folder="evaluation"):

@@ -206,7 +206,8 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
         "Colour: √flux from 0 to the reference's maximum in each column; noisy stamps to their own"
         " maximum. Numbers: MSE × 10⁶."
     )
-    axes.text(0.5 * WIDTH_IN, 0.09, explanation, ha="center", va="bottom", fontsize=8)
+    if any(row.mse is not None for row in rows):
+        axes.text(0.5 * WIDTH_IN, 0.09, explanation, ha="center", va="bottom", fontsize=8)
     return figure
 
 

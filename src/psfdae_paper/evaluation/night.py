@@ -6,16 +6,17 @@ for each, figures of size and shape of the PSF against time, and an HTML page.
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from html import escape
+from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.base.figures import SERIES_COLORS, STAMP_MAP, as_png, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, StripRow, new_figure, restoration_strip, styled
 from psfdae.image.tables import html_table
+from psfdae.model.report import image_tag
 from psfdae.stars.moments import SIGMA_OF_MAD
 from psfdae_paper.stars.nights import PLACES
 
@@ -81,55 +82,21 @@ def night_figure(night: DataFrame) -> Figure:
         axes.set_ylabel(label)
         # The range is that of good images: an outlier must not flatten all others.
         usual = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
-        low, high = usual.min().min(), usual.max().max()
-        if low < high:
-            axes.set_ylim(low - 0.2 * (high - low), high + 0.3 * (high - low))
+        if len(usual) > 1:
+            low, high = usual.min().min(), usual.max().max()
+            axes.set_ylim(low - 0.2 * (high - low), high + 0.4 * (high - low))
     panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
     panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")
     panels[2].set_xlabel("time (UT)" if x is time else "number of the image")
+    for row in night.index[night.verdict == "poor"]:
+        for axes in panels:
+            axes.axvline(x[row], color=SERIES_COLORS[5], lw=0.8, ls=":")
+        in_axes = {"transform": panels[0].get_xaxis_transform(), "rotation": 90, "ha": "right"}
+        panels[0].text(x[row], 0.02, night.name[row], fontsize=6, **in_axes)
     for axes in panels:
         axes.grid(True)
-        for row in night.index[night.verdict == "poor"]:
-            axes.axvline(x[row], color=SERIES_COLORS[5], lw=0.8, ls=":")
-            if axes is panels[0]:
-                name = night.name[row]
-                axes.annotate(name, (x[row], 0.02), xycoords=axes.get_xaxis_transform(),
-                              rotation=90, fontsize=6, ha="right")  # fmt: skip
     panels[0].legend(ncols=5, loc="upper center")
     return figure
-
-
-@styled
-def psf_figure(psfs: Mapping[str, np.ndarray]) -> Figure:
-    """Draw PSFs (5, d, d) at `PLACES` of some images, by the label of the image, a row for each."""
-    figure = new_figure(1.7 * len(psfs), layout="constrained")
-    grid: Any = figure.subplots(len(psfs), len(PLACES), squeeze=False)
-    for axes_row, (label, stamps) in zip(grid, psfs.items(), strict=True):
-        axes_row[0].set_ylabel(label.replace(": ", "\n"), fontsize=7)
-        for axes, place, stamp in zip(axes_row, PLACES, stamps, strict=True):
-            # A square root shows core and outskirts in one picture.
-            root = np.sqrt(np.clip(stamp / stamp.max(), 0.0, 1.0))
-            axes.imshow(root, origin="lower", cmap=STAMP_MAP, interpolation="nearest")
-            axes.set(xticks=[], yticks=[])
-            if axes in grid[0]:
-                axes.set_title(place.replace("_", " "), fontsize=8)
-    return figure
-
-
-PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>A night</title><style>
-body { font: 15px/1.45 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }
-table { border-collapse: collapse; margin: 1em 0; font-size: .9em }
-td, th { padding: .2em .7em; border-bottom: 1px solid #ddd; text-align: left }
-.good { color: #007a5a } .poor { color: #b04000 } .failed { color: #a00000 }
-img { max-width: 100%; display: block; margin: 1em 0 }
-</style></head><body>
-<h1>A night of $count images</h1><p><b>$verdicts</b></p>
-<h2>Images to look at</h2>$inspect
-$figures
-<h2>All images</h2>$images
-</body></html>
-""")
 
 
 def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) -> str:
@@ -158,16 +125,16 @@ def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) ->
     head = ("image", "verdict", "reason", "FWHM (px)", "ellipticity", "bright stars")
     rows = {row.Index: row for row in night.rename(columns={"name": "name_"}).itertuples()}
     unusual = [cells(row) for row in rows.values() if row.verdict != "good"]
+    # Figures of a night with models: how the PSF moved, and its PSFs in the order of `PLACES`.
     figures = ""
     if psfs:
-        for title, figure in (
-            ("Size and shape of the PSF against time", night_figure(night)),
-            ("Best, median and worst PSF", psf_figure(psfs)),
-        ):
-            image = base64.b64encode(as_png(figure, dpi=110)).decode()
-            figures += f'<h2>{title}</h2><img alt="" src="data:image/png;base64,{image}">'
+        places = [place.replace("_", " ") for place in PLACES]
+        strip = [StripRow(label, stamps, own_scale=True) for label, stamps in psfs.items()]
+        figures = image_tag(night_figure(night))
+        figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
     counts = ", ".join(f"{(night.verdict == verdict).sum()} {verdict}" for verdict in VERDICTS)
-    return PAGE.substitute(
+    template = Path(__file__).with_name("night.html").read_text(encoding="utf-8")
+    return Template(template).substitute(
         count=len(night),
         verdicts=counts,
         inspect=html_table(head, unusual) if unusual else "<p>None.</p>",

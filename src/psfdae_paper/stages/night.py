@@ -7,6 +7,7 @@ report page, and for the night one table and one page. What cannot be used is a 
 from __future__ import annotations
 
 import glob
+import itertools
 import math
 import os
 import traceback
@@ -67,14 +68,15 @@ def listed_images(text: str) -> list[dict[str, str]]:
     if not rows:
         raise NightError(f"images = {text}: no image, expected night/*.fits or a CSV list")
     # Names of files in different folders may be the same; the same image twice is an error.
-    names, paths = Counter[str](), set[tuple[str, str]]()
+    names, images = set[str](), set[tuple[str, str]]()
     for row in rows:
-        stem, path = ImageInput(Path(row["image"])).name, str(Path(row["image"]).absolute())
-        names[stem] += 1
-        row["name"] = stem if names[stem] == 1 else f"{stem}_{names[stem]}"
-        extension = row.get("extension", "")
-        row["reason"] = "listed twice" if (path, extension) in paths else ""
-        paths.add((path, extension))
+        stem = ImageInput(Path(row["image"])).name
+        numbered = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        row["name"] = next(name for name in numbered if name not in names)
+        image = str(Path(row["image"]).absolute()), row.get("extension", "")
+        row["reason"] = "listed twice" if image in images else ""
+        names.add(row["name"])
+        images.add(image)
     return rows
 
 
@@ -158,9 +160,9 @@ def night_table(
     night = with_verdicts(concat(tables, ignore_index=True).fillna({"reason": ""}))
     write_csv(out, night)
     table = QTable.from_pandas(night)
+    units = {"fwhm_px": "pix", "mag_20th": "mag", "zero_point": "mag"}
     for name in table.colnames:
-        if name.removeprefix("true_").startswith("fwhm_px"):
-            table[name].unit = "pix"
+        table[name].info.unit = next((u for key, u in units.items() if key in name), None)
     write_table(out.with_suffix(".ecsv"), table)
 
 
@@ -188,7 +190,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
             name = str(with_model.name.iloc[number])
             model = load_model(folder / f"{name}{SUFFIX}")
             assert model.image_px is not None  # of a model that was fitted to an image
-            psfs[f"{label}: {name}"] = model.on_pixels(positions_of_places(model.image_px))
+            psfs[f"{label}\n{name}"] = model.on_pixels(positions_of_places(model.image_px))
     links = os.path.relpath(folder, out.parent)
     write_text(out, night_page(night, psfs, links))
 
