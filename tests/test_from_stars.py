@@ -319,7 +319,10 @@ def test_a_cube_of_stamps_will_do(candidates, tmp_path):
     ("words", "message"),
     [
         (["{image}"], "needs --catalogue, a list of its stars"),
-        (["{image}", "--catalogue", "{stars}", "calibration_stars.stars_min=1000"], "--stars-min takes fewer"),
+        (
+            ["{image}", "--catalogue", "{stars}", "calibration_stars.stars_min=1000"],
+            "--stars-min takes fewer",
+        ),
         (["{image}", "--catalogue", "{stars}", "--method", "pca_som"], "--method"),
         (["{image}", "calibration_stars.snr_levels=[10,5]"], "snr_levels"),
         (["none.fits", "--catalogue", "{stars}"], "none.fits"),
