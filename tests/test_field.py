@@ -17,7 +17,7 @@ from photutils.psf import GriddedPSFModel, PSFPhotometry
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
-from psfdae.methods.field import FieldMixture
+from psfdae.methods.field import FieldMixture, stars_of_fit
 from psfdae.methods.field_law import PosteriorLimits
 from psfdae.methods.field_nodes import node_step
 from psfdae.methods.field_posterior import log_node_prior
@@ -368,6 +368,19 @@ def test_same_stars_give_the_same_fit(stars, field):
     arrays = field.stored_arrays()
     for name, array in refitted.stored_arrays().items():
         assert array.tobytes() == arrays[name].tobytes(), name
+
+
+def test_large_frames_are_fitted_to_fewer_stars_the_brighter_the_likelier():
+    """All stars of usual stamps count; of 52² px, the 739 that 2e6 pixels have room for."""
+    snr = np.random.default_rng(3).permutation(np.geomspace(100.0, 1000.0, 1500))
+    assert (stars_of_fit(snr, 20**2, 1) == np.arange(1500)).all()
+    rows = stars_of_fit(snr, 52**2, 1)
+    assert (rows == stars_of_fit(snr, 52**2, 1)).all()
+    assert len(np.unique(rows)) == int(2e6 / 52**2)
+    # Faint ones are there, too, so that a PSF that changes with the magnitude is seen.
+    is_bright = snr > np.median(snr)
+    assert is_bright[rows].mean() > 0.55
+    assert (~is_bright)[rows].mean() > 0.2
 
 
 def test_list_of_the_training_is_known(field):

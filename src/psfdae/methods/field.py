@@ -99,6 +99,7 @@ class FieldMixture(FieldLaw, Method):
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
         rng = stream(data.seed, "noise", "field")
+        bright = bright.of(stars_of_fit(bright.snr, sizes[0] ** 2, data.seed))
         fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines, rng)
         arrays = fitted_arrays(fit, bright, side, field)
         return cls(**arrays, noise=data.noise, settings=field, uncertainty=fit.uncertainty)
@@ -293,6 +294,32 @@ class FieldMixture(FieldLaw, Method):
             measured=measured,
             outlier_score=posterior.mahalanobis2,
         )
+
+
+def stars_of_fit(
+    snr: np.ndarray, frame_pixels: int, seed: int, most_pixels: float = 2e6
+) -> np.ndarray:
+    """Return the rows of the stars that a field is fitted to: all, unless their frames are large.
+
+    Time and memory of a fit grow with the pixels of all stars. Where stars are well sampled, some
+    hundred of them determine the field as well as thousands. They are drawn with chances that grow
+    with their S/N, so that each part of the field and each magnitude has some.
+
+    Parameters
+    ----------
+    snr : ndarray, shape (n,)
+    frame_pixels : int
+        Pixels of the frame of a star.
+    seed : int
+    most_pixels : float
+        Pixels of all frames together, of which the fit takes about 1 GB.
+    """
+    count = int(most_pixels / frame_pixels)
+    if len(snr) <= count:
+        return np.arange(len(snr))
+    chance = np.maximum(snr, 1.0)
+    rng = stream(seed, "stars of the fit", "field")
+    return np.sort(rng.choice(len(snr), count, replace=False, p=chance / chance.sum()))
 
 
 def fitted_arrays(
