@@ -318,8 +318,11 @@ def test_a_cube_of_stamps_will_do(candidates, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["{image}"], "star catalogue"),
-        (["{image}", "--catalogue", "{stars}", "calibration_stars.stars_min=1000"], "stars_min"),
+        (["{image}"], "needs --catalogue, a list of its stars"),
+        (
+            ["{image}", "--catalogue", "{stars}", "calibration_stars.stars_min=1000"],
+            "--stars-min takes fewer",
+        ),
         (["{image}", "--catalogue", "{stars}", "--method", "pca_som"], "--method"),
         (["{image}", "calibration_stars.snr_levels=[10,5]"], "snr_levels"),
         (["none.fits", "--catalogue", "{stars}"], "none.fits"),

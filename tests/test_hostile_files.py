@@ -109,7 +109,7 @@ CASES = [
     (TABLE, with_card("NAXIS2  = 99999999"), "larger than the file"),
     (MODEL, lambda raw: struct.pack("<Q", 2**60) + raw[8:], MODEL),
     (CUBE, pixels(4, 7, 7), "7×7"),
-    (CUBE, pixels(30, 40), "needs a star catalogue"),
+    (CUBE, pixels(30, 40), "needs --catalogue"),
     (MODEL, model_with("flux/mean", lambda a: a[1:]), "'flux/mean' has shape"),
     (MODEL, model_with("flux/mean", lambda a: 0 * a), "'flux/mean' must have a sum of 1"),
     (MODEL, model_with("gmm/axes", lambda a: 2 * a), "'axes' must have orthonormal"),

@@ -138,7 +138,7 @@ def test_a_model_that_may_have_seen_the_stars_is_refused(training, settings, mes
         (lambda s, sky: psfdae.Stars.from_image(*sky, snr_mim=3.0), "snr_mim"),
         (lambda s, sky: psfdae.Stars.from_image(np.ones(3)), "2 or 3 dim"),
         (lambda s, sky: psfdae.fit(s, method="field", order=3), "order"),
-        (lambda s, sky: psfdae.load_model("mine.yaml"), "psfdae wavefront"),
+        (lambda s, sky: psfdae.load_model("mine.yaml"), r"psfdae\.wavefront"),
     ],
 )
 def test_what_cannot_be_used_is_one_kind_of_error(training, stars, call, message):

@@ -189,11 +189,11 @@ def test_a_dataset_is_one(tree, tmp_path):
 
 def test_a_dataset_with_stars_of_its_own_is_two(tree, tmp_path):
     """A file of stars serves several datasets, so that none changes it for itself."""
-    added(tree, "config/dataset/mine.yaml", f"{DATASET}stars: {{aberration_fraction: 0.25}}\n")
-    refusal = snakemake(tmp_path, "--dry-run", "mine", root=tree, check=False)
-    assert "psfdae: dataset=mine: stars.aberration_fraction = 0.25, but its stars" in refusal
+    path, text = tree / "config/dataset/other.yaml", DATASET.replace("mine", "other")
+    path.write_text(f"{text}stars: {{aberration_fraction: 0.25}}\n")
+    refusal = snakemake(tmp_path, "--dry-run", "other", root=tree, check=False)
+    assert "psfdae: dataset=other: stars.aberration_fraction = 0.25, but its stars" in refusal
     stars = "defaults: [seidel_10pct, _self_]\nname: own\naberration_fraction: 0.25\n"
-    added(tree, "config/stars/own.yaml", stars)
-    chosen = "  - dataset3\n  - override /stars: own\n"
-    (tree / "config/dataset/mine.yaml").write_text(DATASET.replace("  - dataset3\n", chosen))
-    assert planned(tmp_path, "mine", root=tree)["stars"] == 1
+    (tree / "config/stars/own.yaml").write_text(stars)
+    path.write_text(text.replace("  - dataset3\n", "  - dataset3\n  - override /stars: own\n"))
+    assert planned(tmp_path, "other", root=tree)["stars"] == 1

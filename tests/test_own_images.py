@@ -173,7 +173,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     for row, column in np.ndindex(3, 3):
         plate[y + row - 1, x + column + 6] = plate.max()
     path, candidates = collected(plate, sky, tmp_path)
-    advice = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(candidates))
+    advice = re.search(r"(\d+) stamps have .*saturate=(\S+) ", saturation_advice(candidates))
     count, saturation = int(advice[1]), float(advice[2])
     assert (candidates.verdict == "saturated").sum() <= count
     observation = ImageInput(path, catalogue=sky.list, saturate=saturation).open(22, 0)

@@ -153,4 +153,4 @@ def test_cores_that_are_flat_or_hollow_do_not_fit(stars, spoil):
 
 def test_photons_of_the_sky_give_the_gain():
     stars = SimpleNamespace(sky=np.full(9, 300.0), noise=np.full(9, np.sqrt(300 / 1.6)))
-    assert "--gain 1.6 is right" in advice.gain_advice(stars)
+    assert "gain=1.6 is right" in advice.gain_advice(stars)

@@ -169,7 +169,7 @@ TERMS = "telescope.aberrations.terms"
         ([OWN_TELESCOPE, f"++{TERMS}.z1=1"], r"'z1': must be between z2 and z45"),
         (
             [OWN_TELESCOPE, "++telescope.aberrations.seing=1"],
-            r"^telescope\.aberrations\.seing: unknown key$",
+            r"^telescope\.aberrations\.seing: unknown key",
         ),
         ([OWN_TELESCOPE, "stars.aberration_fraction=0"], "jitter_waves = 0.03"),
     ],

@@ -71,7 +71,7 @@ def test_a_mistyped_word_of_a_command_is_answered_with_the_one_meant(
 def test_a_mistyped_name_in_python_is_answered_with_the_one_meant(folder):
     with pytest.raises(library.Error, match=r"did you mean snr_min\?"):
         library.Stars.from_image(folder / "image.fits", detect=True, snr_mn=20)
-    with pytest.raises(library.Error, match=r"gain 2\.0 m, expected a number of electron/adu"):
+    with pytest.raises(library.Error, match=r"gain=2\.0 m: expected a number of electron/adu"):
         from astropy import units
 
         library.Stars.from_image(folder / "image.fits", detect=True, gain=2 * units.m)
