@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import costs
@@ -61,13 +60,5 @@ def test_configured_optics_stay_within_the_error_budget(dataset, worst_stars):
 
 def test_knee_is_the_last_training_whose_time_is_worth_its_error():
     """Twice the time must lower the error by a tenth, or four times by a fifth."""
+    # From 2 s to 4 s it falls by 6 % only.
     assert costs.knee(np.array([1.0, 2.0, 4.0, 8.0]), np.array([1.0, 0.8, 0.75, 0.7])) == 1
-
-
-def test_least_errors_are_those_of_levels_at_which_both_bounds_are_tight():
-    # Two levels of each bound; one of them is not tight at the second.
-    columns = {"method": ["bayes"] * 2 + ["bayes_position"] * 2, "noise_level": [1.0, 2.0] * 2}
-    columns |= {"tight": ["yes"] * 3 + ["no"], "value": range(4), "missing": 0, "metric": "mse"}
-    bounds = pd.DataFrame(columns).assign(dataset="dataset3", reference="realisation")
-    assert costs.least_errors(bounds, "dataset3", knows_position=False) == {1.0: 0}
-    assert costs.least_errors(bounds, "dataset3", knows_position=True) == {1.0: 2}

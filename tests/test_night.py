@@ -41,29 +41,29 @@ def truth(folder):
 
 
 @pytest.fixture(scope="module")
-def alike(truth):
+def similar_exposures(truth):
     """The two good exposures whose PSFs have most nearly the same sizes."""
     intact = truth[truth.fault.isna()]
     sizes = np.log(intact.filter(like="true_fwhm_px"))
-    pairs = combinations(intact.index, 2)
-    return intact.loc[list(min(pairs, key=lambda pair: np.ptp(sizes.loc[[*pair]], axis=0).max()))]
+    # Least over all pairs of the largest difference at any place.
+    pairs = map(list, combinations(intact.index, 2))
+    return intact.loc[min(pairs, key=lambda pair: np.ptp(sizes.loc[pair], axis=0).max())]
 
 
 @pytest.fixture(scope="module")
-def rows(folder, truth, alike):
+def rows(folder, truth, similar_exposures):
     """A list of good and bad images of two cameras, one twice, one that is missing."""
     bad = truth[truth.fault.isin(["no stars", "truncated file"])]
-    first, second = alike.image
-    other = folder / "other" / Path(first).name
+    first_image, second_image = similar_exposures.image
+    other = folder / "other" / Path(first_image).name
     other.parent.mkdir()
-    with fits.open(second) as hdus:
+    with fits.open(second_image) as hdus:
         hdus[0].header["INSTRUME"] = "other camera"
         hdus.writeto(other)
-    listed = pd.concat([alike, bad]).assign(observer="Anna")
-    further = [{"image": path} for path in (first, other, folder / "none.fits")]
-    path = folder / "list.csv"
+    listed = pd.concat([similar_exposures, bad]).assign(observer="Anna")
+    further = [{"image": path} for path in (first_image, other, folder / "none.fits")]
+    path, out = folder / "list.csv", folder / "rows.csv"
     pd.concat([listed, pd.DataFrame(further)]).to_csv(path, index=False)
-    out = folder / "rows.csv"
     pd.DataFrame(listed_images(str(path))).to_csv(out, index=False)
     return out
 
@@ -88,19 +88,18 @@ def test_truth_of_a_night_names_what_is_wrong(truth):
     assert sorted(truth.fault.dropna()) == faults
     # The aberrations of the example grow towards the corners.
     assert (truth.true_fwhm_px_lower_left > truth.true_fwhm_px_centre).all()
-    intact = truth[truth.fault.isna()].image
-    headers = [fits.getheader(path) for path in intact]
+    headers = [fits.getheader(path) for path in truth[truth.fault.isna()].image]
     assert np.ptp([header["AIRMASS"] for header in headers]) > 0.3
     assert len({header["DATE-OBS"] for header in headers}) == len(headers)
 
 
-def test_what_cannot_be_used_is_a_row_with_its_reason(night, truth, alike):
+def test_what_cannot_be_used_is_a_row_with_its_reason(night, truth, similar_exposures):
     reasons = night.reason[night.verdict == "failed"]
     assert len(night) == 7 and len(reasons) == 4
     by_fault = truth.set_index("fault").image.str.extract(r"(exposure_\d+)", expand=False)
     assert "truncated" in reasons[by_fault["truncated file"]]
     assert "no star" in reasons[by_fault["no stars"]]
-    assert reasons[f"{Path(alike.image.iloc[0]).stem}_2"] == "listed twice"
+    assert reasons[f"{Path(similar_exposures.image.iloc[0]).stem}_2"] == "listed twice"
     assert reasons["none"] == "no such file"
 
 
