@@ -503,12 +503,12 @@ class DaeTraining(Training):
         return error
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
-        """Return a row of the history; the learning rate is that at the epoch's end."""
+        """Return a row of the history; the learning rate is that at the epoch's start."""
         # The network sees images times a factor: errors are over its square.
         return {
             "epoch": epoch,
             "step": epoch * self.steps,
-            "lr": self.rate,
+            "lr": rate,
             "train_mse": loss / self.factor**2,
             "validation_mse": error,
             "seconds": round(self.seconds, 3),
