@@ -127,11 +127,18 @@ def of_scene3(name, part, shown, caption=None):
 # What the first page of the report asks (workflow/report/workflow.rst).
 
 
-def shown_first(files, pattern):
+def shown_first(categories, pattern):
     """Of the report's files, that of a pattern: of `HEADLINE_DATASET`, else any; None."""
-    found = [file for file in files if file.path.match(pattern)]
+    # Snakemake's own list of files has only one of each name.
+    listed = [
+        file
+        for subcategories in categories.values()
+        for files in subcategories.values()
+        for file in files
+        if file.path.match(pattern)
+    ]
     return min(
-        found,
+        listed,
         key=lambda file: (HEADLINE_DATASET not in file.path.parts, str(file.path)),
         default=None,
     )
