@@ -98,63 +98,27 @@ def test_models_are_copied_and_pickled_and_work_on_images_side_by_side(image, mo
 
 
 @pytest.mark.parametrize(
-    ("statements", "words", "python", "command"),
+    ("name", "value", "python", "command"),
     [
-        ({}, (), "or detect=True", "or --detect"),
-        ({"detect": True, "gain": -1}, ("--detect", "--gain", -1), "gain=-1:", "--gain -1:"),
-        (
-            {"detect": True, "pixel_scale_arcsec": 0},
-            ("--detect", "--pixel-scale", 0),
-            "pixel_scale_arcsec=0:",
-            "--pixel-scale 0:",
-        ),
-        (
-            {"detect": True, "saturate": 10.0},
-            ("--detect", "--saturate", 10),
-            "saturate= takes that",
-            "--saturate takes that",
-        ),
-        (
-            {"detect": True, "bad_bits": 4},
-            ("--detect", "--bad-bits", 4),
-            "bad_bits= needs a mask",
-            "--bad-bits needs a mask",
-        ),
-        (
-            {"detect": True, "threshold": 1e7},
-            ("--detect", "--threshold", 1e7),
-            "threshold= sets",
-            "--threshold sets",
-        ),
-        (
-            {"detect": True, "origin": 1},
-            ("--detect", "--origin", 1),
-            "detect=True takes an image",
-            "--detect takes an image",
-        ),
-        (
-            {"detect": True, "snr_min": -3},
-            ("--detect", "--snr-min", -3),
-            "snr_min =",
-            "--snr-min =",
-        ),
-        (
-            {"detect": True, "stamp_px": 15},
-            ("--detect", "--stamp-px", 15),
-            "stamp_px",
-            "--stamp-px",
-        ),
-        (
-            {"detect": True, "stars_min": 5000},
-            ("--detect", "--stars-min", 5000),
-            "stars_min= takes fewer, snr_min= fainter",
-            "--stars-min takes fewer, --snr-min fainter",
-        ),
+        ("", None, "or detect=True", "or --detect"),
+        ("gain", -1, "gain=-1:", "--gain -1:"),
+        ("pixel_scale_arcsec", 0, "pixel_scale_arcsec=0:", "--pixel-scale 0:"),
+        ("saturate", 10.0, "saturate= takes that", "--saturate takes that"),
+        ("bad_bits", 4, "bad_bits= needs a mask", "--bad-bits needs a mask"),
+        ("threshold", 1e7, "threshold= sets", "--threshold sets"),
+        ("origin", 1, "detect=True takes an image", "--detect takes an image"),
+        ("snr_min", -3, "snr_min =", "--snr-min ="),
+        ("stamp_px", 15, "stamp_px", "--stamp-px"),
+        ("stars_min", 5000, "stars_min= takes fewer, snr_min=", "--stars-min takes fewer, --snr"),
     ],
 )
 def test_a_refusal_names_keywords_in_python_and_options_in_a_command(
-    image, tmp_path, statements, words, python, command
+    image, tmp_path, name, value, python, command
 ):
+    # Without a value neither a list nor detection is stated.
+    statements = {} if value is None else {"detect": True, name: value}
+    option = f"--{name.removesuffix('_arcsec').replace('_', '-')}"
+    words = () if value is None else ("--detect", option, value)
     with pytest.raises(library.Error) as refusal:
         library.Stars.from_image(image, **statements)
     assert python in str(refusal.value) and "--" not in str(refusal.value)

@@ -220,6 +220,8 @@ def test_training_learns_and_repeats(data, tmp_path):
     assert are_equal(first.result, second.result)
     errors = [row["validation_mse"] for row in first.history]
     assert errors[-1] < 0.5 * errors[0]
+    # One-cycle begins and ends with small steps; none goes backwards.
+    assert min(row["lr"] for row in first.history) > 0
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "muon"])

@@ -14,6 +14,7 @@ from astropy.io import fits
 from psfdae.base.reading import read_table
 from psfdae_paper.evaluation.night import LIMITS, night_page, with_verdicts
 from psfdae_paper.stages.night import (
+    TABLE_COLUMNS,
     NightError,
     listed_images,
     night_count,
@@ -60,7 +61,7 @@ def rows(folder, truth, similar_exposures):
     with fits.open(second_image) as hdus:
         hdus[0].header["INSTRUME"] = "other camera"
         hdus.writeto(other)
-    listed = pd.concat([similar_exposures, bad]).assign(observer="Anna")
+    listed = pd.concat([similar_exposures, bad]).assign(observer="Anna", time="dusk")
     further = [{"image": path} for path in (first_image, other, folder / "none.fits")]
     path, out = folder / "list.csv", folder / "rows.csv"
     pd.concat([listed, pd.DataFrame(further)]).to_csv(path, index=False)
@@ -104,13 +105,19 @@ def test_what_cannot_be_used_is_a_row_with_its_reason(night, truth, similar_expo
 
 
 def test_exposures_of_one_camera_share_a_start(night):
-    """An image of another camera is fitted by itself; further columns of the list are kept."""
+    """An image of another camera is fitted by itself."""
     good = night[night.verdict == "good"]
     assert len(good) == 3
     first, second, other = good.start.astype(object).fillna("")
     assert {first, second} == {"", good.index[0] if not first else good.index[1]}
     assert other == ""
-    assert good.observer.iloc[0] == "Anna"
+
+
+def test_columns_of_the_list_are_kept_beside_those_of_the_table(night, truth):
+    list_columns = night.loc[night.verdict == "good", ["observer", "time_list"]].iloc[0]
+    assert [*list_columns] == ["Anna", "dusk"]
+    columns = {"name", *night.columns} - {*truth.columns, *list_columns.index}
+    assert columns == TABLE_COLUMNS
 
 
 def test_shapes_are_those_of_the_truth(night):

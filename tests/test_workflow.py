@@ -114,6 +114,7 @@ def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path
     snakemake(smoke, "--report", str(report), "all")
     first = json.loads(re.search(r"var workflow_desc = (\".*\");\n", report.read_text())[1])
     assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == 3
+    assert "'results/figures/dataset3/strip_realisation.png'" in first
     words = " ".join(re.sub("<[^>]+>", "", first).split())
     config = load(["dataset=dataset7", "preset=smoke"])
     for label in (

@@ -1,5 +1,4 @@
 from psfdae.base.files import as_csv
-from psfdae_paper.stages.night import NightError, listed_images
 
 NIGHT = f"{RESULTS}/night"
 # Images of a job: its first fit and its imports serve all of them.
@@ -13,6 +12,9 @@ def night_parts():
         sys.exit(
             "psfdae: night: --config images='night/*.fits', or a CSV list of images"
         )
+    # Only a night needs this module, and every job reads this file.
+    from psfdae_paper.stages.night import NightError, listed_images
+
     try:
         rows = listed_images(config["images"])
     except (NightError, ProductError) as error:

@@ -28,7 +28,10 @@ VERDICTS = ("good", "poor", "failed")
 """Good images, those with a model that are unlike their neighbours in time, those without one."""
 
 LIMITS = {
-    "fwhm_px_centre": (0.5, "stars of {value:.2f} px, those of its neighbours in time {usual:.2f}"),
+    "fwhm_px_centre": (
+        0.5,
+        "stars of {value:.2f} px, those of its neighbours in time {median:.2f}",
+    ),
     "ellipticity_centre": (0.1, "elongated stars, ellipticity {value:.2f}: trailed?"),
     "mag_20th": (0.5, "stars fainter by {excess:.1f} mag than in its neighbours in time: clouds?"),
 }
@@ -52,11 +55,11 @@ def with_verdicts(night: DataFrame) -> DataFrame:
     night = night.assign(verdict=np.where(night.reason == "", "good", "failed"))
     for column, (least_excess, sentence) in LIMITS.items():
         value = night[column].dropna()
-        usual = value.rolling(11, center=True, min_periods=1).median()
-        excess = value - usual
+        median = value.rolling(11, center=True, min_periods=1).median()
+        excess = value - median
         sigma = SIGMA_OF_MAD * (excess - excess.median()).abs().median()
         for row in excess.index[excess > max(5.0 * sigma, least_excess)]:
-            words = {"value": value[row], "usual": usual[row], "excess": excess[row]}
+            words = {"value": value[row], "median": median[row], "excess": excess[row]}
             reasons = [night.loc[row, "reason"], sentence.format(**words)]
             night.loc[row, ["verdict", "reason"]] = "poor", "; ".join(filter(None, reasons))
     return night
@@ -81,9 +84,9 @@ def night_figure(night: DataFrame) -> Figure:
             axes.plot(x, values, ".-", ms=4, lw=0.7, color=color, label=place.replace("_", " "))
         axes.set_ylabel(label)
         # The range is that of good images: an outlier must not flatten all others.
-        usual = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
-        if len(usual) > 1:
-            low, high = usual.min().min(), usual.max().max()
+        good_values = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
+        if len(good_values) > 1:
+            low, high = good_values.min().min(), good_values.max().max()
             axes.set_ylim(low - 0.2 * (high - low), high + 0.4 * (high - low))
     panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
     panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")

@@ -28,13 +28,20 @@ from psfdae.image.tables import write_table
 from psfdae.model.bundle import SUFFIX
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation.night import VERDICTS, night_page, with_verdicts
-from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
+from psfdae_paper.stars.nights import PLACES, positions_of_places, shapes_at_places
 
 if TYPE_CHECKING:
     from psfdae.model.psf_model import PsfModel
     from psfdae.model.stars import Stars
 
 Row = dict[str, object]
+
+TABLE_COLUMNS = {
+    *("name", "reason", "verdict", "start", "time", "airmass", "order", "bright_stars", "stars"),
+    *("flagged", "mag_20th", "zero_point", "zero_point_scatter", "chi2"),
+    *(f"{quantity}_{place}" for quantity in ("fwhm_px", "ellipticity") for place in PLACES),
+}
+"""Columns that the table of a night has; one of a list with such a name gets `_list` at its end."""
 
 
 class NightError(Error, ValueError):
@@ -64,7 +71,11 @@ def listed_images(text: str) -> list[dict[str, str]]:
     # Images of a pattern stand in the order of their names, which mostly is that of time.
     rows = [{"image": path} for path in sorted(glob.glob(text))]  # noqa: PTH207  # any folder
     if text.endswith(".csv"):
-        rows = text_rows(Path(text), "image")
+        # A column of the list that the table of the night has as well keeps a name of its own.
+        rows = [
+            {f"{name}_list" if name in TABLE_COLUMNS else name: cell for name, cell in row.items()}
+            for row in text_rows(Path(text), "image")
+        ]
     if not rows:
         raise NightError(f"images = {text}: no image, expected night/*.fits or a CSV list")
     # Names of files in different folders may be the same; the same image twice is an error.
@@ -250,11 +261,11 @@ def from_most_usual(
     """
     least_count = np.median([len(stars) for stars in stars_by_name.values()])
     middle = np.median([*sizes.values()], axis=0)
-    usual = min(
+    most_usual = min(
         (name for name, stars in stars_by_name.items() if len(stars) >= least_count),
         key=lambda name: np.abs(sizes[name] - middle).sum(),
     )
-    return [usual, *(name for name in stars_by_name if name != usual)]
+    return [most_usual, *(name for name in stars_by_name if name != most_usual)]
 
 
 def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:

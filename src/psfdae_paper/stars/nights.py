@@ -70,7 +70,7 @@ class NightRecipe:
     dither_px: float = 12.0  # largest offset of a pointing along either axis
     # The focus runs away between these parts of the night, by so many waves W020 at the edge of
     # the pupil, and is mended then.
-    focus_lost: tuple[float, float] = (0.3, 0.7)
+    focus_drift: tuple[float, float] = (0.3, 0.7)
     focus_waves: float = 0.6
     extinction_mag: float = 0.15  # per airmass
     cloud_transmission: float = 0.06
@@ -158,14 +158,14 @@ def simulated_night(
         # airmass to the power 0.6 (Roddier 1981, Prog. Opt. 19, 281), and wanders about it.
         airmass = 1.0 / np.cos(np.deg2rad(45.0 * (1.0 - 2.0 * part % 1.0)))
         log_seeing = 0.9 * log_seeing + 0.03 * rng.standard_normal()
-        lost, mended = recipe.focus_lost
+        drift_start, drift_end = recipe.focus_drift
         optics = replace(
             recipe.field,
             seeing_px=recipe.field.seeing_px * airmass**0.6 * np.exp(log_seeing),
             defocus_waves=recipe.focus_waves
-            * (part - lost)
-            / (mended - lost)
-            * (lost < part < mended),
+            * (part - drift_start)
+            / (drift_end - drift_start)
+            * (drift_start < part < drift_end),
         )
         # Stars of the field at this pointing, their light dimmed by air and clouds. A trail is the
         # sum of short exposures along a line.
