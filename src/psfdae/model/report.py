@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from html import escape
+from io import BytesIO
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
@@ -111,9 +112,18 @@ def image_tag(picture: Figure | bytes) -> str:
     picture : Figure or bytes
         A figure is drawn with 110 dots per inch.
     """
-    # The picture stands in the page itself, in base 64.
+    from PIL import Image
+
     content = picture if isinstance(picture, bytes) else as_png(picture, dpi=110)
-    return f'<img src="data:image/png;base64,{base64.b64encode(content).decode()}">'
+    # A palette of 256 colours, those of a figure's colour maps among them, takes a third of the
+    # bytes of full colour; dithering would make even areas noisy.
+    palette, dither = Image.Quantize.MEDIANCUT, Image.Dither.NONE
+    picture_in_colours = Image.open(BytesIO(content)).convert("RGB")
+    picture_of_palette = picture_in_colours.quantize(256, palette, dither=dither)
+    small = BytesIO()
+    picture_of_palette.save(small, "PNG")
+    # The picture stands in the page itself, in base 64.
+    return f'<img src="data:image/png;base64,{base64.b64encode(small.getvalue()).decode()}">'
 
 
 def _errors_table(errors: Table, model_method: str) -> str:
