@@ -295,12 +295,24 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     from scipy import ndimage
 
     continued = _continued(mesh, 2, slope)
-    row, column = ((np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape)
+    # The spline is a product of splines along rows and columns, and linear in the meshes: a weight
+    # is the value at a pixel of the spline through 1 in one mesh and 0 in all others.
+    row_weights, column_weights = (
+        ndimage.map_coordinates(
+            np.eye(meshes),
+            np.meshgrid(
+                (np.arange(pixels) + 0.5) / mesh_px + 1.5, np.arange(meshes), indexing="ij"
+            ),
+            order=3,
+            mode="nearest",
+        )
+        for pixels, meshes in zip(shape, continued.shape, strict=True)
+    )
+    columns = continued @ column_weights.T
     values = np.empty(shape, np.float32)
-    # A few rows at a time: their coordinates take twice the memory of the values.
-    for part in (slice(top, top + 256) for top in range(0, len(row), 256)):
-        grid = np.meshgrid(row[part], column, indexing="ij")
-        values[part] = ndimage.map_coordinates(continued, grid, order=3, mode="nearest")
+    # A few rows at a time: products take twice the memory of the values.
+    for part in (slice(top, top + 256) for top in range(0, shape[0], 256)):
+        values[part] = row_weights[part] @ columns
     return values
 
 
