@@ -297,22 +297,16 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     continued = _continued(mesh, 2, slope)
     # The spline is a product of splines along rows and columns, and linear in the meshes: a weight
     # is the value at a pixel of the spline through 1 in one mesh and 0 in all others.
-    row_weights, column_weights = (
-        ndimage.map_coordinates(
-            np.eye(meshes),
-            np.meshgrid(
-                (np.arange(pixels) + 0.5) / mesh_px + 1.5, np.arange(meshes), indexing="ij"
-            ),
-            order=3,
-            mode="nearest",
-        )
-        for pixels, meshes in zip(shape, continued.shape, strict=True)
-    )
-    columns = continued @ column_weights.T
-    values = np.empty(shape, np.float32)
+    weights = []
+    for pixels, meshes in zip(shape, continued.shape, strict=True):
+        position = (np.arange(pixels) + 0.5) / mesh_px - 0.5 + 2.0
+        at = np.meshgrid(position, np.arange(meshes), indexing="ij")
+        weights.append(ndimage.map_coordinates(np.eye(meshes), at, order=3, mode="nearest"))
+    row_weights, columns = weights[0], continued @ weights[1].T
     # A few rows at a time: products take twice the memory of the values.
-    for part in (slice(top, top + 256) for top in range(0, shape[0], 256)):
-        values[part] = row_weights[part] @ columns
+    values = np.empty(shape, np.float32)
+    for top in range(0, len(values), 256):
+        values[top : top + 256] = row_weights[top : top + 256] @ columns
     return values
 
 

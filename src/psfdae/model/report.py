@@ -115,13 +115,11 @@ def image_tag(picture: Figure | bytes) -> str:
     from PIL import Image
 
     content = picture if isinstance(picture, bytes) else as_png(picture, dpi=110)
-    # A palette of 256 colours, those of a figure's colour maps among them, takes a third of the
-    # bytes of full colour; dithering would make even areas noisy.
+    # A palette of 256 colours takes 0.4 of the bytes of full colour; dithering would make even
+    # areas noisy.
     palette, dither = Image.Quantize.MEDIANCUT, Image.Dither.NONE
-    picture_in_colours = Image.open(BytesIO(content)).convert("RGB")
-    picture_of_palette = picture_in_colours.quantize(256, palette, dither=dither)
-    small = BytesIO()
-    picture_of_palette.save(small, "PNG")
+    image = Image.open(BytesIO(content)).convert("RGB").quantize(256, palette, dither=dither)
+    image.save(small := BytesIO(), "PNG")
     # The picture stands in the page itself, in base 64.
     return f'<img src="data:image/png;base64,{base64.b64encode(small.getvalue()).decode()}">'
 
