@@ -4,7 +4,7 @@
 
 Eight exposures of the simulated night, with so many bright and faint stars, are one job of
 `psfdae night images`. Seconds are those of the processor, of one thread; memory is the peak of the
-job, which has one image to fit and seven that start from it.
+job, some of whose images are fitted and the others start from these.
 """
 
 from __future__ import annotations

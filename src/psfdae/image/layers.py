@@ -203,7 +203,7 @@ def _sky(layers: Layers) -> Sky:
     with task("sky", 2) as advance, silent():
         bad_pixels = layers.find_bad(image, masked)
         advance(1, "bad pixels")
-        # A sky that was measured to find trails is used once: kept for many images, it takes memory.
+        # A sky that was measured to find trails is used once: it takes much memory.
         layers._bad_pixels[:] = [replace(bad_pixels, sky=None)]
         try:
             sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, bad_pixels.sky)
