@@ -70,17 +70,7 @@ def sky_level(
         if lines:
             lines_text = ", ".join(map(str, lines))
             notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
-    # Each part between steps has meshes of its own. Single precision: of a large image, each map
-    # takes much memory.
-    level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
-    rows, columns = steps
-    for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
-        for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
-            part = np.s_[top:bottom, first:last]
-            if not bad[part].all() or not any(steps):
-                level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
-    # Structure that is finer than the meshes.
-    level, noise, share = _with_structure(image, bad, level, noise, mesh_px)
+    level, noise, share = level_and_noise(image, bad, steps, mesh_px)
     if share:
         notes.append(
             f"the sky has structure within {mesh_px} px in {100 * share:.0f} % of the image: "
@@ -96,6 +86,29 @@ def sky_level(
             f"pixels is {correlation:.2f} times as large, and errors are of sums"
         )
     return SkyLevel(level, noise, steps, tuple(notes))
+
+
+def level_and_noise(
+    image: np.ndarray,
+    bad: np.ndarray,
+    steps: tuple[Sequence[int], Sequence[int]],
+    mesh_px: int = 64,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return level and σ (h, w) of the sky at known steps, and the part of it that has structure.
+
+    The noise is that of single pixels; parameters are those of `sky_level`.
+    """
+    # Each part between steps has meshes of its own. Single precision: of a large image, each map
+    # takes much memory.
+    level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
+    rows, columns = steps
+    for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
+        for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
+            part = np.s_[top:bottom, first:last]
+            if not bad[part].all() or not any(steps):
+                level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
+    # Structure that is finer than the meshes.
+    return _with_structure(image, bad, level, noise, mesh_px)
 
 
 # Noise of pixels and of sums of pixels.

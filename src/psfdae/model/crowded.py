@@ -105,10 +105,10 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
     bad = sky.bad | saturated
     sky = replace(sky, bad=bad)
-    # Stars start where the list or the detection has them.
+    # Stars start where the list or the detection has them, with the wings of the model.
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
-    wings, wing_light = None, np.zeros_like(image)
+    wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.flat, observation.gain)
     for turn in steps("photometry", range(3)):
@@ -120,8 +120,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
         fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place))
+        # At first, stars are no better known than to the error of the wings.
         sky, wing_light, wings, sigma = around_stars(
-            image, sky, error, fit.light, fluxes, side, wings
+            image, sky, error, fit.light, fluxes, side, wings, tolerance=0.1 if turn else 1.0
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)

@@ -138,6 +138,7 @@ def photometry_of_image(
     zero_point: float | None = None,
     reference: StarList | None = None,
     magnitude_column: str = "mag",
+    opened: Observation | None = None,
 ) -> ImagePhotometry:
     """Measure the fluxes of all stars of an image, overlapping ones together.
 
@@ -154,6 +155,8 @@ def photometry_of_image(
         Star list with magnitudes, which give the zero point.
     magnitude_column : str
         Column of the reference with the magnitudes.
+    opened : Observation, optional
+        `source` with its stars, if it was opened before: it is not read and searched again.
 
     Raises
     ------
@@ -181,7 +184,7 @@ def photometry_of_image(
     # The model must know the PSF at every place (`field_range` refuses others), and have pixels
     # as large as those of the image.
     model.field_range()
-    observation = source.open(model.stamp_px).assuming()
+    observation = opened or source.open(model.stamp_px).assuming()
     if observation.shape is None:
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))

@@ -24,7 +24,7 @@ import numpy as np
 from psfdae.base.errors import keyword
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
-from psfdae.image.sky_level import sky_level
+from psfdae.image.sky_level import level_and_noise
 from psfdae.model.photon_noise import pixel_error
 
 if TYPE_CHECKING:
@@ -258,9 +258,10 @@ def star_tents(
     stars: StarFluxes,
     wings: Wings,
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
+    """Yield windows about the brightest stars, and F s h_k there, shape (K, …).
 
-    A window is of rows, counted from `rows.start`, and columns; the image is `width` px wide.
+    They are the stars that have 99.5 % of the light of all wings, at most 1000. A window is of
+    rows, counted from `rows.start`, and columns; the image is `width` px wide.
     """
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
@@ -271,6 +272,8 @@ def star_tents(
     # In a crowded image, the thousand brightest stars have most of the light of all wings.
     lit_stars = np.flatnonzero(is_lit)
     brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
+    light = np.cumsum(scaled_flux[brightest])
+    brightest = brightest[: int(np.searchsorted(light, 0.995 * light[-1:].sum())) + 1]
     # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
     middle = np.rint(stars.place[brightest]).astype(int)
     first = np.maximum(middle - reach, [0, rows.start])
@@ -378,8 +381,10 @@ def wings_of(
     """
     from scipy.ndimage import uniform_filter
 
-    # Six tents, of which the last one ends 2.5 stamps from the star.
+    # Six tents, of which the last one ends 2.5 stamps from the star; those of an earlier fit stay.
     radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
+    if earlier is not None:
+        radius = earlier.radius_px
     # The mean of the outer share by light, for which s = 1.
     flux, outer_share = stars.flux, stars.outer_share
     has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
@@ -466,6 +471,7 @@ def around_stars(
     stars: StarFluxes,
     stamp_px: int,
     earlier: Wings | None = None,
+    tolerance: float = 0.1,
 ) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
@@ -480,6 +486,9 @@ def around_stars(
     stars : StarFluxes
     stamp_px : int
     earlier : Wings, optional
+        Wings with which the turns begin.
+    tolerance : float
+        Turns end when the light of the wings changes by less than this part of its error.
 
     Returns
     -------
@@ -493,7 +502,7 @@ def around_stars(
     # What is left beside the models has their errors, too.
     sigma = error_beside_models(error, star_light)
     without_stars = image - star_light
-    wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier)
+    wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
     light_of_wings = wing_light(image.shape, stars, wings)
     # The sky without them, with its noise map if it has one.
     has_noise_map = np.isfinite(sky.noise_scale)
@@ -521,6 +530,7 @@ def _wings_beside(
     stars: StarFluxes,
     stamp_px: int,
     earlier: Wings | None = None,
+    tolerance: float = 0.1,
 ) -> Wings | None:
     """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
     from scipy.ndimage import uniform_filter
@@ -540,18 +550,18 @@ def _wings_beside(
     is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
     stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
-    for turn in steps("light beyond the stamps", range(8)):
+    for _ in steps("light beyond the stamps", range(8)):
         previous = wings
-        if turn:
+        if previous is not None:
             without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
-            residual = without_stars - sky_level(without_wings, bad, sky.steps).level
+            residual = without_stars - level_and_noise(without_wings, bad, sky.steps)[0]
         wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break
-        # Until their light changes by less than a tenth of its error.
+        # Until their light changes by less than a part of its error.
         light, light_sigma = wings.light()
-        if previous is not None and abs(light - previous.light()[0]) < 0.1 * light_sigma:
+        if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
             break
     return wings
 

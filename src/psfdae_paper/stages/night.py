@@ -134,7 +134,8 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
         starts: dict[str, PsfModel] = {}
         for name in from_most_usual(stars_by_name, sizes):
             try:
-                stars = stars_by_name[name]
+                # Its stars take memory: those of an image that is done are not needed any more.
+                stars = stars_by_name.pop(name)
                 # Stars that differ by more than 4 % in size show another field than a start has.
                 distance = {start: np.abs(sizes[start] - sizes[name]).max() for start in starts}
                 nearest = min(distance, key=distance.__getitem__, default="")
@@ -304,7 +305,9 @@ def measured(row: Mapping[str, object], stars: Stars, model: PsfModel, folder: P
 
     path = folder / str(row["name"])
     reference = Path(str(row["reference"])) if row.get("reference") else None
-    photometry = photometry_of_image(model, stars.source, reference=reference)
+    photometry = photometry_of_image(
+        model, stars.source, reference=reference, opened=stars.observation
+    )
     table = photometry.table
     write_table(path.with_name(f"{path.name}.fits"), table)
     validate(model, stars).save(path.with_name(f"{path.name}.html"))
