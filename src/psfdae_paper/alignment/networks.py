@@ -341,27 +341,18 @@ class PerceptronTraining(NetworkTraining):
 
     model: AlignmentPerceptron
 
-    def __init__(
-        self,
-        data: TrainingStates,
-        network: Perceptron,
-        settings: NetworkTrain,
-        seed: int,
-        name: str,
-    ) -> None:
-        super().__init__(data, network, settings, seed, name)
+    def fit_components(self) -> None:
+        """Fit the network's principal axes to the stamps; the training begins with this."""
         # 1500 states in all mirror images are enough to find the principal components.
-        rng = stream(seed, "cnn", "examples", name)
-        clean = self._draw_stamps(rng.permutation(len(data.states))[:1500], rng)
+        rng = stream(self.seed, "cnn", "examples", self.name)
+        clean = self._draw_stamps(rng.permutation(len(self.data.states))[:1500], rng)
         if self.mirrors:
             clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
         self.model.fit_components(scale_stamps(clean))
         # Variance 1 together with the noise: that of component k is (RᵀR)_kk, the mean over all λ.
-        if self.roots:
-            noise_variance = np.mean([np.square(root).sum(axis=0) for root in self.roots], axis=0)
-            factor = (1.0 + noise_variance) ** -0.5
-            self.model.axes *= torch.from_numpy(factor)
-            self.roots = [root * factor for root in self.roots]
+        noise_variance = [np.square(root).sum(axis=0) for root in self.roots] or [np.zeros(1)]
+        self.model.axes /= torch.from_numpy(np.sqrt(1.0 + np.mean(noise_variance, axis=0))).float()
+        del self.roots  # they are those of the axes before
 
     @cached_property
     def parts(self) -> np.ndarray:
@@ -450,4 +441,6 @@ def training_of(
     """
     if isinstance(network, Cnn):
         return NetworkTraining(data, network, settings, seed, name)
-    return PerceptronTraining(data, network, settings, seed, name)
+    training = PerceptronTraining(data, network, settings, seed, name)
+    training.fit_components()
+    return training
