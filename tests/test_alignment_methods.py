@@ -99,7 +99,7 @@ def _training(scene3, epochs, data, seed=3, network=CNN):
     settings = defaults.model_copy(
         update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
     )
-    return NetworkTraining(TrainingStates(states, stamps), network, settings, seed, "test")
+    return training_of(network, TrainingStates(states, stamps), settings, seed, "test")
 
 
 def _train(path, *arguments, report=lambda row: None):

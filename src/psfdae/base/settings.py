@@ -209,8 +209,6 @@ class Evaluation(Group):
 
     data_range: Positive = 0.66
     """SSIM dynamic range fitted to the paper's rows."""
-    batch: Count = 256
-    """Stars per forward pass."""
     threads: Count = 1
     """Threads of the linear algebra."""
 

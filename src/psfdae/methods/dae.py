@@ -41,8 +41,6 @@ class Dae(Method):
     network : DaeNetwork
     scale : "mean", "none" or float
         Of images for the network: as the setting, or the factor itself.
-    batch : int
-        Images per forward pass.
     attempt : int
         Starts of the training before the one that succeeded.
     history : list of dict
@@ -64,11 +62,10 @@ class Dae(Method):
         self,
         network: DaeNetwork,
         scale: Literal["mean", "none"] | float,
-        batch: int = 256,
         attempt: int = 0,
         history: list[dict[str, Any]] | None = None,
     ) -> None:
-        self.network, self.scale, self.batch, self.attempt = network, scale, batch, attempt
+        self.network, self.scale, self.attempt = network, scale, attempt
         self.diagnosed = {HISTORY: history or []}
 
     @classmethod
@@ -132,7 +129,7 @@ class Dae(Method):
         """PSFs, neither clipped nor renormalised, float32."""
         from psfdae.methods.networks.dae import run_network
 
-        return run_network(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
+        return run_network(self.network, noisy, self.factor(noisy.shape[-1]))
 
     def factor(self, stamp_px: int) -> float:
         """Return the factor from images of sum 1 to those that the network sees."""
@@ -159,7 +156,7 @@ class Dae(Method):
         from psfdae.methods.networks.dae import DaeNetwork
         from psfdae.methods.networks.weights import with_weights
 
-        described, batch = cls.described(place), 256
+        described = cls.described(place)
         # The shape of the network is in its configuration, its weights are beside it.
         settings = from_tree(
             place / CONFIG,
@@ -167,14 +164,13 @@ class Dae(Method):
             "dae",
             make=lambda tree: parse_settings(DaeSettings, tree),
         )
-        # Threads, and images at a time, change the speed alone.
+        # Threads change the speed alone.
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)
-            batch = evaluation.batch
         network = with_weights(
             lambda: DaeNetwork(settings.kernels, settings.widths), place / WEIGHTS
         )
-        return cls(network, settings.scale, batch)
+        return cls(network, settings.scale)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Weights, and the network's shape."""
@@ -191,7 +187,7 @@ class Dae(Method):
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Dae:
-        """The network of a bundle, which takes as many images at once as memory should hold."""
+        """The network of a bundle."""
         import torch
 
         from psfdae.methods.networks.dae import DaeNetwork
@@ -201,9 +197,7 @@ class Dae(Method):
         # Copies, because torch would share memory with arrays that may be read-only.
         network = DaeNetwork(info.dae.kernels, info.dae.widths)
         network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
-        # Numbers between two layers at most: those of 64 channels of 256 stamps of 32 x 32 px.
-        batch = max(1, 64 * 256 * 32**2 // (max(info.dae.widths) * info.stamp_px**2))
-        return cls(channels_last(network).eval(), float(info.image_scale), batch)
+        return cls(channels_last(network).eval(), float(info.image_scale))
 
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:

@@ -102,20 +102,18 @@ class AlignmentPerceptron(nn.Module):
         states: torch.Tensor = self.linear(self.features(components))
         return states
 
-    def fit_components(self, clean: torch.Tensor, noisy: torch.Tensor) -> None:
-        """Fit the principal axes to noise-free stamps.
+    def fit_components(self, clean: torch.Tensor) -> None:
+        """Fit the principal axes to stamps, whose components get variance 1.
 
         Parameters
         ----------
         clean : Tensor, shape (n, fields, d, d)
-            Scaled stamps without noise.
-        noisy : Tensor, shape (n, fields, d, d)
-            Scaled stamps as the network receives them, whose components get variance 1.
+            Scaled stamps without noise; their values are used up.
         """
         # Deviations from the mean stamps, all fields of a state in one row.
         flat = clean.flatten(1)
         self.mean.copy_(flat.mean(dim=0))
-        flat = flat - self.mean
+        flat -= self.mean
         count = self.axes.shape[1]
         # Leading eigenvectors of the covariance. In double precision: pixels that a DAE leaves
         # empty make the matrix singular.
@@ -123,9 +121,8 @@ class AlignmentPerceptron(nn.Module):
         leading = eigh(products, subset_by_index=[last + 1 - count, last], overwrite_a=True)[1]
         # The largest eigenvalues are last.
         axes = torch.from_numpy(leading[:, ::-1].astype(np.float32))
-        del flat, products  # the noisy stamps take as much memory
         # An axis divided by the standard deviation of its component gives it the variance 1.
-        spread = ((noisy.flatten(1) - self.mean) @ axes).std(dim=0)
+        spread = (flat @ axes).std(dim=0)
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
 
@@ -285,8 +282,6 @@ class NetworkTraining(Training):
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
         model = build_network(network, fields, side, generator)
-        if isinstance(model, AlignmentPerceptron):
-            model.fit_components(*self._examples())
         # A last batch of one state, with which batch normalisation could do nothing, is left out.
         full_batches, remainder = divmod(len(data.states), settings.batch)
         super().__init__(
@@ -326,18 +321,6 @@ class NetworkTraining(Training):
         draw = rng.integers(len(stamps), size=(numbers.size, fields.size))
         return np.asarray(stamps[draw, numbers[:, None], fields])
 
-    def _examples(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scaled stamps in all mirror images, without noise and as the network sees them."""
-        rng = stream(self.seed, "cnn", "examples", self.name)
-        # 1500 states are enough to find the principal components.
-        clean = self._draw_stamps(rng.permutation(len(self.data.states))[:1500], rng)
-        if self.mirrors:
-            clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
-        scaled = scale_stamps(clean)
-        if self.data.noise is None:
-            return scaled, scaled
-        return scaled, scale_stamps(self.data.with_noise(clean, rng))
-
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the mean squared error of a batch."""
         stamps, states = batch
@@ -357,6 +340,19 @@ class PerceptronTraining(NetworkTraining):
     """
 
     model: AlignmentPerceptron
+
+    def fit_components(self) -> None:
+        """Fit the network's principal axes to the stamps; the training begins with this."""
+        # 1500 states in all mirror images are enough to find the principal components.
+        rng = stream(self.seed, "cnn", "examples", self.name)
+        clean = self._draw_stamps(rng.permutation(len(self.data.states))[:1500], rng)
+        if self.mirrors:
+            clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
+        self.model.fit_components(scale_stamps(clean))
+        # Variance 1 together with the noise: that of component k is (RᵀR)_kk, the mean over all λ.
+        noise_variance = [np.square(root).sum(axis=0) for root in self.roots] or [np.zeros(1)]
+        self.model.axes /= torch.from_numpy(np.sqrt(1.0 + np.mean(noise_variance, axis=0))).float()
+        del self.roots  # they are those of the axes before
 
     @cached_property
     def parts(self) -> np.ndarray:
@@ -443,5 +439,8 @@ def training_of(
 
     Perceptrons learn from principal components, CNNs from stamps.
     """
-    kind = NetworkTraining if isinstance(network, Cnn) else PerceptronTraining
-    return kind(data, network, settings, seed, name)
+    if isinstance(network, Cnn):
+        return NetworkTraining(data, network, settings, seed, name)
+    training = PerceptronTraining(data, network, settings, seed, name)
+    training.fit_components()
+    return training

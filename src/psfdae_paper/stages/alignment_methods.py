@@ -343,7 +343,7 @@ def network_predictor(
     )
     # The field points are a centre and a circle of points; a mirror image permutes these.
     mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
-    return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
+    return partial(predict_states, model, mirrors=mirrors)
 
 
 @command("alignment estimate", reads=("seed", "noise", "evaluation"))

@@ -306,7 +306,7 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
 
 @torch.inference_mode()
 def run_network(
-    model: DaeNetwork, noisy: np.ndarray, factor: float, batch: int = 256
+    model: DaeNetwork, noisy: np.ndarray, factor: float, batch: int | None = None
 ) -> np.ndarray:
     """Estimate the PSFs of noisy star images.
 
@@ -318,15 +318,18 @@ def run_network(
         Flux-normalised images.
     factor : float
         Result of `image_scale`.
-    batch : int
-        Images per forward pass.
+    batch : int, optional
+        Images per forward pass; by default as many as make 2^18 numbers, or 1 MB, between two
+        layers, which stay in a core's cache.
 
     Returns
     -------
     ndarray, shape (n, d, d), float32
         PSFs of about sum 1, neither clipped nor renormalised.
     """
-    # In batches, which limits the memory of the channels between the layers.
+    # In batches, 64 images of 16 × 16 pixels with 16 channels: channels that leave the cache cost
+    # up to half of the time again (docs/benchmark.md).
+    batch = batch or max(1, 2**18 // (max(model.widths) * noisy.shape[-1] ** 2))
     model.eval()
     psf = np.empty(noisy.shape, dtype=np.float32)
     for start in range(0, len(noisy), batch):
