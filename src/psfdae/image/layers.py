@@ -203,9 +203,10 @@ def _sky(layers: Layers) -> Sky:
     with task("sky", 2) as advance, silent():
         bad_pixels = layers.find_bad(image, masked)
         advance(1, "bad pixels")
+        # A sky that was measured to find trails is used once: it takes much memory.
+        layers._bad_pixels[:] = [replace(bad_pixels, sky=None)]
         try:
-            measured = bad_pixels.sky
-            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, measured)
+            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, bad_pixels.sky)
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:

@@ -402,7 +402,9 @@ def wings_of(
     variance = np.square(sigma / unit_sigma)
     smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
     # A mean is not below the least value, but for the rounding of running sums.
-    smooth_sigma = unit_sigma * np.sqrt(np.maximum(smooth_variance, variance.min()))
+    np.maximum(smooth_variance, variance.min(), out=smooth_variance)
+    smooth_sigma = unit_sigma * np.sqrt(smooth_variance, out=smooth_variance)
+    del variance, smooth_variance
     # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
     # of A is (F s h_k, mean σ)/σ of a pixel, so that the even light is in units of the mean σ, and
     # d its residual over σ; the same in blocks of a stamp.
@@ -548,6 +550,7 @@ def _wings_beside(
     is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
     is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
+    del squares, mean_square, good_part  # of a large image, each map takes much memory
     stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
     for _ in steps("light beyond the stamps", range(8)):

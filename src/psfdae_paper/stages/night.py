@@ -276,8 +276,15 @@ def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
     from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
-    if start is None or np.count_nonzero(~stars.held_out) < MIN_STARS_WITH_ERROR:
-        return fit(stars, method="field")
+    training_stars = np.count_nonzero(~stars.held_out)
+    if start is None or training_stars < MIN_STARS_WITH_ERROR:
+        model = fit(stars, method="field")
+        # Where wavefronts grow with the square of the place, as Seidel aberrations do, second
+        # moments grow with its fourth power: a curved field gets order 4 at least, if there are two
+        # stars for each of its 15 terms. Few of the stars that chose the order are in the corners.
+        if 2 <= model.order < 4 and training_stars >= 30:
+            model = fit(stars, method="field", orders=[4, 6])
+        return model
     return adapted_to_stars(start, stars)
 
 
