@@ -249,8 +249,8 @@ def measured(config, folder):
             checkpoint_option = ["--checkpoint", folder / "fit.pt"]
             cost(rule_of(kind), ["fit", kind.name, *stars_option, *checkpoint_option], place)
             models += [f"--{kind.name.replace('_', '-')}", place]
-        per_star = ["--per-star", folder / "per_star.parquet"]
-        cost("evaluate", ["evaluate", *stars_option, *models, *per_star], folder / "summary.csv")
+        models += ["--per-star", folder / "per_star.parquet", "--restored", folder / "shown.h5"]
+        cost("evaluate", ["evaluate", *stars_option, *models], folder / "summary.csv")
         if i < SIMULATED:
             isolated(1, untrained_bundle, tree, stars, bundle)
             isolated(1, make_cube, tree, stars, count, cube)
