@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -47,8 +46,9 @@ def main(table: Path, side_px: int, bright: int, faint: int) -> None:
         # One thread; the job's processor time and peak of memory are those of the child.
         command = ["psfdae", "night", "images", "--rows", rows, "--folder", folder / "images"]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        subprocess.run([*command, "--out", folder / "out.csv"], env=environment, check=True)
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        job = subprocess.Popen([*command, "--out", folder / "out.csv"], env=environment)
+        _, status, used = os.wait4(job.pid, 0)
+        assert status == 0
         night = pd.read_csv(folder / "out.csv")
         row = {"side_px": side_px, "stars": night.stars.median(), "images": len(night)}
         row |= {"bright_stars": night.bright_stars.median(), "started": night.start.count()}
