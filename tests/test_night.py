@@ -216,12 +216,16 @@ def test_wrong_statement_is_the_reason(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.workflow
-def test_killed_and_typed_again_gives_the_same_files(folder, tmp_path):
-    """The start of an image depends on the list, not on what was finished before."""
+def test_killed_and_typed_again_gives_the_same_files(folder, truth, tmp_path):
+    """The start of an image depends on the list, not on what was finished before.
+
+    One image of each job tells the state of the telescope, whose focus runs away.
+    """
     products = []
     for is_killed in (False, True):
         place = copy_of_sources(tmp_path / str(is_killed))
         words = ["snakemake", "night", "--cores", "2", "--config", f"images={folder}/exp*.fits"]
+        words += [f"telescope={folder}/telescope.yaml"]
         options = {"cwd": place, "env": environment(SOURCE_DATE_EPOCH="0")}
         if is_killed:
             run = subprocess.Popen(words, **options, **QUIET)
@@ -236,3 +240,9 @@ def test_killed_and_typed_again_gives_the_same_files(folder, tmp_path):
         products.append({str(p.relative_to(place)): p.read_bytes() for p in files})
     assert products[0] == products[1]
     assert (tmp_path / "True/results/mlflow/night.csv").is_file()
+    defocus = "telescope_z4.constant_wave"
+    states = read_table(place / "results/night/night.csv", "image", defocus).dropna(subset=defocus)
+    states = states.merge(truth, on="image")
+    assert len(states) == 2
+    pull = (states[defocus] - states[f"true_{defocus}"]) / states[f"{defocus}_error"]
+    assert np.abs(pull).max() < 4.0

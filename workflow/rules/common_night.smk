@@ -13,11 +13,15 @@ def night_parts():
             "psfdae: night: --config images='night/*.fits', or a CSV list of images"
         )
     # Only a night needs this module, and every job reads this file.
+    from psfdae.telescope.settings import read_telescope
     from psfdae_paper.stages.night import NightError, listed_images
 
     try:
         rows = listed_images(config["images"])
-    except (NightError, ProductError) as error:
+        if config["telescope"]:
+            read_telescope(Path(config["telescope"]))  # a wrong key stops before any job
+            rows = [{"telescope_file": config["telescope"], **row} for row in rows]
+    except (NightError, ProductError, ConfigError) as error:
         sys.exit(f"psfdae: {error}")
     return [
         rows[start : start + IMAGES_PER_JOB]
@@ -37,6 +41,6 @@ def night_rows(part):
 
 def night_files(part):
     """Files of the images of a job; one that is missing is a row with a reason."""
-    columns = ("image", "catalogue", "mask", "reference")
+    columns = ("image", "catalogue", "mask", "reference", "telescope_file")
     files = [row.get(c) for row in night_parts()[int(part)] for c in columns]
     return [file for file in dict.fromkeys(files) if file and os.path.isfile(file)]

@@ -80,8 +80,8 @@ def wavefront_command(
     check_targets((*source.files(), telescope), out, plot, list_path, overwrite=overwrite)
     optics = read_telescope(telescope)
     observation = source.open(stamp_px)
-    _check_scale(observation, optics)
-    field_deg = _field_angles(observation, source.catalogue, optics, axis)
+    check_scale(observation, optics)
+    field_deg = field_angles(observation, source.catalogue, optics, axis)
     # All stars are one piece: the joint fit takes them together.
     stamps = next(observation.chunks(observation.count))
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
@@ -132,7 +132,7 @@ def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     return [] if note is None else [note]
 
 
-def _check_scale(observation: Observation, telescope: OwnTelescope) -> None:
+def check_scale(observation: Observation, telescope: OwnTelescope) -> None:
     """Refuse an image with pixels of another scale than the telescope's.
 
     Raises
@@ -151,7 +151,7 @@ def _check_scale(observation: Observation, telescope: OwnTelescope) -> None:
         )
 
 
-def _field_angles(
+def field_angles(
     observation: Observation,
     catalogue: StarList | None,
     telescope: OwnTelescope,

@@ -6,7 +6,7 @@ for each, figures of size and shape of the PSF against time, and an HTML page.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -65,16 +65,42 @@ def with_verdicts(night: DataFrame) -> DataFrame:
     return night
 
 
+def times_of(night: DataFrame) -> tuple[Any, str]:
+    """Return the time of each image, or its number where times are missing, and their label."""
+    import pandas as pd
+
+    time = pd.to_datetime(night.time, errors="coerce", format="ISO8601")
+    if time.notna().sum() == night.fwhm_px_centre.notna().sum():
+        return time, "time (UT)"
+    return night.index, "number of the image"
+
+
+@styled
+def telescope_figure(night: DataFrame, names: Sequence[str]) -> Figure:
+    """Draw numbers of the telescope, columns of the night's table, with their errors against time.
+
+    The columns with the errors have `_error` at the end of their names.
+    """
+    figure = new_figure(0.4 + 0.8 * len(names), layout="constrained")
+    panels: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    x, label_of_x = times_of(night)
+    is_measured = night[names[0]].notna()
+    for axes, name in zip(panels, names, strict=True):
+        columns = night[name][is_measured], night[f"{name}_error"][is_measured]
+        axes.errorbar(x[is_measured], *columns, fmt=".-", ms=4, lw=0.7, color="black")
+        # Name of the number above its unit.
+        axes.set_ylabel("\n".join(name.removeprefix("telescope_").rsplit("_", 1)))
+        axes.grid(True)
+    panels[-1].set_xlabel(label_of_x)
+    return figure
+
+
 @styled
 def night_figure(night: DataFrame) -> Figure:
     """Draw FWHM and ellipticity at five places, and the brightness of stars, against time."""
-    import pandas as pd
-
     figure = new_figure(6.5, layout="constrained")
     panels: Any = figure.subplots(3, 1, sharex=True)
-    # Images without a time are drawn by their number.
-    time = pd.to_datetime(night.time, errors="coerce", format="ISO8601")
-    x = time if time.notna().sum() == night.fwhm_px_centre.notna().sum() else night.index
+    x, label_of_x = times_of(night)
     for axes, column, label in (
         (panels[0], "fwhm_px", "FWHM (px)"),
         (panels[1], "ellipticity", "ellipticity"),
@@ -90,7 +116,7 @@ def night_figure(night: DataFrame) -> Figure:
             axes.set_ylim(low - 0.2 * (high - low), high + 0.4 * (high - low))
     panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
     panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")
-    panels[2].set_xlabel("time (UT)" if x is time else "number of the image")
+    panels[2].set_xlabel(label_of_x)
     for row in night.index[night.verdict == "poor"]:
         for axes in panels:
             axes.axvline(x[row], color=SERIES_COLORS[5], lw=0.8, ls=":")
@@ -135,6 +161,11 @@ def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) ->
         strip = [StripRow(label, stamps, own_scale=True) for label, stamps in psfs.items()]
         figures = image_tag(night_figure(night))
         figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
+    # Where the optics are known: the state of the telescope.
+    columns = map(str, night.filter(regex="^telescope_"))
+    names = [column for column in columns if f"{column}_error" in night]
+    if names and night[names[0]].notna().any():
+        figures += image_tag(telescope_figure(night, names))
     counts = ", ".join(f"{(night.verdict == verdict).sum()} {verdict}" for verdict in VERDICTS)
     template = Path(__file__).with_name("night.html").read_text(encoding="utf-8")
     return Template(template).substitute(

@@ -142,6 +142,9 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
                 start = starts[nearest] if nearest and distance[nearest] < 0.04 else None
                 model = model_of_image(stars, start)
                 results[name] |= measured(results[name], stars, model, folder)
+                # Where the optics are known, one image of each job tells the telescope's state.
+                if not starts and (telescope := results[name].get("telescope_file")):
+                    results[name] |= telescope_state(stars, Path(str(telescope)))
                 results[name]["start"] = nearest if model.info.adapted else ""
                 starts |= {} if model.info.adapted else {name: model}
             except Exception as error:
@@ -286,6 +289,46 @@ def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
             model = fit(stars, method="field", orders=[4, 6])
         return model
     return adapted_to_stars(start, stars)
+
+
+def telescope_state(stars: Stars, telescope: Path) -> Row:
+    """Return the numbers of a telescope that explain the brightest stars of an image, and errors.
+
+    Parameters
+    ----------
+    stars : Stars
+    telescope : Path
+        YAML file of the telescope, as `psfdae wavefront` takes it.
+
+    Returns
+    -------
+    dict
+        Values and errors by names such as `telescope_z4.constant_wave` and
+        `telescope_z4.constant_wave_error`; empty if no wavefronts explain the stars.
+    """
+    from psfdae.commands.wavefront import check_scale, field_angles
+    from psfdae.sensing.results import wavefront
+    from psfdae.sensing.stars import SensingError
+    from psfdae.telescope.settings import read_telescope
+
+    optics = read_telescope(telescope)
+    # Thirty stars tell ten numbers, and take some seconds.
+    bright = stars.candidates.bright.row
+    brightest = bright[np.argsort(-stars.candidates.snr[bright])[:30]]
+    observation = stars.observation.with_margin(0).select(brightest)
+    try:
+        check_scale(observation, optics)
+        angle_deg = field_angles(observation, None, optics, None)
+        stamps = next(observation.chunks(observation.count))
+        state = wavefront(stamps, optics, field_deg=angle_deg, joint=True).joint
+    except SensingError as error:
+        print(f"{telescope}: {error}", flush=True)
+        return {}
+    assert state is not None  # a joint fit was asked for
+    row: Row = {}
+    for name, unit, value, sigma in state.table.iterrows("name", "unit", "value", "error"):
+        row |= {f"telescope_{name}_{unit}": value, f"telescope_{name}_{unit}_error": sigma}
+    return row
 
 
 def measured(row: Mapping[str, object], stars: Stars, model: PsfModel, folder: Path) -> Row:

@@ -18,12 +18,14 @@ from psfdae.base.errors import Error
 from psfdae.base.figures import write_png
 from psfdae.base.files import (
     Product,
+    as_yaml,
     atomic_path,
     check_outputs,
     read_product,
     write_bytes,
     write_csv,
     write_fits,
+    write_text,
 )
 from psfdae.base.options import File, Folder
 from psfdae.base.rng import stream
@@ -45,7 +47,12 @@ from psfdae_paper.stars.example import (
 )
 from psfdae_paper.stars.example import example_field as simulate_field
 from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux, without_margin
-from psfdae_paper.stars.nights import NightRecipe, reference_stars, simulated_night
+from psfdae_paper.stars.nights import (
+    NightRecipe,
+    reference_stars,
+    simulated_night,
+    telescope_of,
+)
 from psfdae_paper.stars.scenes import template_wavefronts
 
 if TYPE_CHECKING:
@@ -431,14 +438,14 @@ def example_night(
 
     truth.csv has a row for each image: what is wrong with it, and FWHM and ellipticity of its PSF
     in the middle and in the corners, without clouds or trail. reference.csv has the stars with
-    their magnitudes. The same seed gives the same images.
+    their magnitudes, telescope.yaml the telescope. The same seed gives the same images.
 
     Parameters
     ----------
     seed : int
         Seed of stars, noise and faults.
     out : Path
-        Folder for images, truth.csv and reference.csv.
+        Folder for images, truth.csv, reference.csv and telescope.yaml.
     exposures : int
         Images.
     """
@@ -447,6 +454,7 @@ def example_night(
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = reference_stars(recipe, seed)
     write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
+    write_text(out / "telescope.yaml", as_yaml(telescope_of(recipe.field)))
     rows: list[dict[str, object]] = []
     for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"

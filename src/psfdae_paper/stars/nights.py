@@ -107,6 +107,46 @@ def shapes_at_places(
     }
 
 
+def telescope_of(recipe: FieldRecipe) -> dict[str, object]:
+    """Return the telescope of an exposure in focus, as a file of config/telescope describes it.
+
+    Seidel terms are sums of Zernike terms: with Noll's normalisation, ρ² = Z4/(2√3) + …,
+    ρ⁴ = Z11/(6√5) + Z4/(2√3) + …, ρ³ cos θ = Z8/(3√8) + …, and ρ² cos 2θ = Z6/√6; pistons and
+    tilts are left out. The field vector is 1 at the middle of an edge of the image.
+    """
+    spherical, coma, astigmatism, curvature, _ = recipe.seidel
+    # A pixel of 1 rad on the sky would be 1/(λ/D) λ/D wide.
+    wavelength_m, pixel_rad = 6.0e-7, np.deg2rad(recipe.pixel_scale_arcsec / 3600.0)
+    field_squared = float((curvature + 0.5 * astigmatism) / np.sqrt(12.0))
+    along_axes = float(0.5 * astigmatism / np.sqrt(6.0))
+    linear = float(coma / (3.0 * np.sqrt(8.0)))
+    terms = {
+        "z4": {
+            "constant": float(spherical / np.sqrt(12.0)),
+            "xx": field_squared,
+            "yy": field_squared,
+        },
+        "z5": {"xy": 2.0 * along_axes},
+        "z6": {"xx": along_axes, "yy": -along_axes},
+        "z7": {"y": linear},
+        "z8": {"x": linear},
+        "z11": {"constant": float(spherical / (6.0 * np.sqrt(5.0)))},
+    }
+    seeing_arcsec = recipe.seeing_px * recipe.pixel_scale_arcsec
+    return {
+        "name": "example_night",
+        "diameter_m": float(recipe.pixel * wavelength_m / pixel_rad),
+        "obscuration": 0.35,
+        "wavelength_m": wavelength_m,
+        "pixel_scale_arcsec": recipe.pixel_scale_arcsec,
+        "field_edge_deg": 0.5 * recipe.side_px * recipe.pixel_scale_arcsec / 3600.0,
+        "aberrations": {"kind": "zernike", "terms": terms},
+        "seeing": {"kind": "moffat", "fwhm_arcsec": seeing_arcsec, "beta": 3.0},
+        # The focus may run away by as much, and seeing changes.
+        "prior": {"waves": 0.1, "seeing": 0.2},
+    }
+
+
 def reference_stars(recipe: NightRecipe, seed: int) -> Table:
     """Return the stars of the night's two fields.
 
@@ -194,4 +234,7 @@ def simulated_night(
         }
         cards |= {"SATURATE": float(optics.saturation), **wcs.to_header()}
         truth = shapes_at_places(partial(star_images, optics), shape, "true_")
+        # Defocus W020 ρ² of the drift, and that of the telescope in focus, as Zernike term.
+        w020 = optics.seidel[0] + optics.defocus_waves
+        truth["true_telescope_z4.constant_wave"] = float(w020 / np.sqrt(12.0))
         yield expose(optics, starlight, rng), cards, {"fault": fault, **truth}
