@@ -19,9 +19,8 @@ def night_parts():
     try:
         rows = listed_images(config["images"])
         if config["telescope"]:
-            read_telescope(
-                Path(config["telescope"])
-            )  # a wrong key stops before any job
+            # A wrong key stops before any job.
+            read_telescope(Path(config["telescope"]))
             rows = [{"telescope_file": config["telescope"], **row} for row in rows]
     except (NightError, ProductError, ConfigError) as error:
         sys.exit(f"psfdae: {error}")
