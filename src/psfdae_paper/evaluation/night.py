@@ -92,6 +92,7 @@ def telescope_figure(night: DataFrame, names: Sequence[str]) -> Figure:
         axes.set_ylabel("\n".join(name.removeprefix("telescope_").rsplit("_", 1)))
         axes.grid(True)
     panels[-1].set_xlabel(label_of_x)
+    figure.suptitle("The telescope, as one image of each job shows it")
     return figure
 
 
