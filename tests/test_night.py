@@ -16,10 +16,12 @@ from psfdae_paper.evaluation.night import LIMITS, night_page, with_verdicts
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,
     NightError,
+    bright_stars,
     listed_images,
     night_count,
     night_images,
     night_table,
+    telescope_state,
     write_night_page,
 )
 from psfdae_paper.stages.simulate import example_night
@@ -212,6 +214,22 @@ def test_wrong_statement_is_the_reason(tmp_path):
     rows.write_text("image,gain,name,reason\na.fits,much,a,\n")
     night_images(rows, tmp_path / "images", tmp_path / "part.csv")
     assert "gain = much" in read_table(tmp_path / "part.csv", "reason").reason[0]
+
+
+def test_a_wrong_telescope_makes_no_image_bad(folder, similar_exposures, tmp_path):
+    """The page says why the state of the telescope is not known, and draws it where it is."""
+    coarse_camera, text = tmp_path / "coarse.yaml", (folder / "telescope.yaml").read_text()
+    coarse_camera.write_text(text.replace("pixel_scale_arcsec: 1.2", "pixel_scale_arcsec: 2.4"))
+    stars = bright_stars({"image": similar_exposures.image.iloc[0]})
+    rows = [telescope_state(stars, path) for path in (coarse_camera, tmp_path / "none.yaml")]
+    assert "pixels of 1.2 arcsec" in rows[0]["telescope_reason"]
+    assert "none.yaml" in rows[1]["telescope_reason"]
+    measured = {"telescope_z4_wave": 0.1, "telescope_z4_wave_error": 0.01, "time": ""}
+    shapes = {f"{quantity}_{p}": 2.0 for p in PLACES for quantity in ("fwhm_px", "ellipticity")}
+    names = {"name": "a", "reason": "", "mag_20th": -9.0, "bright_stars": 9, **shapes}
+    night = with_verdicts(pd.DataFrame([{**names, **rows[0]}, {**names, **measured}]))
+    page = night_page(night, {}, "images")
+    assert page.count("<img") == 1 and "pixels of 1.2 arcsec" in page
 
 
 @pytest.mark.slow

@@ -115,8 +115,8 @@ def image_tag(picture: Figure | bytes) -> str:
     from PIL import Image
 
     content = picture if isinstance(picture, bytes) else as_png(picture, dpi=110)
-    # A palette of 256 colours takes 0.4 of the bytes of full colour; dithering would make even
-    # areas noisy.
+    # A palette of 256 colours takes less than half of the bytes of full colour; dithering would
+    # make even areas noisy.
     palette, dither = Image.Quantize.MEDIANCUT, Image.Dither.NONE
     image = Image.open(BytesIO(content)).convert("RGB").quantize(256, palette, dither=dither)
     image.save(small := BytesIO(), "PNG")

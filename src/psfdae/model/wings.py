@@ -258,10 +258,9 @@ def star_tents(
     stars: StarFluxes,
     wings: Wings,
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield windows about the brightest stars, and F s h_k there, shape (K, …).
+    """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
 
-    They are the stars that have 99.5 % of the light of all wings, at most 1000. A window is of
-    rows, counted from `rows.start`, and columns; the image is `width` px wide.
+    A window is of rows, counted from `rows.start`, and columns; the image is `width` px wide.
     """
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
@@ -272,8 +271,6 @@ def star_tents(
     # In a crowded image, the thousand brightest stars have most of the light of all wings.
     lit_stars = np.flatnonzero(is_lit)
     brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
-    light = np.cumsum(scaled_flux[brightest])
-    brightest = brightest[: int(np.searchsorted(light, 0.995 * light[-1:].sum())) + 1]
     # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
     middle = np.rint(stars.place[brightest]).astype(int)
     first = np.maximum(middle - reach, [0, rows.start])

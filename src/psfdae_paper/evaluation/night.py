@@ -162,11 +162,13 @@ def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) ->
         strip = [StripRow(label, stamps, own_scale=True) for label, stamps in psfs.items()]
         figures = image_tag(night_figure(night))
         figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
-    # Where the optics are known: the state of the telescope.
-    columns = map(str, night.filter(regex="^telescope_"))
-    names = [column for column in columns if f"{column}_error" in night]
-    if names and night[names[0]].notna().any():
+    # Where the optics are known: the state of the telescope, or why it is not.
+    state = night.filter(regex="^telescope_")
+    names = [str(column) for column in state if f"{column}_error" in state]
+    if names:
         figures += image_tag(telescope_figure(night, names))
+    for reason in state.get("telescope_reason", night.reason[:0]).dropna().unique():
+        figures += f"<p>State of the telescope: {escape(reason)}</p>"
     counts = ", ".join(f"{(night.verdict == verdict).sum()} {verdict}" for verdict in VERDICTS)
     template = Path(__file__).with_name("night.html").read_text(encoding="utf-8")
     return Template(template).substitute(

@@ -304,26 +304,25 @@ def telescope_state(stars: Stars, telescope: Path) -> Row:
     -------
     dict
         Values and errors by names such as `telescope_z4.constant_wave` and
-        `telescope_z4.constant_wave_error`; empty if no wavefronts explain the stars.
+        `telescope_z4.constant_wave_error`; or `telescope_reason`, why they cannot be measured.
     """
     from psfdae.commands.wavefront import check_scale, field_angles
     from psfdae.sensing.results import wavefront
-    from psfdae.sensing.stars import SensingError
     from psfdae.telescope.settings import read_telescope
 
-    optics = read_telescope(telescope)
     # Thirty stars tell ten numbers, and take some seconds.
     bright = stars.candidates.bright.row
     brightest = bright[np.argsort(-stars.candidates.snr[bright])[:30]]
     observation = stars.observation.with_margin(0).select(brightest)
+    # A telescope that cannot be used makes no image bad.
     try:
+        optics = read_telescope(telescope)
         check_scale(observation, optics)
         angle_deg = field_angles(observation, None, optics, None)
         stamps = next(observation.chunks(observation.count))
         state = wavefront(stamps, optics, field_deg=angle_deg, joint=True).joint
-    except SensingError as error:
-        print(f"{telescope}: {error}", flush=True)
-        return {}
+    except Error as error:
+        return {"telescope_reason": str(error)}
     assert state is not None  # a joint fit was asked for
     row: Row = {}
     for name, unit, value, sigma in state.table.iterrows("name", "unit", "value", "error"):

@@ -327,8 +327,8 @@ def run_network(
     ndarray, shape (n, d, d), float32
         PSFs of about sum 1, neither clipped nor renormalised.
     """
-    # In batches, 64 images of 16 × 16 pixels with 16 channels: channels that leave the cache cost
-    # up to half of the time again (docs/benchmark.md).
+    # In batches, 64 images of 16 × 16 pixels with 16 channels: those of a thousand, whose channels
+    # leave the cache, take up to twice the time (docs/benchmark.md).
     batch = batch or max(1, 2**18 // (max(model.widths) * noisy.shape[-1] ** 2))
     model.eval()
     psf = np.empty(noisy.shape, dtype=np.float32)
