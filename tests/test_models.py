@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -24,7 +26,7 @@ from psfdae.methods.networks.dae import (
     build_dae,
 )
 from psfdae.methods.networks.settings import DaeSettings, Train
-from psfdae.methods.networks.training import DeadNetworkError, TrainingError, orthogonal
+from psfdae.methods.networks.training import Adam, DeadNetworkError, TrainingError, orthogonal
 from psfdae.methods.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae_paper.methods import pca_som
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
@@ -335,6 +337,66 @@ def test_errors_of_faint_stars_count_less_by_a_power_of_their_noise(data):
     errors = ((training.model(noisy) - target) ** 2).mean(dim=(1, 2, 3))
     mean_error = (errors * weight.ravel()).mean().item()
     assert training.loss((noisy, target, weight), 1).item() == pytest.approx(mean_error, rel=1e-5)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_adam_without_the_compiler_is_torchs(fused):
+    start = torch.randn(5, 3, generator=torch.Generator().manual_seed(1))
+    weights = {kind: torch.nn.Parameter(start.clone()) for kind in (Adam, torch.optim.Adam)}
+    for kind, weight in weights.items():
+        optimiser = kind([weight], lr=0.1, fused=fused)
+        for _ in range(5):
+            optimiser.zero_grad()
+            weight.pow(4).sum().backward()
+            optimiser.step()
+    assert torch.equal(*weights.values())
+    assert (weights[Adam] - start).abs().max() > 0.1
+
+
+def test_trainings_do_not_import_torchs_compiler():
+    code = (
+        "import sys, torch; from psfdae.methods.networks.training import Muon;"
+        "weight = torch.nn.Parameter(torch.eye(2));"
+        "optimiser = Muon([{'params': [weight], 'orthogonal': True}], lr=0.1);"
+        "weight.sum().backward(); optimiser.step(); optimiser.zero_grad();"
+        "optimiser.load_state_dict(optimiser.state_dict());"
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_half_precision_rounds_all_layers_but_the_last(monkeypatch):
+    network = build_dae([3, 1, 3], [4, 4], "he", torch.Generator().manual_seed(1))
+    images = torch.rand(2, 1, 8, 8, generator=torch.Generator().manual_seed(2))
+    expected = network(images)
+    # A processor without instructions for it computes as always.
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
+    with loop.half_precision():
+        assert torch.equal(network(images), expected)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    with loop.half_precision(False):
+        assert torch.equal(network(images), expected)
+    with loop.half_precision():
+        rounded = network(images)
+    # Eight bits err by 2^-9, and more where terms cancel; the result itself has all its digits.
+    assert rounded.dtype == torch.float32 and not torch.equal(rounded, rounded.bfloat16().float())
+    error = (rounded - expected).abs().max() / expected.max()
+    assert 1e-4 < error < 2e-2
+    # The gradient has the precision of the weights.
+    rounded.sum().backward()
+    assert {weight.grad.dtype for weight in network.parameters()} == {torch.float32}
+
+
+def test_second_half_of_the_epochs_has_half_precision(data, monkeypatch):
+    halves = []
+    half_precision = loop.half_precision
+    monkeypatch.setattr(
+        loop, "half_precision", lambda half: (halves.append(half), half_precision(False))[1]
+    )
+    training = DaeTraining(data, DAE, TRAIN.model_copy(update={"epochs": 4}), 3, 0)
+    while not training.finished():
+        training.run_epoch()
+    assert halves == [False] * 2 * training.steps + [True] * 2 * training.steps
 
 
 def test_steps_of_muon_are_along_orthogonal_matrices():

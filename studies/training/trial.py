@@ -7,7 +7,8 @@ configuration, as for the workflow, or of the schedule of the learning rate: cou
 rises and falls; linear in use) and peak=0.15 (part of the steps before the peak; 0.3 in use). Or
 sides=8,8,16,16:12,16 says the side in pixels of the stamps' middle that each epoch sees, of the
 realisations and, after the colon, of the templates (else the same); there are as many epochs as
-sides. A side is as even or odd as the stamps'.
+sides. A side is as even or odd as the stamps'. half=all or half=none lets all epochs or none
+compute with half precision, not those of the second half.
 """
 
 from __future__ import annotations
@@ -52,13 +53,21 @@ def with_sides(text):
     ]
 
 
+def with_half_precision(epochs):
+    """Let all epochs of a training, or none, compute with half precision."""
+    half_precision, enabled = training.half_precision, {"all": True, "none": False}[epochs]
+    training.half_precision = lambda _: half_precision(enabled)
+
+
 def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: str) -> None:
     """Train with every seed, measure, append."""
     words = dict(word.split("=", 1) for word in settings)
     keys = {"course": ("anneal_strategy", str), "peak": ("pct_start", float)}
     with_schedule(**{keys[k][0]: keys[k][1](v) for k, v in words.items() if k in keys})
-    overrides = [f"{k}={v}" for k, v in words.items() if k not in {*keys, "sides"}]
+    overrides = [f"{k}={v}" for k, v in words.items() if k not in {*keys, "sides", "half"}]
     overrides += with_sides(words["sides"]) if "sides" in words else []
+    if "half" in words:
+        with_half_precision(words["half"])
     config = load([f"dataset={dataset}", *overrides])
     references = config.dataset.references
     product = read_product(Path(stars), "stars", ("field_index", "grid", *references))

@@ -215,6 +215,8 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
     TrainingStates
         States without noise, with stamps of shape (draws, n, F, d, d).
     """
+    from psfdae.methods.networks.training import half_precision
+
     assert data.noise is not None
     # A stream of the network's name: all draws of one network are different.
     rng = stream(config.seed, "cnn", "noise", kind)
@@ -227,7 +229,8 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
         for start in range(0, len(level), 1000):
             part = slice(start, start + 1000)
             noisy = data.noise.draw(data.stamps[part], level[part], rng)
-            draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
+            with half_precision():  # what it rounds is far below the noise
+                draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
     return replace(data, stamps=denoised, noise=None)
 
 

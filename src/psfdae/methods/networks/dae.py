@@ -18,7 +18,14 @@ from torch.nn.grad import conv2d_weight
 
 from psfdae.base.rng import stream
 from psfdae.methods.interface import TrainingSet
-from psfdae.methods.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError
+from psfdae.methods.networks.training import (
+    Adam,
+    DeadNetworkError,
+    Muon,
+    Row,
+    Training,
+    TrainingError,
+)
 from psfdae.methods.networks.weights import channels_last
 
 if TYPE_CHECKING:
@@ -37,7 +44,9 @@ class SingleChannelConv(nn.Conv2d):
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        output: torch.Tensor = _ToOneChannel.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
+        # Always float32: the result is the PSF, of which bfloat16 would round each pixel by 0.2 %.
+        with torch.autocast("cpu", enabled=False):
+            output: torch.Tensor = _ToOneChannel.apply(x.float(), self.weight, self.bias)  # type: ignore[no-untyped-call]
         return output
 
 
@@ -408,7 +417,7 @@ class DaeTraining(Training):
         hidden layers, not for the first and the last layer (K. Jordan et al. 2024).
         """
         if self.settings.optimiser == "adam":
-            return torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
+            return Adam(self.model.parameters(), lr=lr, fused=True)
         matrices = [layer.weight for layer in self.model.convolutions[1:-1]]
         # By identity, as "in" would compare the values of tensors.
         by_adam = [p for p in self.model.parameters() if all(p is not w for w in matrices)]
