@@ -137,8 +137,8 @@ def half_precision(enabled: bool = True) -> torch.autocast:
     """Return a context in which convolutions and products of matrices take bfloat16 numbers.
 
     These have the range of float32 and 8 significant bits; weights stay float32, and sums are
-    float32. Processors that have instructions for them (AVX-512 BF16) need about half of the time;
-    with others, or if it is not enabled, the context changes nothing.
+    float32. Processors that have instructions for them (AVX-512 BF16) need less time; with others,
+    or if it is not enabled, the context changes nothing.
     """
     # torch before 2.12 says nothing about the processor.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
@@ -283,8 +283,8 @@ class Training(ABC):
 
     def take_step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
         """Make a step of the optimiser with a batch, and return the loss before it."""
-        # With half precision from the first epoch on, errors of bright stars grow by 1 to 2 %, but
-        # not if the last epochs alone have it (studies/training).
+        # With half precision from the first epoch on, errors grow by up to 2 %, but not if the last
+        # epochs alone have it (studies/training).
         with half_precision(2 * len(self.history) >= self.settings.epochs):
             loss = self.loss(batch, step)
         value = self._finite("loss", loss, step)
