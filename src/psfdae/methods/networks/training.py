@@ -140,7 +140,7 @@ def half_precision(enabled: bool = True) -> torch.autocast:
     float32. Processors that have instructions for them (AVX-512 BF16) need less time; with others,
     or if it is not enabled, the context changes nothing.
     """
-    # torch before 2.12 says nothing about the processor.
+    # Older versions of torch say nothing about the processor.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     supported = bool(capabilities.get("avx512_bf16"))
     return torch.autocast("cpu", torch.bfloat16, enabled=enabled and supported)
