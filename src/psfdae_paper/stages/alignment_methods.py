@@ -229,7 +229,8 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
         for start in range(0, len(level), 1000):
             part = slice(start, start + 1000)
             noisy = data.noise.draw(data.stamps[part], level[part], rng)
-            with half_precision():  # what it rounds is far below the noise
+            # States that a network estimates from them err as before (studies/training).
+            with half_precision():
                 draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
     return replace(data, stamps=denoised, noise=None)
 

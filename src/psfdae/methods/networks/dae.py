@@ -44,7 +44,7 @@ class SingleChannelConv(nn.Conv2d):
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        # Always float32: the result is the PSF, of which bfloat16 would round each pixel by 0.2 %.
+        # Always float32: the result is the PSF, of which bfloat16 rounds pixels by up to 0.2 %.
         with torch.autocast("cpu", enabled=False):
             output: torch.Tensor = _ToOneChannel.apply(x.float(), self.weight, self.bias)  # type: ignore[no-untyped-call]
         return output
