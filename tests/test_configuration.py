@@ -16,7 +16,7 @@ from psfdae.methods.networks.settings import DaeSettings, Train
 from psfdae.methods.networks.training import fingerprint
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
-from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.consistency import SIMULATION, simulation_changes
 from workflow_runs import captured
 
 DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {"alignment"})
@@ -25,6 +25,35 @@ DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {"
 def settings_of(dataset):
     """A dataset in the default preset, composed once for all tests of this file."""
     return load((f"dataset={dataset}",))
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("telescope=wfsat_literal", "telescope.name"),
+        ("telescope.obscuration=0.2", "telescope.obscuration"),
+        ("grid.points=7", "grid.points"),
+        ("wavefront.coma=3", "wavefront.coma"),
+        ("framing.jitter_px=0", "framing.jitter_px"),
+        ("optics.pupil_samples=[256]", "optics.pupil_samples"),
+        ("stars.aberration_fraction=0.3", "stars.aberration_fraction"),
+        ("seed=5", "seed"),
+    ],
+)
+def test_a_dataset_with_another_simulation_than_its_stars_is_named(override, key):
+    """Datasets share the stars of a file: a change in a dataset alone would have no effect."""
+    changes = simulation_changes(
+        compose.compose(("dataset=dataset3", override)), compose.compose(("stars=seidel_10pct",))
+    )
+    assert key in [name for name, *_ in changes]
+    assert all(name.startswith(key.split(".")[0]) for name, *_ in changes)
+
+
+@pytest.mark.parametrize("dataset", sorted({*DATASETS} - {"from_stars"}))
+def test_datasets_have_the_simulation_of_their_stars(dataset):
+    tree = compose.compose((f"dataset={dataset}",))
+    if tree["scene"]["name"] != "telescope":  # a telescope's stars are those of one dataset
+        assert not simulation_changes(tree, compose.compose((f"stars={tree['stars']['name']}",)))
 
 
 @pytest.mark.parametrize("dataset", DATASETS)

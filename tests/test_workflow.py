@@ -232,6 +232,18 @@ def test_wrong_config_stops_before_any_job(tmp_path, options, key):
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow
+def test_a_dataset_that_changes_its_shared_telescope_stops_before_any_job(tree, tmp_path):
+    text = (tree / "config/dataset/dataset3.yaml").read_text(encoding="utf-8")
+    text = text.replace("name: dataset3", "name: dataset9").replace(
+        "dataset:", "telescope:\n  obscuration: 0.1\n\ndataset:"
+    )
+    (tree / "config/dataset/dataset9.yaml").write_text(text, encoding="utf-8")
+    out = snakemake(tmp_path, "dataset9", root=tree, check=False)
+    assert "dataset=dataset9: telescope.obscuration = 0.1, but its stars are those of" in out
+    assert not (tmp_path / "results").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -28,6 +28,7 @@ from psfdae_paper.configuration.compose import (
     part,
     write_settings,
 )
+from psfdae_paper.configuration.consistency import simulation_changes
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
@@ -204,7 +205,8 @@ def templates_of(stars):
 def stars_of(dataset):
     """Stars of a dataset: those of a file of config/stars, or of its own telescope.
 
-    A file of stars serves several datasets, so that a dataset that changes them is refused.
+    A file of stars serves several datasets, and decides all that is simulated: a dataset that changes
+    a group of it would get the stars of the others, and is refused.
     """
     tree = dataset_config(dataset)
     name = tree.stars.name
@@ -216,14 +218,15 @@ def stars_of(dataset):
             raise ConfigError(
                 f"dataset={dataset}: stars.name = {name}: no {file}; {advice}"
             )
-        stars_of_file = composed(f"stars={name}")["stars"]
-        for key, value in composed(f"dataset={dataset}")["stars"].items():
-            if value != stars_of_file.get(key):
-                raise ConfigError(
-                    f"dataset={dataset}: stars.{key} = {value}, but its stars are those of {file} "
-                    f"with {stars_of_file.get(key)}; {advice}, which a dataset chooses by "
-                    "'override /stars: NAME' among its defaults"
-                )
+        changes = simulation_changes(
+            composed(f"dataset={dataset}"), composed(f"stars={name}")
+        )
+        for key, value, simulated_value in changes:
+            raise ConfigError(
+                f"dataset={dataset}: {key} = {value}, but its stars are those of {file} with "
+                f"{simulated_value}; {advice} and this setting, which a dataset chooses by "
+                "'override /stars: NAME' among its defaults"
+            )
     return f"{RESULTS}/data/{tree.scene.name}/{name}.h5"
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict, ValidationError, create_model, model_validator
 
-from psfdae.base.settings import Group
+from psfdae.base.settings import Group, leaves
 from psfdae.telescope.settings import Telescope, has_own_aberrations
 from psfdae_paper.configuration.base import search_distance
 
@@ -178,6 +178,34 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
             intervals = max(points - 1, 1) if isinstance(points, int) else 2
             grid["spacing_deg"] = 2.0 * edge / intervals
     return derived
+
+
+def simulation_changes(
+    dataset: Mapping[str, Any], stars: Mapping[str, Any]
+) -> list[tuple[str, object, object]]:
+    """Return the simulation settings in which a dataset differs from the file of its stars.
+
+    The stars are simulated once, from their own file, for all datasets that choose them.
+
+    Parameters
+    ----------
+    dataset, stars : mapping
+        Composed configurations of the dataset and of the file in `config/stars`.
+
+    Returns
+    -------
+    list of (str, object, object)
+        Dotted key, its value in the dataset and in the file of the stars (None if it is absent).
+    """
+    values, simulated_values = (
+        dict(leaves({group: tree[group] for group in SIMULATION if group in tree}))
+        for tree in (dataset, stars)
+    )
+    return [
+        (key, values.get(key), simulated_values.get(key))
+        for key in dict.fromkeys([*values, *simulated_values])
+        if values.get(key) != simulated_values.get(key)
+    ]
 
 
 @cache
