@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import io
 import itertools
@@ -16,6 +17,7 @@ from contextlib import suppress
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 
 from command_line import psfdae, refused
@@ -23,11 +25,16 @@ from psfdae.base import progress
 from psfdae.base.files import (
     Column,
     ProductError,
+    as_csv,
     atomic_path,
     read_product,
+    write_columns,
+    write_csv,
+    write_parquet,
     write_product,
     write_text,
 )
+from psfdae.base.reading import read_table
 from psfdae.commands.cli import as_click, command_modules, stage
 from psfdae.commands.terminal import bar, bar_or_lines
 
@@ -99,6 +106,51 @@ def test_a_full_disk_is_named_with_the_file_that_has_no_space(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert refusal.value.filename == str(tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
+
+
+FORMULAE = ("=1+1", "+a", "-a", "@a", "\ta", "a\n=1", "a\r=1", "\r=1")
+
+
+@pytest.mark.parametrize("write_rows", ["frame", "columns", "rows"])
+def test_no_cell_of_a_csv_is_a_formula(tmp_path, write_rows):
+    """Neither a name of a column nor a text; psfdae reads what was there before."""
+    texts = [*FORMULAE, "-1.5", "a=1", "'a"]
+    columns, path = {"=x": texts, "y": [-1.5] * len(texts)}, tmp_path / "a.csv"
+    if write_rows == "frame":
+        write_csv(path, pd.DataFrame(columns))
+    elif write_rows == "columns":
+        write_columns(path, columns)
+    else:
+        names, rows = [*columns], zip(*columns.values(), strict=True)
+        write_text(path, as_csv([dict(zip(names, row, strict=True)) for row in rows]))
+    with path.open(newline="") as file:
+        cells = {cell for row in csv.reader(file) for cell in row}
+    assert {cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))} == {"-1.5"}
+    table = read_table(path, "=x", "y")
+    # A carriage return, which ends a row to many readers, is a blank.
+    assert table["=x"].tolist() == [text.replace("\r", " ") for text in texts]
+    assert table["y"].tolist() == columns["y"]
+
+
+def test_flipped_bytes_of_a_parquet_file_are_found(tmp_path):
+    """Those of its pages have a checksum; a flip in the names at its end changes no value."""
+    rng, path = np.random.default_rng(1), tmp_path / "a.parquet"
+    table = pd.DataFrame(rng.random((9000, 4)), columns=["a", "b", "c", "d"])
+    table["name"] = [f"star {number % 70}" for number in range(len(table))]
+    write_parquet(path, table)
+    whole, found = path.read_bytes(), 0
+    for position in np.linspace(0, len(whole) - 1, 30).astype(int):
+        content = bytearray(whole)
+        content[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+        try:
+            changed = read_table(path)
+        except ProductError as error:
+            assert "a.parquet: damaged" in str(error)
+            found += 1
+        else:
+            assert (changed.to_numpy() == table.to_numpy()).all()
+    assert found >= 27
 
 
 def test_the_manifest_of_a_run_shows_which_files_have_changed(tmp_path):

@@ -1,18 +1,24 @@
 """A night of a telescope: the simulated example, and the tables and pages made of many images."""
 
+import csv
 import signal
 import subprocess
 import time
+from html import escape
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 
+from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae_paper.evaluation.night import LIMITS, night_page, with_verdicts
+from psfdae.model import psf_model
+from psfdae_paper.evaluation.night import LIMITS, night_page, read_night, with_verdicts
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,
     NightError,
@@ -26,6 +32,7 @@ from psfdae_paper.stages.night import (
 )
 from psfdae_paper.stages.simulate import example_night
 from psfdae_paper.stars.nights import PLACES
+from psfdae_paper.tracking import runs_of_night
 from workflow_runs import QUIET, captured, copy_of_sources, environment
 
 
@@ -230,6 +237,67 @@ def test_a_wrong_telescope_makes_no_image_bad(folder, similar_exposures, tmp_pat
     night = with_verdicts(pd.DataFrame([{**names, **rows[0]}, {**names, **measured}]))
     page = night_page(night, {}, "images")
     assert page.count("<img") == 1 and "pixels of 1.2 arcsec" in page
+
+
+NAMES = ["001", "1e5", "NA", "nan", "True", "0x10", "-x", "=2+3", "+1", "@a", "a$b$c", "$", "<b>"]
+
+
+def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch):
+    """From the table of a part to the page and the tracked runs; no cell is a formula."""
+    shapes = {f"{quantity}_{p}": 2.0 for p in PLACES for quantity in ("fwhm_px", "ellipticity")}
+    measurements = {**shapes, "mag_20th": -9.0, "bright_stars": 9, "time": "", "start": "1e5"}
+    of_list = {"filter": "NA", "serial": "007", "chip": "1e2", "@note": "=1+1", "celsius": "-3.5"}
+    rows = [
+        {"image": f"{name}.fits", "name": name, "reason": "", **measurements, **of_list}
+        for name in NAMES
+    ]
+    # Sizes differ, so that the best, the median and the worst image are not the same ones.
+    for number, row in enumerate(rows):
+        row["fwhm_px_centre"] += 0.01 * (5 * number % len(NAMES))
+        row["ellipticity_centre"] -= 0.01
+    parts = [tmp_path / "1.csv", tmp_path / "2.csv"]
+    write_csv(parts[0], pd.DataFrame(rows[:4]))
+    write_csv(parts[1], pd.DataFrame(rows[4:]))
+    out = tmp_path / "night/night.csv"
+    night_table(tuple(parts), out)
+    night = read_night(out)
+    assert [*night.name] == NAMES and [*night.image] == [row["image"] for row in rows]
+    assert [*Table.read(out.with_suffix(".ecsv"))["name"]] == NAMES
+    for column, value in {**of_list, "celsius": -3.5, "start": "1e5", "reason": ""}.items():
+        assert (night[column] == value).all(), column
+    with out.open(newline="") as file:
+        cells = {cell for row in csv.reader(file) for cell in row}
+    assert "'=2+3" in cells and "'@note" in cells
+    assert {c for c in cells if c.startswith(("=", "+", "-", "@"))} <= {"+1", "-3.5", "-9"}
+    # The page opens the models of the best, the median and the worst image by their names.
+    opened = []
+
+    def load(path):
+        opened.append(path.name.removesuffix(".psf.safetensors"))
+        return SimpleNamespace(image_px=(300, 200), on_pixels=lambda _: np.ones((5, 8, 8)))
+
+    monkeypatch.setattr(psf_model, "load_model", load)
+    write_night_page(out, tmp_path / "images", tmp_path / "night.html")
+    by_size = sorted(rows, key=lambda row: row["fwhm_px_centre"])
+    middle = by_size[len(rows) // 2]
+    assert opened == [by_size[0]["name"], middle["name"], by_size[-1]["name"]]
+    page = (tmp_path / "night.html").read_text()
+    assert all(f'{escape(name)}.html">{escape(name)}</a>' in page for name in NAMES)
+    for name in NAMES:
+        write_text(tmp_path / f"night/images/{name}.psf.safetensors", "")
+    assert [run.name for run in runs_of_night(tmp_path)] == NAMES
+
+
+@pytest.mark.parametrize("name", ["a$b$c", "$x^$", "one $", r"\$\frac$", "$$", "100 %", "_^{"])
+def test_names_are_drawn_as_they_are(name):
+    """Dollars would be formulae to matplotlib, and wrong ones would end the page."""
+    night = table_of(12, fwhm_px_centre=(5, 9.0))
+    shapes = {f"{quantity}_{p}": night.fwhm_px_centre for p in PLACES for quantity in ("fwhm_px",)}
+    shapes |= {f"ellipticity_{p}": night.ellipticity_centre for p in PLACES}
+    night = with_verdicts(night.assign(**shapes, name=name, bright_stars=9, time=""))
+    night["telescope_a$_wave"] = night["telescope_a$_wave_error"] = 0.1
+    psfs = dict.fromkeys([f"best\n{name}", f"worst\n{name}"], np.ones((5, 8, 8)))
+    assert night_page(night, psfs, "images").count("<img") == 3
 
 
 @pytest.mark.slow

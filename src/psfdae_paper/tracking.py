@@ -31,6 +31,7 @@ from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_network
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered
+from psfdae_paper.evaluation.night import read_night
 from psfdae_paper.sweeps.points import hash_of
 
 if TYPE_CHECKING:
@@ -353,14 +354,14 @@ def runs_of_night(results: Path) -> list[TrackedRun]:
     ProductError
         If the table of the night or a model is missing.
     """
-    night = read_table(results / "night/night.csv", "image", "name", "verdict")
+    night = read_night(results / "night/night.csv", "image", "name", "verdict")
     runs = []
     for row in night[night.verdict != "failed"].to_dict("records"):
         name = str(row["name"])
         source = f"night/images/{name}{SUFFIX}"
         # All numbers of the row are metrics, and the texts tags.
         numbers = {str(k): float(v) for k, v in row.items() if isinstance(v, int | float)}
-        texts = {str(k): v for k, v in row.items() if isinstance(v, str)}
+        texts = {str(k): v for k, v in row.items() if isinstance(v, str) and v}
         runs.append(
             TrackedRun(
                 kind="field",

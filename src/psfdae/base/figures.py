@@ -52,12 +52,22 @@ def in_style() -> AbstractContextManager[None]:
 
 
 def styled(draw: Drawing) -> Drawing:
-    """Decorate a function that draws a figure, so that it uses the style of all figures."""
+    """Decorate a function that draws a figure, so that it uses the style of all figures.
+
+    Its texts are drawn as they are: a name with dollars is not a formula.
+    """
 
     @wraps(draw)
     def wrapped(*args: Any, **kwargs: Any) -> Figure:
+        from matplotlib.text import Text
+
         with in_style():
-            return draw(*args, **kwargs)
+            figure = draw(*args, **kwargs)
+        # Formulae are numbers at ticks, such as 10⁻³, which matplotlib writes when it draws.
+        for text in figure.findobj(Text):
+            if text.get_text():
+                text.set_parse_math(False)
+        return figure
 
     return wrapped
 

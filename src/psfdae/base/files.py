@@ -13,9 +13,11 @@ import io
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,41 @@ if TYPE_CHECKING:
 
 class ProductError(Error, RuntimeError):
     """Error of a data product that is missing, damaged, or not what the stage expects."""
+
+
+_unnamed: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("unnamed", default=None)
+"""Whole temporary files and their paths inside `renamed_together`; None outside of it."""
+
+
+@contextmanager
+def renamed_together(main: Path) -> Iterator[None]:
+    """Give the files of a block their names at its end, `main` last; if it fails, write none.
+
+    A command with several outputs is inside it. If `main` exists, all outputs are whole. If the
+    process is killed between two renames, the temporary file of `main` is left, which `is_cut_off`
+    finds, so that the same command may replace the other outputs.
+
+    Parameters
+    ----------
+    main : Path
+        The output whose existence means that everything is done.
+    """
+    unnamed: list[tuple[Path, Path]] = []
+    token = _unnamed.set(unnamed)
+    try:
+        yield
+        # Each file is on the disk already: the renames need no space.
+        for temporary, path in sorted(unnamed, key=lambda pair: pair[1] == main):
+            temporary.replace(path)
+    finally:
+        _unnamed.reset(token)
+        for temporary, _ in unnamed:
+            temporary.unlink(missing_ok=True)
+
+
+def is_cut_off(main: Path) -> bool:
+    """Return whether a command was killed before its output `main`, and so all, had its name."""
+    return not main.exists() and any(main.parent.glob(f".{escape(main.name[:40])}.????????.tmp"))
 
 
 @contextmanager
@@ -57,7 +94,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     OSError
         If the system cannot write; the error names `path`.
     """
-    path = Path(path)
+    path, unnamed = Path(path), _unnamed.get()
     path.parent.mkdir(parents=True, exist_ok=True)
     # A name has at most 255 bytes, and a character up to four of them.
     temporary = path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}.tmp")
@@ -67,14 +104,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         # The content is on the disk before it has its name, in case that the power fails between.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        temporary.replace(path)
+        if unnamed is None:
+            temporary.replace(path)
+        else:
+            unnamed.append((temporary, path))
     except OSError as error:
         # Libraries leave out which file a full disk has no space for, or name the temporary one.
         if error.errno is not None and error.filename in (None, temporary, str(temporary)):
             error.filename = str(path)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if (temporary, path) not in (unnamed or ()):
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -89,8 +130,48 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+def no_formula(cell: Any) -> Any:
+    """Return a text with an apostrophe before it if a spreadsheet would execute it.
+
+    Spreadsheets execute cells that begin with = + - @, a tab or a carriage return. Numbers such as
+    -1.5, in texts or not, stay as they are. A carriage return, with which a row ends, is a blank.
+    """
+    if not isinstance(cell, str):
+        return cell
+    cell = cell.replace("\r", " ") if "\r" in cell else cell
+    if not cell.startswith(("=", "+", "-", "@", "\t")):
+        return cell
+    try:
+        float(cell)  # numbers stay
+    except ValueError:
+        return "'" + cell
+    return cell
+
+
+def without_apostrophe(cell: Any) -> Any:
+    """Return the cell that `no_formula` has changed; any other one stays."""
+    is_changed = isinstance(cell, str) and cell[:1] == "'" and no_formula(cell[1:]) == cell
+    return cell[1:] if is_changed else cell
+
+
+def map_texts(table: DataFrame, change: Callable[[Any], Any]) -> DataFrame:
+    """Return the table with a function applied to its texts and the names of its columns."""
+    table = table.copy(deep=False)
+    for name in [name for name in table if table[name].dtype.kind == "O"]:
+        values = table[name].tolist()
+        changed = [*map(change, values)]
+        # A column of which nothing changes keeps its type.
+        if any(new is not old for new, old in zip(changed, values, strict=True)):
+            table[name] = changed
+    return table.rename(columns=change)
+
+
 def write_csv(path: str | Path, table: DataFrame, digits: int = 8) -> None:
-    """Write a DataFrame as CSV with so many significant digits of a number, atomically."""
+    """Write a DataFrame as CSV with so many significant digits of a number, atomically.
+
+    No text is a formula to a spreadsheet; `psfdae.base.reading.read_table` undoes this.
+    """
+    table = map_texts(table, no_formula)
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
 
 
@@ -114,11 +195,8 @@ def write_columns(
         return "" if np.isnan(value) else f"{value:.{digits}g}"
 
     # One row after the other, below the row of the names.
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(map(cell, row) for row in zip(*columns.values(), strict=True))
-    write_text(path, text.getvalue())
+    rows = (map(cell, row) for row in zip(*columns.values(), strict=True))
+    write_text(path, _csv_text([columns, *rows]))
 
 
 def write_parquet(path: str | Path, table: DataFrame) -> None:
@@ -129,11 +207,15 @@ def write_parquet(path: str | Path, table: DataFrame) -> None:
 
 
 def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows with equal keys as CSV, the numbers with all digits."""
+    """Return rows with equal keys as CSV, the numbers with all digits, no text a formula."""
+    names = [*rows[0]] if rows else []
+    return _csv_text([names, *([row[name] for name in names] for row in rows)])
+
+
+def _csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Return rows of cells as CSV, the first of them the names of the columns."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0] if rows else ()), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(no_formula, row) for row in rows)
     return text.getvalue()
 
 
@@ -225,7 +307,7 @@ def stream_product(
     """
     import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, _SafeFile(temporary) as disk, h5py.File(disk, "w") as file:
         # What the file is: no time of writing, so that equal products are equal bytes.
         file.attrs["kind"] = kind
         file.attrs["psfdae_version"] = __version__
@@ -240,6 +322,45 @@ def stream_product(
             filled_rows = data.id.get_num_chunks() * data.chunks[0]
             if isinstance(columns[name], Empty) and filled_rows < data.shape[0]:
                 raise ProductError(f"{path}: array {name!r} was not filled to its end")
+
+
+class _SafeFile(io.FileIO):
+    """File for HDF5 to write to, which raises an error of the disk when it is closed.
+
+    HDF5 2.0 ends the process by a segmentation fault if it cannot write what it has in memory. So
+    it never learns of an error: what follows is thrown away.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self.error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        """Write all bytes, or none after an error."""
+        rest = memoryview(content).cast("B")
+        size = len(rest)
+        # The system may write fewer bytes than it is given, the last time before an error.
+        while self.error is None and rest:
+            rest = rest[self._call(super().write, rest) :]
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the size of the file, or do nothing after an error."""
+        return self._call(super().truncate, size)
+
+    def _call(self, change: Callable[[Any], int], value: Any) -> int:
+        """Return what a method of the file returns, 0 after an error, which is kept."""
+        try:
+            return change(value) if self.error is None else 0
+        except OSError as error:
+            self.error = error
+            return 0
+
+    def __exit__(self, *details: object) -> None:
+        """Close the file; raise the first error in place of those of HDF5 that follow from it."""
+        super().__exit__(*details)  # type: ignore[arg-type]
+        if self.error is not None:
+            raise self.error
 
 
 def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[str]:

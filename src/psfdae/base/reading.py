@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from psfdae.base.errors import no_such_file
-from psfdae.base.files import ProductError
+from psfdae.base.files import ProductError, map_texts, without_apostrophe
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -138,7 +138,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
-    """Read a CSV file as a DataFrame.
+    """Read a CSV or Parquet file as a DataFrame; texts are as they were before `no_formula`.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     *columns : str
         Names of columns that it must have.
     **options
-        Options of `pandas.read_csv`.
+        Options of `pandas.read_csv`, or `pandas.read_parquet` if the name ends in .parquet.
 
     Raises
     ------
@@ -157,10 +157,14 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
 
     # pandas raises ValueError for cells that are not of the type that is asked for.
     try:
-        table: DataFrame = pd.read_csv(path, **options)
+        if path.suffix == ".parquet":
+            # pyarrow verifies the checksums of pages only if it is asked to.
+            table = pd.read_parquet(path, page_checksum_verification=True, **options)
+        else:
+            table = map_texts(pd.read_csv(path, **options), without_apostrophe)
     except FileNotFoundError:
         raise ProductError(no_such_file(path)) from None
-    except (ValueError, pd.errors.ParserError, RecursionError) as error:
+    except (OSError, ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
     # Columns beyond those that are asked for are allowed.

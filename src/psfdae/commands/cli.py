@@ -121,10 +121,8 @@ def refusal(error: Exception) -> str | None:
         return missing(error, "this command")
     if isinstance(error, Error):
         return str(error)
-    # HDF5 reports a full disk, and torch a lack of memory, as a RuntimeError that only its text
-    # distinguishes from others.
-    is_refusal = re.search("errno = |not enough memory", str(error))
-    return " ".join(str(error).split()) if is_refusal else None
+    # torch reports a lack of memory as a RuntimeError that only its text distinguishes from others.
+    return " ".join(str(error).split()) if "not enough memory" in str(error) else None
 
 
 class Commands(Careful):

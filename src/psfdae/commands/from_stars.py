@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae.base.errors import Error
 from psfdae.base.files import (
-    atomic_path,
     check_outputs,
+    is_cut_off,
+    renamed_together,
     write_bytes,
     write_columns,
     write_product,
@@ -294,6 +295,8 @@ def reserved_folder(
     lists = [files.star_list(source.name) for source in sources if source.detect]
     inputs = [path for source in sources for path in source.files()]
     check_outputs([*files.paths(), *lists, page], inputs)
+    # A run that was killed after it named some of its outputs may be repeated.
+    overwrite = overwrite or is_cut_off(files.bundle)
     if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     # Models are looked for under the lock, so that no other process writes one meanwhile.
@@ -380,15 +383,14 @@ def write_model(
         print(f"{model_method.look.title}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
-    # The bundle gets its name when the stack is left, after all others: a bundle that exists
-    # means that everything is done.
-    with ExitStack() as stack:
-        model.save(stack.enter_context(atomic_path(files.bundle)))
+    # The bundle gets its name after all others: if it exists, everything is done.
+    with renamed_together(files.bundle):
+        model.save(files.bundle)
         # The field of each exposure, by its own stars.
         exposure_models = for_exposures(model, stars)
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]
-            exposure_model.save(stack.enter_context(atomic_path(files.bundle_of(exposure.name))))
+            exposure_model.save(files.bundle_of(exposure.name))
             change = (
                 "get the model of all" if exposure_model is model else "change the field of all"
             )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from psfdae.base.files import write_fits
+from psfdae.base.files import renamed_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
@@ -57,12 +57,13 @@ def photometry_command(
         raise PhotometryError(f"{out}: expected a name that ends in {', '.join(SUFFIXES)}")
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), reference, model), out, residual, overwrite=overwrite)
-    # Measure all stars, and write the table and the residual image.
+    # Measure all stars, and write the table and the residual image, both or none.
     photometry = photometry_of_image(
         load_field(model), source, zero_point, reference, magnitude_column
     )
-    write_table(out, photometry.table)
-    if residual is not None:
-        write_fits(residual, photometry.residual.to_hdu()[0])
+    with renamed_together(out):
+        write_table(out, photometry.table)
+        if residual is not None:
+            write_fits(residual, photometry.residual.to_hdu()[0])
     count = np.count_nonzero(np.isfinite(photometry.table["flux"]))
     print(f"{out}: {len(photometry.table)} stars, {count} measured", *photometry.notes, sep="\n")

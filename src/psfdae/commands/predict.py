@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import atomic_path, check_outputs
+from psfdae.base.files import atomic_path, check_outputs, is_cut_off, renamed_together
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
@@ -110,7 +110,7 @@ def predict_command(
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
         # The FITS file gets its name last: if it exists, everything is done.
-        with atomic_path(out) as unfinished:
+        with renamed_together(out), atomic_path(out) as unfinished:
             flag_counts, unflagged, list_note = write_prediction(
                 loaded, source, observation, unfinished, threads, fixed_positions
             )
@@ -121,7 +121,8 @@ def predict_command(
 
                 write_png(map_of_file(unfinished), plot)
     except OSError as error:
-        raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
+        name = error.filename or out
+        raise PredictionError(f"{name}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
     lines = [observation.summary(), list_note, *notes_on_model(loaded, observation)]
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
@@ -156,7 +157,7 @@ def bundle_of_image(model: Path | None, name: str) -> Path | None:
 def check_targets(
     inputs: Sequence[object], out: Path, *other_outputs: Path | None, overwrite: bool
 ) -> None:
-    """Refuse outputs that exist, unless `overwrite` is set.
+    """Refuse outputs that exist, unless `overwrite` is set or they are of this command, killed.
 
     Parameters
     ----------
@@ -174,6 +175,7 @@ def check_targets(
     # An output is neither an input nor another output, and replaces nothing without a word.
     targets = [out, *filter(None, other_outputs)]
     check_outputs(targets, inputs)
+    overwrite = overwrite or is_cut_off(out)
     for target in targets:
         if target.is_dir():
             raise PredictionError(f"{target}: is a folder, not a file")

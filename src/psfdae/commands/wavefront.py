@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import write_fits
+from psfdae.base.files import renamed_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
@@ -86,14 +86,15 @@ def wavefront_command(
     stamps = next(observation.chunks(observation.count))
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
     lines = [observation.summary(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
-    if list_path is not None:
-        write_list(observation, list_path)
-    if plot is not None:
-        from psfdae.sensing.plot import wavefront_map
+    # The FITS file gets its name last: if it exists, everything is done.
+    with renamed_together(out):
+        if list_path is not None:
+            write_list(observation, list_path)
+        if plot is not None:
+            from psfdae.sensing.plot import wavefront_map
 
-        write_png(wavefront_map(wavefronts, f"{source.path.name}: {optics.name}"), plot)
-    # The FITS file is written last: if it exists, everything is done.
-    write_fits(out, wavefront_hdus(wavefronts, source.path.name))
+            write_png(wavefront_map(wavefronts, f"{source.path.name}: {optics.name}"), plot)
+        write_fits(out, wavefront_hdus(wavefronts, source.path.name))
     # Many stars that no wavefront explains mean that the description of the telescope is wrong.
     count, unexplained = len(wavefronts.stamps), int((~wavefronts.explained).sum())
     summary = (

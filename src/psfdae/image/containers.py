@@ -241,5 +241,5 @@ def _temporary_fits(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
     content = io.BytesIO()
     with reading(name):
         hdus().writeto(content, output_verify="silentfix+ignore")
-    content.seek(0)
-    return temporary_file(name, content)
+        content.seek(0)
+        return temporary_file(name, content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import warnings
 from collections.abc import Iterator
@@ -24,21 +25,6 @@ def one_line(text: object) -> str:
 def ascii_line(text: object) -> str:
     """Return a text in the characters that FITS headers hold, others as question marks."""
     return one_line(text).encode("ascii", "replace").decode()
-
-
-def no_formula(text: str) -> str:
-    """Return the text, with an apostrophe before it if a spreadsheet would execute it.
-
-    Spreadsheets execute cells that begin with = + - @, a tab or a carriage return. Numbers such as
-    -1.5 stay as they are.
-    """
-    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
-        return text
-    try:
-        float(text)  # numbers stay
-    except ValueError:
-        return "'" + text
-    return text
 
 
 def shorten(names: list[str], length_max: int = 20) -> str:
@@ -84,6 +70,15 @@ def silent() -> Iterator[None]:
             log.setLevel(level)
 
 
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the errors of a disk, of a user's share of it, and of a file without more space."""
+
+
+def _no_space(error: OSError) -> str:
+    """Return why no temporary copy of an image can be written."""
+    return f"no temporary copy of it ({error.strerror}): set TMPDIR to a folder with more space"
+
+
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
     """Silence libraries while they read a file, and turn what they raise about it into one error.
@@ -102,7 +97,10 @@ def reading(path: str | Path) -> Iterator[None]:
         # Refusals of our own pass; those of the operating system get plain words.
         except ObservationError:
             raise
-        except FileNotFoundError:
+        except FileNotFoundError as error:
+            # Python names no file if every folder for temporary files is full.
+            if error.filename is None:
+                raise ObservationError(path, _no_space(error)) from None
             reason = no_such_file(Path(path)).removeprefix(f"{path}: ")
             raise ObservationError(path, reason) from None
         except IsADirectoryError:
@@ -112,6 +110,9 @@ def reading(path: str | Path) -> Iterator[None]:
         except MemoryError:
             raise ObservationError(path, "does not fit into memory") from None
         except Exception as error:
+            # Only the copy of a packed image is written while it is read.
+            if isinstance(error, OSError) and error.errno in NO_SPACE:
+                raise ObservationError(path, _no_space(error)) from None
             # A missing package and an undefined name are no property of a file. Neither is a wrong
             # type, attribute, index or assertion in a line of psfdae's own; libraries raise these
             # on damaged files, in their own lines.

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.base.files import atomic_path
+from psfdae.base.files import no_formula, write_bytes
 from psfdae.image.containers import fits_unit
-from psfdae.image.errors import ascii_line, no_formula, silent
+from psfdae.image.errors import ascii_line, silent
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU
@@ -244,24 +245,28 @@ def write_table(path: Path, table: QTable) -> None:
     from astropy.table import Table
 
     plain = Table(table)  # columns with units in place of quantities
-    with atomic_path(path) as temporary, silent():
+    # Into memory first: astropy does not name the file for which a disk has no space.
+    content, text = io.BytesIO(), io.StringIO()
+    with silent():
         if path.suffix.lower() == ".fits":
             # A table is an extension behind an empty primary one.
             hdus = fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")])
-            hdus.writeto(temporary, overwrite=True)
+            hdus.writeto(content)
         elif path.suffix.lower() == ".ecsv":
-            plain.write(temporary, format="ascii.ecsv", overwrite=True)
+            plain.write(text, format="ascii.ecsv")
         else:
             # Texts of a list, in bytes or not, may begin like a formula.
             plain.convert_bytestring_to_unicode()
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
+            plain.rename_columns(plain.colnames, [*map(no_formula, plain.colnames)])
             # Formats are those of the columns; numbers that are missing are written as such.
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
                     plain[column.name] = column.filled(np.nan)
             empty = [(text_tables.masked, "")]
-            plain.write(temporary, format="ascii.csv", fill_values=empty, overwrite=True)
+            plain.write(text, format="ascii.csv", fill_values=empty)
+    write_bytes(path, content.getvalue() or text.getvalue().encode())
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

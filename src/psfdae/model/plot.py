@@ -154,7 +154,7 @@ def psf_map(
         both_axes = [stamp_axes, whisker_axes]
         bar = figure.colorbar(whiskers, ax=both_axes, location="bottom", shrink=0.6, aspect=40)
         bar.set_label("FWHM of the PSF (px)")
-    figure.suptitle(f"{image_name}: {len(usable)} of {len(stars['x'])} stars", parse_math=False)
+    figure.suptitle(f"{image_name}: {len(usable)} of {len(stars['x'])} stars")
     return figure
 
 

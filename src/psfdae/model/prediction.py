@@ -22,7 +22,6 @@ from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from psfdae.base.files import atomic_path
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
@@ -273,11 +272,12 @@ class PredictionFile:
 def prediction_file(
     path: Path, bundle: Bundle, example: Prediction, count: int, cards: Sequence[Card], history: str
 ) -> Iterator[PredictionFile]:
-    """Open a `PredictionFile` for so many stars that gets its name if the block succeeds.
+    """Open a `PredictionFile` for so many stars.
 
     Parameters
     ----------
     path : Path
+        Temporary file, as `atomic_path` makes it.
     bundle : Bundle
         Model of the predictions.
     example : Prediction
@@ -314,5 +314,5 @@ def prediction_file(
             header[key] = (text, ascii_line(comment))
         header["HISTORY"] = ascii_line(history)
         primary = header.tostring().encode("ascii")
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with path.open("wb") as file:
         yield PredictionFile(file, primary, example, count)

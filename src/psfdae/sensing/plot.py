@@ -85,7 +85,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
         if len(stars):
             figure.colorbar(mappable, ax=panel, location="bottom", shrink=0.8, label=unit)
     axes[0].set_ylabel("y (deg)")
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(title)
     return figure
 
 

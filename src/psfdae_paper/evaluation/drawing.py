@@ -137,7 +137,8 @@ def noise_axis(axes: Axes, levels: np.ndarray) -> None:
     # Rounding must not make log10(1e-3) less than −3.
     power = int(np.floor(np.log10(levels.min()) + 1e-9))
     log_axis(axes, levels, [f"{level / 10.0**power:g}" for level in levels])
-    axes.set_xlabel(rf"noise level λ ($\times 10^{{{power}}}$)")
+    exponent = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    axes.set_xlabel(f"noise level λ (× 10{exponent})")
 
 
 def log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:

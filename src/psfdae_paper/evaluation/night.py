@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.base.figures import SERIES_COLORS, StripRow, new_figure, restoration_strip, styled
+from psfdae.base.files import ProductError
+from psfdae.base.reading import read_table
 from psfdae.image.tables import html_table
 from psfdae.model.report import image_tag
 from psfdae.stars.moments import SIGMA_OF_MAD
@@ -26,6 +28,20 @@ if TYPE_CHECKING:
 
 VERDICTS = ("good", "poor", "failed")
 """Good images, those with a model that are unlike their neighbours in time, those without one."""
+
+TEXT_COLUMNS = {"image", "name", "reason", "verdict", "start", "time"}
+"""Columns of the table of a night that are texts, whatever they look like."""
+
+TABLE_COLUMNS = {
+    *(TEXT_COLUMNS - {"image"}),
+    *("airmass", "order", "bright_stars", "stars", "flagged", "mag_20th"),
+    *("zero_point", "zero_point_scatter", "chi2"),
+    *(f"{quantity}_{place}" for quantity in ("fwhm_px", "ellipticity") for place in PLACES),
+}
+"""Columns that the table of a night has; one of a list with such a name gets `_list` at its end."""
+
+PLAIN_NUMBER = r"(-?(0|[1-9][0-9]*)(\.[0-9]+)?)?"
+"""Cells of a list's column of numbers; 007, 1e5 and NA are names."""
 
 LIMITS = {
     "fwhm_px_centre": (
@@ -63,6 +79,38 @@ def with_verdicts(night: DataFrame) -> DataFrame:
             reasons = [night.loc[row, "reason"], sentence.format(**words)]
             night.loc[row, ["verdict", "reason"]] = "poor", "; ".join(filter(None, reasons))
     return night
+
+
+def read_night(path: Path, *columns: str) -> DataFrame:
+    """Return the table of a night, or of a part of it, with names as texts.
+
+    Parameters
+    ----------
+    path : Path
+        CSV file.
+    *columns : str
+        Names of columns that it must have.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing or damaged, or lacks a column.
+    """
+    import pandas as pd
+
+    # Measurements, and columns of the list that are nothing but numbers, become numbers.
+    table = read_table(path, *columns, dtype=str, keep_default_na=False)
+    for name in table.columns.difference([*TEXT_COLUMNS]):
+        cells = table[name]
+        is_measured = name in TABLE_COLUMNS or name.startswith("telescope_")
+        if is_measured or cells.str.fullmatch(PLAIN_NUMBER).all():
+            try:
+                table[name] = pd.to_numeric(cells)
+            except ValueError as error:
+                # Some columns of the telescope are texts, too.
+                if name in TABLE_COLUMNS:
+                    raise ProductError(f"{path}: column {name!r}: {error}") from None
+    return table
 
 
 def times_of(night: DataFrame) -> tuple[Any, str]:
@@ -164,10 +212,13 @@ def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) ->
         figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
     # Where the optics are known: the state of the telescope, or why it is not.
     state = night.filter(regex="^telescope_")
-    names = [str(column) for column in state if f"{column}_error" in state]
+    numbers = {str(column) for column in state.select_dtypes("number")}
+    names = [str(column) for column in state if {column, f"{column}_error"} <= numbers]
     if names:
         figures += image_tag(telescope_figure(night, names))
-    for reason in state.get("telescope_reason", night.reason[:0]).dropna().unique():
+    for reason in (
+        state.get("telescope_reason", night.reason[:0]).replace("", None).dropna().unique()
+    ):
         figures += f"<p>State of the telescope: {escape(reason)}</p>"
     counts = ", ".join(f"{(night.verdict == verdict).sum()} {verdict}" for verdict in VERDICTS)
     template = Path(__file__).with_name("night.html").read_text(encoding="utf-8")

@@ -255,9 +255,9 @@ def efficiency(
     # Errors of methods by star, in groups that are columns of the paper's tables. The posterior
     # mean over a bank is an estimator, too, and must respect the floor.
     # Bounds are paired with errors star by star: scatter that both share cancels.
-    bound_stars = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
+    bound_stars = pd.concat([read_table(path) for path in bounds_per_star], ignore_index=True)
     columns = [*CELL, "method", "star", "field", "mse"]
-    methods = pd.concat([pd.read_parquet(path, columns=columns) for path in parts])
+    methods = pd.concat([read_table(path, columns=columns) for path in parts])
     means = bound_stars[bound_stars.method.isin(tables.POSTERIOR_MEANS)][columns]
     methods = pd.concat([methods, means], ignore_index=True)
     # A cell is a dataset, split, reference and noise level.

@@ -148,14 +148,11 @@ def read_run(folder: Path, errors: Path) -> Run:
     columns = ("epoch", "train_mse", "validation_mse", "seconds")
     # Some cells may be empty, hence text that is converted below.
     history = read_table(folder / HISTORY, *columns, dtype=str)
-    try:
-        table = pd.read_parquet(errors, page_checksum_verification=True)
     # A network may be there before it is evaluated.
-    except FileNotFoundError:
-        raise ProductError(f"{errors}: no such file; evaluate the run first") from None
-    except (OSError, ValueError) as error:
-        raise ProductError(f"{errors}: damaged ({error}); delete it and run again") from error
-    return Run(str(folder), flatten(config), history.apply(pd.to_numeric, errors="coerce"), table)
+    if not errors.exists():
+        raise ProductError(f"{errors}: no such file; evaluate the run first")
+    history = history.apply(pd.to_numeric, errors="coerce")
+    return Run(str(folder), flatten(config), history, read_table(errors))
 
 
 def describe(first: Run, second: Run) -> str:

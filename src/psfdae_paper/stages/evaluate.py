@@ -19,6 +19,7 @@ from psfdae.base.figures import spread_stars
 from psfdae.base.files import Column, Product, write_csv, write_parquet, write_product, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
+from psfdae.base.reading import read_table
 from psfdae.base.settings import ConfigError, Reference, SplitKind
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
@@ -239,7 +240,7 @@ def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: Fil
     """
     columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
     # Errors in the same fields, as seen in training and as held out.
-    parts = [pd.read_parquet(path, columns=columns) for path in per_star]
+    parts = [read_table(path, columns=columns) for path in per_star]
     write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 
 

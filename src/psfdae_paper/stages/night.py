@@ -27,21 +27,20 @@ from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
 from psfdae.model.bundle import SUFFIX
 from psfdae_paper.configuration.command import command
-from psfdae_paper.evaluation.night import VERDICTS, night_page, with_verdicts
-from psfdae_paper.stars.nights import PLACES, positions_of_places, shapes_at_places
+from psfdae_paper.evaluation.night import (
+    TABLE_COLUMNS,
+    VERDICTS,
+    night_page,
+    read_night,
+    with_verdicts,
+)
+from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
 
 if TYPE_CHECKING:
     from psfdae.model.psf_model import PsfModel
     from psfdae.model.stars import Stars
 
 Row = dict[str, object]
-
-TABLE_COLUMNS = {
-    *("name", "reason", "verdict", "start", "time", "airmass", "order", "bright_stars", "stars"),
-    *("flagged", "mag_20th", "zero_point", "zero_point_scatter", "chi2"),
-    *(f"{quantity}_{place}" for quantity in ("fwhm_px", "ellipticity") for place in PLACES),
-}
-"""Columns that the table of a night has; one of a list with such a name gets `_list` at its end."""
 
 
 class NightError(Error, ValueError):
@@ -171,8 +170,10 @@ def night_table(
     from pandas import concat
 
     # A part without a usable image lacks the columns of measurements.
-    tables = [read_table(path, "image", "name", "reason") for path in parts]
-    night = with_verdicts(concat(tables, ignore_index=True).fillna({"reason": ""}))
+    tables = [read_night(path, "image", "name", "reason") for path in parts]
+    night = concat(tables, ignore_index=True)
+    texts = [name for name in night if night[name].dtype.kind == "O"]
+    night = with_verdicts(night.fillna(dict.fromkeys(texts, "")))
     write_csv(out, night)
     table = QTable.from_pandas(night)
     units = {"fwhm_px": "pix", "mag_20th": "mag", "zero_point": "mag"}
@@ -196,7 +197,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
     """
     from psfdae.model.psf_model import load_model
 
-    night = read_table(table, "name", "verdict", "reason")
+    night = read_night(table, "name", "verdict", "reason")
     # PSFs over the field of the best, the median and the worst image, by the FWHM in the middle.
     psfs = {}
     with_model = night.dropna(subset="fwhm_px_centre").sort_values("fwhm_px_centre")
