@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import gzip
+import pickle
+
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from photutils.psf import GriddedPSFModel
 
 from command_line import printed, psfdae, refused
+from psfdae import Error, load_model
 from psfdae.model import exchange
 from psfdae.model.exchange import PsfexField, load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
@@ -86,6 +91,142 @@ def test_photutils_reads_stdpsf(tmp_path):
         expected = model.psf_at(x, y, 1)[4:21, 4:21]
         values = grid.evaluate(columns, rows, 1.0, x, y)
         assert np.abs(values - expected).max() < 1e-3 * expected.max()
+
+
+def stdpsf(path, columns, rows):
+    exchange.write_stdpsf(path, Moving(), columns, rows)
+
+
+def cube(path, columns, rows, oversampling=4):
+    exchange.write_grid(path, Moving(), np.rint(Moving().grid(columns, rows)), oversampling)
+
+
+def even_cube(path, columns, rows):
+    """As STPSF writes it: an even number of values, with the star in the middle of them."""
+    positions = np.rint(Moving().grid(columns, rows))
+    # Every other of eight values per pixel; the star is midway between two of them.
+    psfs = Moving().psf_at(*positions.T, 8)[:, 1::2, 1::2]
+    header = fits.Header({"OVERSAMP": 4})
+    for number, (x, y) in enumerate(positions.tolist()):
+        header[f"DET_YX{number}"] = f"({y}, {x})"
+    fits.writeto(path, psfs, header)
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress], ids=["plain", "gz"])
+@pytest.mark.parametrize(
+    ("write", "columns", "rows"),
+    [(stdpsf, 7, 5), (cube, 7, 5), (cube, 12, 10), (even_cube, 7, 5)],
+)
+def test_grids_of_other_programs_are_read(tmp_path, write, columns, rows, pack):
+    """Positions, axes, phases, sampling and flux; outside of the grid, the PSF of its edge."""
+    path = tmp_path / "grid.fits"
+    write(path, columns, rows)
+    path.write_bytes(pack(path.read_bytes()))
+    model, back = Moving(), load_field(path)
+    assert np.array(back.field_range()) == pytest.approx(np.array([LOW, HIGH]))
+    for samples in (1, 3, 4):
+        expected, read = (m.psf_at(*PLACES.T, samples) for m in (model, back))
+        assert np.abs(read - expected).max() < 1e-4 * expected.max()
+    edge, outside = back.psf_at([980.0, 1500.0], [300.0, 300.0], 1)
+    assert outside == pytest.approx(edge)
+
+
+def test_a_single_psf_is_the_same_everywhere(tmp_path):
+    exchange.write_grid(tmp_path / "m.fits", Moving(), np.array([[500.0, 300.0]]), 4)
+    back = load_field(tmp_path / "m.fits")
+    expected = Moving().psf_at(500.0, 300.0, 1)
+    for place in ((500.0, 300.0), (20.0, 640.0)):
+        assert np.abs(back.psf_at(*place, 1) - expected).max() < 1e-4 * expected.max()
+    assert back.order == 0
+
+
+def test_photometry_by_a_grid_of_another_program(tmp_path):
+    """Fluxes of stars whose PSF changes over the image."""
+    model, rng = Moving(), np.random.default_rng(5)
+    stars = np.stack(np.meshgrid(np.arange(60, 940, 110), np.arange(70, 600, 110)), -1)
+    stars = stars.reshape(-1, 2) + rng.uniform(-5, 5, (stars.size // 2, 2))
+    flux = 10 ** rng.uniform(4.3, 5.0, len(stars))
+    image = np.zeros((660, 1000))
+    for (x, y), f, psf in zip(stars, flux, model.on_pixels(stars), strict=True):
+        row, column = (int(np.floor(v + 0.5)) - 12 for v in (y, x))
+        image[row : row + 24, column : column + 24] += f * psf
+    image = rng.poisson(image + 100.0).astype(np.float32)
+    fits.writeto(tmp_path / "image.fits", image, fits.Header({"GAIN": 1.0, "SATURATE": 6e4}))
+    Table({"x": stars[:, 0], "y": stars[:, 1]}).write(tmp_path / "list.csv")
+    stdpsf(tmp_path / "m.stdpsf.fits", 9, 7)
+    words = ["--catalogue", tmp_path / "list.csv", "--origin", 0, "--pixel-scale", 1]
+    words += ["--model", tmp_path / "m.stdpsf.fits", "--out", tmp_path / "p.ecsv"]
+    printed("photometry", tmp_path / "image.fits", *words)
+    table = Table.read(tmp_path / "p.ecsv")
+    pull = (table["flux"].value - flux) / table["flux_error"].value
+    assert abs(np.median(table["flux"].value / flux) - 1) < 0.003
+    assert 0.6 < np.sqrt(np.mean(pull**2)) < 1.6
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory):
+    """Models of other programs."""
+    folder = tmp_path_factory.mktemp("foreign")
+    exchange.write_psfex(folder / "PSFEx", Moving(), 2)
+    stdpsf(folder / "STDPSF", 3, 3)
+    cube(folder / "STPSF", 3, 3)
+    with fits.open(folder / "PSFEx") as hdus:
+        fits.HDUList([hdus[0], hdus[1], hdus[1].copy()]).writeto(folder / "merged PSFEx")
+    column = fits.Column("type", "8A", array=["Simple"])
+    names = ("psf", "psf_stars", "psf_wcs", "psf_model", "psf_interp")
+    tables = [fits.BinTableHDU.from_columns([column], name=name) for name in names]
+    fits.HDUList([fits.PrimaryHDU(), *tables]).writeto(folder / "Piff")
+    fits.writeto(folder / "FITS", np.zeros((9, 9)))
+    (folder / "pickle").write_bytes(pickle.dumps([1]))
+    (folder / "JSON").write_text('{"psf": 1}')
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name", ["PSFEx", "STDPSF", "STPSF", "merged PSFEx", "Piff", "FITS", "pickle", "JSON"]
+)
+def test_models_of_other_programs_are_named(foreign, tmp_path, name):
+    """By the content, whatever the name of the file; those that cannot be read by any command."""
+    kind = name.removeprefix("merged ")
+    path = foreign / name
+    message = f"{path}: of the format {kind}, expected a model of psfdae"
+    with pytest.raises(Error) as refusal:
+        load_model(path)
+    assert str(refusal.value).startswith(message)
+    assert ("psf and photometry read it" in str(refusal.value)) == (kind[:2] in ("PS", "ST"))
+    assert message in refused("describe", path)
+    assert message in refused("predict", path, "--model", path, "--out", tmp_path / "a.fits")
+    if kind not in ("PSFEx", "STDPSF", "STPSF"):
+        assert message in refused("psf", path, "--grid", "3x3", "--out", tmp_path / "a.fits")
+    elif name == kind:
+        load_field(path)
+    else:
+        assert "2 tables PSF_DATA" in refused("psf", path, "--out", tmp_path / "a.psf")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"JPSFY03": 42}, "several detectors"),
+        ({"JPSFY03": "x"}, "damaged"),
+        ({"NXPSFS": 4}, "damaged"),
+        ({"NXPSFS": -1}, "damaged"),
+        ({"IPSFX01": None}, "damaged"),
+    ],
+)
+def test_a_grid_that_is_damaged_or_of_several_detectors_is_refused(tmp_path, change, message):
+    path = tmp_path / "m.fits"
+    stdpsf(path, 3, 3)
+    with fits.open(path, mode="update") as hdus:
+        for key, value in change.items():
+            if value is None:
+                del hdus[0].header[key]
+            else:
+                hdus[0].header[key] = value
+        if "JPSFY03" in change:
+            hdus[0].header["JPSFY02"] = 41
+    with pytest.raises(Error, match=rf"m\.fits: .*{message}"):
+        load_field(path)
 
 
 def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -24,9 +25,12 @@ from command_line import psfdae, refused
 from psfdae.base import progress
 from psfdae.base.files import (
     Column,
+    OutputError,
     ProductError,
     as_csv,
     atomic_path,
+    check_outputs,
+    left_over,
     read_product,
     write_columns,
     write_csv,
@@ -89,16 +93,59 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_killed_writer_leaves_the_old_file(tmp_path):
+def test_what_a_killed_writer_leaves_is_removed_by_the_next_one(tmp_path):
+    """The old file stays; temporary files of a process that runs, or of other names, do, too."""
     path = tmp_path / "file.txt"
     path.write_text("old")
     code = (
         "import os, sys; from psfdae.base.files import atomic_path\n"
         "with atomic_path(sys.argv[1]) as new: new.write_text('half'); os.kill(os.getpid(), 9)"
     )
-    assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
+    for _ in range(2):
+        assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
     assert path.read_text() == "old"
-    assert [p.name[:10] for p in tmp_path.iterdir() if p != path] == [".file.txt."]
+    (left,) = left_over(tmp_path, path.name)
+    others = [tmp_path / name for name in (".file.txt.tmp", f".x{left.name[1:]}", left.name[1:])]
+    for other in others:
+        other.touch()
+    with atomic_path(path) as running:
+        assert not left.exists()
+        write_text(path, "new")
+        assert running.exists()
+    assert {*tmp_path.iterdir()} == {path, *others}
+
+
+def test_a_file_that_is_replaced_keeps_mode_and_link(tmp_path):
+    path, link, absent = (tmp_path / name for name in ("file.txt", "link.txt", "absent.txt"))
+    link.symlink_to(path.name)
+    for mode in (0o600, 0o640, 0o444):
+        path.touch()
+        path.chmod(mode)
+        for target in (path, link):
+            write_text(target, str(mode))
+            assert path.stat().st_mode & 0o7777 == mode and path.read_text() == str(mode)
+    assert link.readlink() == Path("file.txt")
+    (tmp_path / "hanging.txt").symlink_to(absent)
+    write_text(tmp_path / "hanging.txt", "new")
+    assert absent.read_text() == "new"
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "folder", "circle", "link to a device"])
+def test_an_output_replaces_nothing_but_a_file(tmp_path, kind):
+    path = tmp_path / "out.fits"
+    if kind == "device":
+        path = Path(os.devnull)
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(os.devnull if "device" in kind else path)
+    before = path.lstat()
+    for write in (lambda: check_outputs([path], []), lambda: write_text(path, "new")):
+        with pytest.raises(OutputError, match=rf"({path}|{os.devnull}): is a .*, not a file"):
+            write()
+    assert (path.lstat().st_mode, path.lstat().st_ino) == (before.st_mode, before.st_ino)
 
 
 def test_a_full_disk_is_named_with_the_file_that_has_no_space(tmp_path):

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import gc
+import gzip
+import http.server
+import io
+import itertools
+import os
 import pickle
 import shutil
+import signal
 import struct
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import astropy.io.votable
 import numpy as np
+import psutil
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from command_line import refused
+from command_line import psfdae, refused
 from fits_inputs import PACK, open_observation, write_cube, write_field
 from prediction_stars import with_network
-from psfdae import load_model
+from psfdae import Error, load_model
+from psfdae.base.files import read_product, temporary_name
+from psfdae.base.reading import read_table, read_yaml
 from psfdae.image import fits_file as images
+from psfdae.image import list_formats
 from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
+from psfdae.methods.networks.weights import load_weights
 from psfdae.model import bundle as bundles
 from psfdae.model.bundle import read_bundle, shipped_path
 
@@ -185,6 +203,366 @@ def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipp
         for name in ("psf", "flux", "flux_error", "background", "noise", "chi2", "distance"):
             a, b = getattr(full_basis, name), getattr(lean_prediction, name)
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6 * np.nanmax(np.abs(a)))
+
+
+# What is packed.
+
+
+def leftovers(room):
+    gc.collect()
+    return list(room.iterdir())
+
+
+@pytest.fixture
+def room(tmp_path, monkeypatch):
+    """The folder for temporary files, empty."""
+    folder = tmp_path / "room"
+    folder.mkdir()
+    monkeypatch.setattr(images.tempfile, "tempdir", str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("spoil", [cut(0.6), cut(0.02), lambda raw: raw[:-9] + bytes(9)])
+@pytest.mark.parametrize("pack", PACK)
+def test_a_damaged_packed_file_leaves_no_copy(good, tmp_path, room, pack, spoil):
+    path = tmp_path / CUBE
+    path.write_bytes(spoil(PACK[pack]((good / CUBE).read_bytes())))
+    with pytest.raises(ObservationError, match=CUBE):
+        open_observation(path, SIDE)
+    assert leftovers(room) == []
+
+
+@pytest.mark.parametrize("pack", PACK)
+def test_no_more_is_unpacked_than_a_file_may_hold(tmp_path, room, monkeypatch, pack):
+    """A file that unpacks to the limit is read; one byte more, and nothing is left of it."""
+    monkeypatch.setattr(images, "unpacked_max", lambda packed_bytes: 2**21)
+    path = tmp_path / "packed"
+    for size in (2**21, 2**21 + 1):
+        path.write_bytes(PACK[pack](bytes(size)))
+        if size == 2**21:
+            assert images.unpacked(path)[0].path.stat().st_size == size
+            continue
+        with pytest.raises(ObservationError, match="unpacks to more than 2 MB"):
+            images.unpacked(path)
+    assert leftovers(room) == []
+
+
+def test_the_limit_of_what_is_unpacked_grows_with_the_file():
+    memory_bytes = psutil.virtual_memory().total
+    assert images.unpacked_max(14_000) == 2**26
+    assert images.unpacked_max(10**6) == min(1032 * 10**6, memory_bytes)
+    assert abs(images.unpacked_max(2**50) / memory_bytes - 1) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("coding", "dtype"), [("RICE_1", "i2"), ("GZIP_1", "f4"), ("GZIP_2", "i4")]
+)
+def test_tiles_that_share_their_bytes_are_refused(tmp_path, coding, dtype):
+    """A file of 64 kB whose 7500 tiles are one tile of 20000 pixels, 150 million in all."""
+    row = fits.CompImageHDU(
+        np.zeros((1, 20000), dtype), compression_type=coding, tile_shape=(1, 20000)
+    )
+    row.writeto(tmp_path / "row.fz")
+    with fits.open(tmp_path / "row.fz", disable_image_compression=True) as hdus:
+        header, start = hdus[1].header.copy(), hdus[1].fileinfo()["datLoc"]
+    content = (tmp_path / "row.fz").read_bytes()[start:]
+    width = header["NAXIS1"]
+    header["NAXIS2"] = header["ZNAXIS2"] = 7500
+    data = content[:width] * 7500 + content[width : width + header["PCOUNT"]]
+    head = fits.PrimaryHDU().header.tostring() + header.tostring()
+    path = tmp_path / "image.fz"
+    path.write_bytes(head.encode() + data + bytes(-len(data) % 2880))
+    with pytest.raises(ObservationError, match=r"damaged: \d+ bytes in tiles of"):
+        images.find_image(path)
+    assert images.find_image(tmp_path / "row.fz").shape == (1, 20000)
+
+
+def test_arrays_of_a_table_that_share_their_bytes_are_refused(tmp_path):
+    """6000 rows, each of which claims all of the 24000 numbers that the file has."""
+    lists = np.array([np.zeros(4, "f4")] * 6000, dtype=object)
+    x = fits.Column("x", "D", array=np.arange(6000))
+    table = fits.BinTableHDU.from_columns([x, fits.Column("many", "PE()", array=lists)])
+    table.writeto(tmp_path / "s.fits")
+    assert len(read_catalogue(tmp_path / "s.fits")) == 6000
+    with fits.open(tmp_path / "s.fits") as hdus:
+        start, width = hdus[1].fileinfo()["datLoc"], hdus[1].header["NAXIS1"]
+    raw = bytearray((tmp_path / "s.fits").read_bytes())
+    for row in range(6000):
+        raw[start + row * width + 8 : start + (row + 1) * width] = struct.pack(">ii", 24000, 0)
+    (tmp_path / "s.fits").write_bytes(raw)
+    with pytest.raises(ObservationError, match="larger than the file"):
+        read_catalogue(tmp_path / "s.fits")
+
+
+def test_what_a_killed_process_has_unpacked_is_removed(good, tmp_path, room):
+    """By the next process that unpacks something; the copy of one that runs stays."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    name = temporary_name("psfdae")
+    dead, alive = (room / name.replace(f"-{os.getpid()}-", f"-{n}-") for n in (ended.pid, 1))
+    for path in (dead, alive):
+        path.touch()
+    path = tmp_path / "cube.fits.gz"
+    path.write_bytes(gzip.compress((good / CUBE).read_bytes()))
+    observation = open_observation(path, SIDE)
+    assert not dead.exists() and alive.exists()
+    del observation
+    assert leftovers(room) == [alive]
+
+
+# Pipes and devices, which may never end.
+
+
+@pytest.fixture(params=["pipe", "device"])
+def endless(request, tmp_path):
+    path = tmp_path / "endless"
+    if request.param == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    signal.alarm(60)
+    yield path
+    signal.alarm(0)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "predict {} --out out.fits",
+        "predict {good}/cube.fits --mask {} --out out.fits",
+        "predict {good}/image.fz --catalogue {} --out out.fits",
+        "predict {good}/cube.fits --model {} --out out.fits",
+        "from-stars {good}/image.fz --catalogue {} --out m",
+        "photometry {good}/image.fz --catalogue {good}/stars.csv --model {} --out out.csv",
+        "psf {} --grid 3x3 --out out.fits",
+        "describe {}",
+        "wavefront {good}/cube.fits --telescope {} --out out.csv",
+    ],
+)
+def test_a_pipe_or_a_device_is_refused(good, tmp_path, monkeypatch, endless, words):
+    monkeypatch.chdir(tmp_path)
+    line = refused(*words.format(endless, good=good).split())
+    assert "a pipe or a device, expected a file" in " ".join(line.split())
+    for read in (lambda path: read_product(path, "stars"), read_yaml, read_table, load_weights):
+        with pytest.raises(Error, match="a pipe or a device"):
+            read(endless)
+
+
+# Addresses.
+
+STREAMS = {
+    "plain": "<STREAM href='{}'/>",
+    "double quotes": '<STREAM encoding="base64" href="{}"></STREAM>',
+    "prefix": "<v:STREAM href='{}'/>",
+    "prefix with a hyphen": "<v-o.t:STREAM href='{}'/>",
+    "prefix of other letters": "<ö:STREAM href='{}'/>",
+    "greater than in an attribute": "<STREAM encoding='>' rights='/>' href='{}'/>",
+    "lines": "<STREAM\n\trights='x'\r\n\n href\n=\n'{}'\n/>",
+    "after a comment": "<!-- <STREAM> --><STREAM href='{}'/><!-- -->",
+    "after CDATA": "<INFO name='a' value='b'><![CDATA[</STREAM>]]></INFO><STREAM href='{}'/>",
+    "references": "<STREAM href='&#104;&#x74;tp{tail}'/>",
+    "entity in the address": "<STREAM href='&address;'/>",
+    "entity of the element": "&element;",
+    "entity of the tag's content": "&outer;",
+    "default attribute": "<STREAM/>",
+}
+DATA = ["<BINARY>{}</BINARY>", "<BINARY2>{}</BINARY2>", "<FITS>{}</FITS>", "<PARQUET>{}</PARQUET>"]
+ENCODINGS = {"utf-8": b"", "utf-16-le": b"\xff\xfe", "utf-16-be": b"\xfe\xff", "iso-8859-1": b""}
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A server of this machine, and the list of the addresses that were asked for."""
+
+    class Log(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            requests.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, *words):
+            pass
+
+    requests = []
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Log) as listening:
+        thread = threading.Thread(target=listening.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{listening.server_port}/", requests
+        listening.shutdown()
+        thread.join()
+
+
+def votable_of(stream, data, encoding, address):
+    entities = {
+        "entity in the address": f"<!ENTITY address '{address}'>",
+        "entity of the element": f"""<!ENTITY element "<STREAM href='{address}'/>">""",
+        "entity of the tag's content": f"<!ENTITY inner '{address}'>"
+        """<!ENTITY outer "<STREAM href='&#38;inner;'/>">""",
+        "default attribute": f"<!ATTLIST STREAM href CDATA '{address}'>",
+    }
+    name = encoding[:6] if encoding.startswith("utf-16") else encoding
+    head = f'<?xml version="1.0" encoding="{name}"?>'
+    if stream in entities:
+        head += f"<!DOCTYPE VOTABLE [{entities[stream]}]>"
+    fields = "".join(f'<FIELD name="{axis}" datatype="double"/>' for axis in "xy")
+    part = data.format(STREAMS[stream].format(address, tail=address.removeprefix("http")))
+    body = f"<RESOURCE><TABLE>{fields}<DATA>{part}</DATA></TABLE></RESOURCE>"
+    text = f'{head}<VOTABLE version="1.3">{body}</VOTABLE>'
+    return ENCODINGS[encoding] + text.encode(encoding)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_no_address_in_a_votable_is_opened(tmp_path, server, stream):
+    """Whatever its spelling; astropy opens most of them, which shows that they are sound."""
+    address, requests = server
+    for data, encoding in itertools.product(DATA, ENCODINGS):
+        path = tmp_path / "s.vot"
+        path.write_bytes(votable_of(stream, data, encoding, address))
+        with pytest.raises(Error, match=r"s\.vot: "):
+            read_catalogue(path)
+        path.write_bytes(gzip.compress(path.read_bytes()))
+        with pytest.raises(Error, match=r"s\.vot: "):
+            read_catalogue(path)
+    assert requests == []
+    content = votable_of(stream, DATA[0], "utf-8", address)
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        astropy.io.votable.parse(io.BytesIO(content), verify="ignore")
+    opened, requests[:] = list(requests), []
+    assert opened == ["/"]
+
+
+def test_no_address_that_a_file_names_is_opened(good, tmp_path, monkeypatch, server):
+    """Of a list, an image or a model, in texts, headers and names; nor as a path itself."""
+    address, requests = server
+    monkeypatch.chdir(tmp_path)
+    dtd = f'<!DOCTYPE VOTABLE SYSTEM "{address}a.dtd" [<!ENTITY % p SYSTEM "{address}p"> %p;'
+    dtd += f'<!ENTITY x SYSTEM "{address}x">]>'
+    link = f'<RESOURCE><LINK href="{address}"/><TABLE><LINK href="{address}"/></TABLE></RESOURCE>'
+    schema = f'xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" xsi:schemaLocation="{address}"'
+    include = f'<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="{address}"/>'
+    texts = {
+        "a.vot": f"{dtd}<VOTABLE {schema}>{link}{include}&x;</VOTABLE>",
+        "b.vot": f'<?xml-stylesheet href="{address}"?><VOTABLE>{link}</VOTABLE>',
+        "c.csv": f"{address}\n",
+        "d.csv": f"x,y,name\n1,2,{address}\n",
+        "e.ecsv": f"# %ECSV 1.0\n# ---\n# datatype:\n# - {{name: x, datatype: string}}\n"
+        f"# meta: !!python/object/apply:urllib.request.urlopen ['{address}']\nx\n1\n",
+        "f.reg": f"image\ncircle(1,2,3) # text={{{address}}}\n# {address}\n",
+        "g.json": f'{{"href": "{address}"}}',
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        with suppress(Error):
+            read_catalogue(tmp_path / name)
+    cards = {"BPMASK": f"{address}m.fits", "INHERIT": True, "XTENSION": address[:60]}
+    fits.writeto(tmp_path / "i.fits", fits.getdata(good / TILES), fits.Header(cards.items()))
+    for words in (
+        ["predict", address, "--out", "o.fits"],
+        ["predict", tmp_path / "i.fits", "--catalogue", address, "--out", "o.fits"],
+        ["predict", tmp_path / "i.fits", "--catalogue", good / LIST, "--mask", address],
+        ["predict", good / CUBE, "--model", address, "--out", "o.fits"],
+        ["psf", address, "--grid", "3x3", "--out", "o.fits"],
+        ["describe", address],
+        ["wavefront", good / CUBE, "--telescope", address, "--out", "o.csv"],
+    ):
+        psfdae(*words)
+    psfdae("predict", tmp_path / "i.fits", "--catalogue", good / LIST, "--pixel-scale", 1)
+    assert requests == []
+
+
+# Time.
+
+DS9 = "# Region file format: DS9\nimage\n"
+XML = '<?xml version="1.0"?><VOTABLE version="1.3"><RESOURCE><TABLE>'
+LONG = {
+    "dashes": ("x y\na b\n{}x\n1 2\n", "-"),
+    "blanks before a bracket": (DS9 + "circle{})\n", " "),
+    "blanks and commas": (DS9 + "circle{})\n", " 1,"),
+    "commas": (DS9 + "circle(1{})\n", ","),
+    "open texts": (DS9 + "circle(1,2,3) # {}\n", "text={"),
+    "open texts with blanks": (DS9 + "circle(1,2,3) # {}\n", "text = ' "),
+    "tags without an end": (XML + "{}", "<STREAM "),
+    "elements": (XML + "{}</TABLE></RESOURCE></VOTABLE>", "<STREAM a='>'/>"),
+    "fields of one name": (XML + "{}", "<FIELD ID='x' name='x' datatype='int'/>"),
+    "columns of one name": ("{}\n1\n", "x "),
+    "columns of one name in IPAC": ("{}|\n{}|\n1\n", "|i"),
+    "letters of a name": ("{}\n1\n", "x"),
+    "digits of a name": ("# x y\n{}\n1\n", "1e"),
+    "digits": ("ra,dec\n{}:00:00,+10:00:00\n", "1"),
+    "comments": ("{}x y\n1 2\n", "# 1 \n"),
+    "rows": ("x y\n{}", "1 2\n"),
+}
+
+
+@pytest.mark.parametrize("kind", LONG)
+def test_the_work_on_a_list_grows_with_its_length(tmp_path, kind):
+    """Ten times the length takes ten times the work, up to a factor of three; its square, 100."""
+    form, unit = LONG[kind]
+
+    def work(size):
+        path = tmp_path / "list"
+        path.write_text(form.format(*[unit * (size // len(unit))] * form.count("{}")))
+        path = path.rename(tmp_path / "list.reg") if form.startswith(DS9) else path
+        begin = time.process_time()
+        with suppress(Error):
+            catalogue = read_catalogue(path)
+            places = catalogue.positions()
+            catalogue.sky(places) if places.sky else catalogue.pixels(places.first)
+        return time.process_time() - begin
+
+    def stop(*details):
+        raise AssertionError("the work does not end")
+
+    work(2_000)  # imports
+    signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, 20)
+    try:
+        assert work(200_000) < 30 * max(work(20_000), 0.05)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+@pytest.mark.parametrize(
+    ("table", "field"),
+    [
+        ("nrows='1000000000'", ""),
+        ("", "<FIELD name='z' datatype='double' arraysize='100000000'/>"),
+        ("nrows='100000'", "<FIELD name='z' datatype='int' arraysize='30x400'/>"),
+        ("", "<FIELD name='z' datatype='char' arraysize='100000000*'/>"),
+    ],
+)
+def test_a_votable_gets_no_more_memory_than_its_size_allows(tmp_path, table, field):
+    head = XML.replace("<TABLE>", f"<TABLE {table}>")
+    fields = "".join(f'<FIELD name="{axis}" datatype="double"/>' for axis in "xy") + field
+    cells = "<TR><TD>1</TD><TD>2</TD></TR>" * 3
+    data = f"<DATA><TABLEDATA>{cells}</TABLEDATA></DATA></TABLE></RESOURCE></VOTABLE>"
+    (tmp_path / "s.vot").write_text(head + fields + data)
+    with pytest.raises(ObservationError, match=r"damaged: \d columns, \d+ rows"):
+        read_catalogue(tmp_path / "s.vot")
+
+
+def test_rows_of_parquet_that_are_equal_get_no_more_memory_than_its_size_allows(
+    tmp_path, monkeypatch
+):
+    Table({"x": np.ones(10**5), "y": np.ones(10**5)}).to_pandas().to_parquet(tmp_path / "s")
+    assert len(read_catalogue(tmp_path / "s")) == 10**5
+    monkeypatch.setattr(list_formats, "unpacked_max", lambda packed_bytes: 10**6)
+    with pytest.raises(ObservationError, match="unpacks to 1600000 bytes"):
+        read_catalogue(tmp_path / "s")
+
+
+# Pixels in tables.
+
+
+def test_a_target_pixel_file_is_named(tmp_path):
+    """Of Kepler and TESS: the only image is the aperture; those of the star are in a table."""
+    flux = fits.Column("FLUX", "20E", dim="(5, 4)", array=np.zeros((3, 4, 5), "f4"))
+    pixels = fits.BinTableHDU.from_columns([flux], name="PIXELS")
+    aperture = fits.ImageHDU(np.ones((4, 5), np.int32), name="APERTURE")
+    path = tmp_path / "tpf.fits"
+    fits.HDUList([fits.PrimaryHDU(), pixels, aperture]).writeto(path)
+    assert "target pixel file" in refused("predict", path, "--out", tmp_path / "o.fits")
+    assert images.find_image(path, "APERTURE").shape == (4, 5)
 
 
 # Results.

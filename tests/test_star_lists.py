@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -107,13 +109,6 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
     assert next(observation.chunks(100)).id[0] == 100
 
 
-def test_a_votable_opens_no_address(tmp_path, image):
-    path = tmp_path / "s.vot"
-    path.write_text('<VOTABLE><STREAM href="file:///etc/hostname"/></VOTABLE>')
-    with pytest.raises(Error, match="data are not in it"):
-        ImageInput(image, catalogue=path).open(16)
-
-
 @pytest.mark.parametrize("form", [daophot, stetson, regions])
 def test_lists_that_count_from_1(tmp_path, image, place, form):
     listed = [(k + 5, x + 1, y + 1) for k, (x, y) in enumerate(place)]
@@ -141,6 +136,130 @@ def test_vizier(tmp_path, path, place):
     sky = TANGENT.pixel_to_world(*place.T)
     vizier(zip(sky.ra.deg, sky.dec.deg, strict=True), tmp_path / "s.tsv")
     np.testing.assert_allclose(positions(path, tmp_path / "s.tsv"), place, atol=2e-3)
+
+
+# Lists of other programs: the same stars, or a line that names the format.
+
+
+def siril(place, name):
+    """Siril's list: its first comment begins with a number, as SExtractor's do."""
+    head = f"# {len(place)} stars found using the following parameters:\n# sigma=1.00 radius=10\n"
+    names = '# star#\tlayer\tB\tA\tX\tY\tFWHMx [px]\tFWHMx ["]\tmag\tProfile\n'
+    rows = [f"{k}\t0\t0.004\t0.5\t{x:9.3f}\t{y:9.3f}\t3\t3\t-8\tMoffat\n" for k, (x, y) in place]
+    name.write_text(head + names + "".join(rows))
+
+
+def image_j(place, name):
+    """AstroImageJ's measurements, whose first name is blank; x and y of the FITS image from 1."""
+    rows = [f"{k}\timage.fits\t{x:.3f}\t{y:.3f}\n" for k, (x, y) in place]
+    name.write_text(" \tLabel\tX(FITS)\tY(FITS)\n" + "".join(rows))
+
+
+def columns(x_name, y_name, shift=0.0):
+    def write_csv(place, name):
+        rows = [f"{k},{x + shift:.3f},{y + shift:.3f}\n" for k, (x, y) in place]
+        name.write_text(f"id,{x_name},{y_name}\n" + "".join(rows))
+
+    return write_csv
+
+
+def parquet(place, name):
+    xy = np.array([xy for _, xy in place])
+    frame = pd.DataFrame({"id": [f"s{k}" for k, _ in place], "x": xy[:, 0], "y": xy[:, 1]})
+    frame.to_parquet(name, index=False)
+
+
+def in_utf16(place, name):
+    columns("x", "y")(place, name)
+    name.write_bytes(name.read_text().encode("utf-16"))
+
+
+def in_gzip(place, name):
+    columns("x", "y")(place, name)
+    name.write_bytes(gzip.compress(name.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    ("form", "origin"),
+    [
+        (siril, None),
+        (image_j, 1),
+        (columns("pixel_centroid_x", "pixel_centroid_y", 1), 1),
+        (columns("slot_Centroid_x", "slot_Centroid_y"), 0),
+        (columns("base_SdssCentroid_x", "base_SdssCentroid_y"), 0),
+        (parquet, None),
+        (in_utf16, None),
+        (in_gzip, None),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_lists_of_other_programs(tmp_path, image, place, form, origin):
+    written = place + 1 if form is image_j else place
+    form([*enumerate(written.tolist())], tmp_path / "list")
+    assert read_catalogue(tmp_path / "list").positions().origin == origin
+    stated = {"origin": 0} if origin is None else {}
+    np.testing.assert_allclose(
+        positions(image, tmp_path / "list", **stated), place, atol=1e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg", None, "degrees without a unit"])
+def test_sky_coordinates_of_lsst_are_radians_without_a_unit(tmp_path, path, place, unit):
+    sky = TANGENT.pixel_to_world(*place.T)
+    angles = [angle.rad if unit in ("rad", None) else angle.deg for angle in (sky.ra, sky.dec)]
+    units = [unit, unit] if unit in ("rad", "deg") else None
+    table = Table(angles, names=("coord_ra", "coord_dec"), units=units)
+    table.write(tmp_path / "list.fits")
+    np.testing.assert_allclose(positions(path, tmp_path / "list.fits"), place, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "|  ra     | dec     |\n| double  | double  |\n| deg     | deg     |\n",
+        "\\catalog = 2MASS\n|  RA     | DEC     |\n| double  | double  |\n| deg     | deg     |\n",
+        "Title: stars\n====\nByte-by-byte Description of file: list.txt\n"
+        + f"{'-' * 40}\n   Bytes Format Units Label Explanations\n{'-' * 40}\n"
+        + "   2- 10 F9.5  deg   RAdeg Right ascension\n  12- 20 F9.5  deg   DEdeg Declination\n"
+        + f"{'-' * 40}\n",
+    ],
+    ids=["IPAC", "IPAC with keys", "CDS"],
+)
+def test_tables_of_archives(tmp_path, path, place, head):
+    sky = TANGENT.pixel_to_world(*place.T)
+    rows = [f" {ra:9.5f} {dec:9.5f}\n" for ra, dec in zip(sky.ra.deg, sky.dec.deg, strict=True)]
+    (tmp_path / "list.tbl").write_text(head + "".join(rows))
+    np.testing.assert_allclose(positions(path, tmp_path / "list.tbl"), place, atol=0.1)
+
+
+NO_NAMES = "no names of columns"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b" 12.5  14.25\n 33.1  8.0\n", NO_NAMES),  # IRAF's .coo
+        (b"12.5,14.25\n33.1,8.0\n", NO_NAMES),
+        (b"star1 12.5 14.25\nstar2 33.1 8.0\n", NO_NAMES),
+        (b"0 1 12.50 14.25 1.02 150.3 -0.01 0.02 92 1e-3 1\n", NO_NAMES),  # DOLPHOT
+        (b"10:00:12 +20:30:00\n", NO_NAMES),
+        (b" \tLabel\tslice\tX(FITS)_T1\tY(FITS)_T1\n1\ta.fits\t1\t2.5\t3.5\n", "AstroImageJ"),
+        (b'[{"Position": {"X": 1.5, "Y": 2.5}, "HFR": 2.1}]', "JSON"),
+        (b'{\n  "stars": [\n    {"x": 1.5}\n  ]\n}\n', "JSON"),
+        (b"x;y\n12,5;14,25\n", "'x' holds '12,5' in row 1.*decimal point"),
+        (b"x\ty\n12\t14,25\n", "'y' holds '14,25' in row 1.*decimal point"),
+        (b"x y\n12.5 14.25\n1 14,25\n", "'y' holds '14,25' in row 2.*decimal point"),
+        (b"ra;dec\n12,5;14,25\n", "'ra' holds '12,5' in row 1.*decimal point"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(40), "HDF5"),
+        (b"\x93NUMPY\x01\0" + bytes(40), "npy"),
+        (b"ARROW1\0\0" + bytes(40), "Feather"),
+        ("x,y,größe\n1,2,3\n".encode("latin-1"), "UTF-8"),
+    ],
+)
+def test_other_formats_are_named_or_ask_for_names(tmp_path, image, content, message):
+    (tmp_path / "list").write_bytes(content)
+    with pytest.raises(Error, match=message):
+        positions(image, tmp_path / "list", origin=0)
 
 
 # Origin.

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import re
+import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from difflib import get_close_matches
 from importlib.metadata import PackageNotFoundError, distribution, requires
@@ -149,6 +150,15 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
     alike = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
     alike = sorted(alike, key=len) or get_close_matches(word, names, n=1)
     return f"; did you mean {' or '.join(alike[:3])}?" if alike else ""
+
+
+def require_file(path: Path) -> None:
+    """Raise Error for a pipe or a device, whose opening or reading might never end."""
+    # Readers have their own words for a path that is missing.
+    with suppress(OSError, ValueError):
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise Error(f"{path}: a pipe or a device, expected a file")
 
 
 def no_such_file(path: Path) -> str:

@@ -12,7 +12,9 @@ import hashlib
 import io
 import json
 import os
+import platform
 import secrets
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.base.errors import Error, no_such_file
+from psfdae.base.errors import Error, no_such_file, require_file
 from psfdae.base.version import __version__
 
 if TYPE_CHECKING:
@@ -34,6 +36,55 @@ if TYPE_CHECKING:
 
 class ProductError(Error, RuntimeError):
     """Error of a data product that is missing, damaged, or not what the stage expects."""
+
+
+class OutputError(Error, ValueError):
+    """Output that would replace one of the inputs, or a device."""
+
+
+def temporary_name(name: str) -> str:
+    """Return a new name, .NAME.HOST-PROCESS-RANDOM.tmp, by which `left_over` finds the process."""
+    # A name has at most 255 bytes, and a character up to four of them.
+    host = zlib.crc32(platform.node().encode())
+    return f".{name[:40]}.{host:08x}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
+
+
+def left_over(folder: Path, name: str) -> list[Path]:
+    """Return the files of a `temporary_name` whose process was killed.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        As for `temporary_name`. Files of processes that run, or of other hosts, are not returned.
+    """
+    # All but the number of the process and the random digits is the same.
+    start = temporary_name(name).rsplit("-", 2)[0]
+    ended = []
+    for path in folder.glob(f"{escape(start)}-*-????????.tmp"):
+        try:
+            os.kill(int(path.name.split("-")[-2]), 0)  # signal 0 only asks whether it exists
+        except (ProcessLookupError, OverflowError):
+            ended.append(path)
+        except (PermissionError, ValueError):  # a process of another user, or another name
+            continue
+    return ended
+
+
+def output_path(path: Path) -> Path:
+    """Return the file that an output replaces or creates; symbolic links are followed.
+
+    Raises
+    ------
+    OutputError
+        If there is something else than a regular file: a device, a pipe, a folder, or a symbolic
+        link in a circle.
+    """
+    path = Path(os.path.realpath(path))
+    if os.path.lexists(path) and not path.is_file():
+        kind = "folder" if path.is_dir() else "device, a pipe or a circle of links"
+        raise OutputError(f"{path}: is a {kind}, not a file; choose another name")
+    return path
 
 
 _unnamed: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("unnamed", default=None)
@@ -53,7 +104,7 @@ def renamed_together(main: Path) -> Iterator[None]:
     main : Path
         The output whose existence means that everything is done.
     """
-    unnamed: list[tuple[Path, Path]] = []
+    main, unnamed = output_path(main), list[tuple[Path, Path]]()
     token = _unnamed.set(unnamed)
     try:
         yield
@@ -68,7 +119,8 @@ def renamed_together(main: Path) -> Iterator[None]:
 
 def is_cut_off(main: Path) -> bool:
     """Return whether a command was killed before its output `main`, and so all, had its name."""
-    return not main.exists() and any(main.parent.glob(f".{escape(main.name[:40])}.????????.tmp"))
+    main = output_path(main)
+    return not main.exists() and bool(left_over(main.parent, main.name))
 
 
 @contextmanager
@@ -76,8 +128,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a new, empty file beside `path`; rename it onto `path` if the block succeeds.
 
     A reader therefore never sees a half-written file, and an interrupted stage leaves nothing
-    that looks finished. A writer that is killed leaves its temporary file, whose name begins with
-    a dot and ends in .tmp.
+    that looks finished. A file that is replaced keeps its permissions, and a symbolic link to it
+    stays. A writer that is killed leaves its temporary file, which the next writer of `path`
+    removes.
 
     Parameters
     ----------
@@ -93,14 +146,23 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     ------
     OSError
         If the system cannot write; the error names `path`.
+    OutputError
+        If `path` is a device, a pipe or a folder.
     """
-    path, unnamed = Path(path), _unnamed.get()
+    path, unnamed = output_path(Path(path)), _unnamed.get()
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A name has at most 255 bytes, and a character up to four of them.
-    temporary = path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}.tmp")
+    for unfinished in left_over(path.parent, path.name):
+        unfinished.unlink(missing_ok=True)
+    temporary = path.with_name(temporary_name(path.name))
+    # Permissions of the file that is replaced; a new one has those of the user's mask.
+    mode = path.stat().st_mode if path.exists() else None
     try:
-        temporary.touch(exist_ok=False)
+        # Nobody else reads the content before it has its permissions.
+        temporary.touch(0o666 if mode is None else 0o600, exist_ok=False)
         yield temporary
+        # Some file systems have the same permissions for all files, and refuse a change.
+        if mode not in (None, temporary.stat().st_mode):
+            temporary.chmod(mode)
         # The content is on the disk before it has its name, in case that the power fails between.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
@@ -446,6 +508,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
 
     # Reading a damaged chunk raises OSError, because its checksum is wrong.
     path = Path(path)
+    require_file(path)
     try:
         with h5py.File(path, "r") as file:
             # A file of another stage is refused by its kind, before anything of it is used.
@@ -470,12 +533,8 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-class OutputError(Error, ValueError):
-    """Output that would replace one of the inputs."""
-
-
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
-    """Refuse outputs that are inputs, too.
+    """Refuse outputs that are inputs, too, or no regular files.
 
     Parameters
     ----------
@@ -487,10 +546,10 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> N
     Raises
     ------
     OutputError
-        For the first output that is an input.
+        For the first output that is an input, a device, a pipe or a folder.
     """
     # Links and relative names are followed, because they may be the same file.
-    input_paths = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
+    input_paths = {Path(os.path.realpath(name)) for name in inputs if isinstance(name, str | Path)}
     for out in outputs:
-        if out is not None and out.resolve() in input_paths:
+        if out is not None and output_path(out) in input_paths:
             raise OutputError(f"{out}: is an input, too; choose another name")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from psfdae.base.errors import no_such_file
+from psfdae.base.errors import no_such_file, require_file
 from psfdae.base.files import ProductError, map_texts, without_apostrophe
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ class UniqueKeyLoader(yaml.SafeLoader):
 def _text(path: Path) -> str:
     """Return the content of a file in UTF-8; raise ProductError if it cannot be read."""
     # The whole file at once: the files that people write are small.
+    require_file(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -156,6 +157,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     import pandas as pd
 
     # pandas raises ValueError for cells that are not of the type that is asked for.
+    require_file(path)
     try:
         if path.suffix == ".parquet":
             # pyarrow verifies the checksums of pages only if it is asked to.

@@ -177,8 +177,6 @@ def check_targets(
     check_outputs(targets, inputs)
     overwrite = overwrite or is_cut_off(out)
     for target in targets:
-        if target.is_dir():
-            raise PredictionError(f"{target}: is a folder, not a file")
         if target.exists() and not overwrite:
             raise PredictionError(f"{target}: exists already; --overwrite replaces it")
     for target in targets[1:]:

@@ -71,7 +71,7 @@ class Catalogue:
         ----------
         name : str
         strict : bool
-            Refuse a text that is no number; else it is NaN.
+            Refuse a text that is no number; else it is NaN, unless it has a decimal comma.
 
         Raises
         ------
@@ -93,10 +93,11 @@ class Catalogue:
             try:
                 numbers[row] = float(text or "nan")
             except ValueError:
-                if strict:
+                if strict or "," in text:
                     raise ObservationError(
                         self.path,
-                        f"column {name!r} holds {text[:40]!r} in row {row + 1}, expected a number",
+                        f"column {name!r} holds {text[:40]!r} in row {row + 1}, expected a number "
+                        "with a decimal point",
                     ) from None
         return numbers
 
@@ -147,11 +148,16 @@ class Catalogue:
 
         Columns without unit are in degrees; text with colons, blanks or letters is
         sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
-        off the sphere are NaN, and an error if all are.
+        off the sphere are NaN, and an error if all are. LSST's `coord_ra` and `coord_dec` without
+        a unit are in radians if all may be.
         """
-        # Angles beyond a pole are no place on the sky.
         ra = self._angles(positions.first, "hourangle")
         dec = self._angles(positions.second, "deg")
+        # Lists of LSST that are in degrees have larger numbers nearly everywhere on the sky.
+        has_unit = getattr(self._column(positions.first), "unit", None) is not None
+        if positions.first.lower() == "coord_ra" and not has_unit and np.nanmax(ra) < 2 * np.pi:
+            ra, dec = np.rad2deg(ra), np.rad2deg(dec)
+        # Angles beyond a pole are no place on the sky.
         on_sphere = np.abs(dec) <= 90
         if not on_sphere.any():
             row = np.flatnonzero(np.isfinite(dec))[0]
@@ -181,7 +187,7 @@ class Catalogue:
         if any(re.search(r"[:hd\s]", text, re.IGNORECASE) for text in texts):
             # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
             whole_parts = [
-                int(number[0]) for number in map(re.compile(r"\d+").match, texts) if number
+                float(number[0]) for number in map(re.compile(r"\d+").match, texts) if number
             ]
             if max(whole_parts, default=0) > 24:
                 sexagesimal_unit = "deg"

@@ -11,9 +11,9 @@ import bz2
 import gzip
 import io
 import lzma
+import math
 import os
 import re
-import shutil
 import tempfile
 import weakref
 import zipfile
@@ -25,6 +25,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.base.errors import require_file
+from psfdae.base.files import left_over, temporary_name
 from psfdae.image.errors import ObservationError, reading, shorten
 
 if TYPE_CHECKING:
@@ -68,6 +70,20 @@ UNPACK: dict[bytes, Callable[[IO[bytes]], Any]] = {
 }
 """How files that are compressed as a whole are read, by their first bytes."""
 
+OTHER_FORMATS = {
+    **{b"\x89HDF": "HDF5", b"#ASDF": "ASDF", b"PAR1": "Parquet", b"ARROW1": "Feather"},
+    **{b"\x93NUMPY": ".npy", b"\x80": "pickle", b"{": "JSON", b"[{": "JSON", b"[[": "JSON"},
+    **{b"XISF": "XISF", b"II*": "TIFF", b"MM\0*": "TIFF", b"\x89PNG": "PNG", b"\xff\xd8": "JPEG"},
+}
+"""Names of formats that are not read here, for messages, by their first bytes."""
+
+
+def other_format(start: bytes) -> str:
+    """Return ", but " and the name of a format by the first bytes of its files, or ""."""
+    start = b"".join(start.split())
+    names = (name for magic, name in OTHER_FORMATS.items() if start.startswith(magic))
+    return next((f", but {name}" for name in names), "")
+
 
 @dataclass(frozen=True)
 class PlainFile:
@@ -106,21 +122,43 @@ def plain_file(path: Path) -> PlainFile:
     ObservationError
         If there is no such file, or it is not a FITS file.
     """
+    file, start = unpacked(path)
+    if not start.startswith(b"SIMPLE  ="):
+        raise ObservationError(path, f"not a FITS file{other_format(start)}")
+    return file
+
+
+def unpacked(path: Path) -> tuple[PlainFile, bytes]:
+    """Return a file of any format, unpacked if need be, and its first 80 bytes."""
+    require_file(path)
     with reading(path), path.open("rb") as file:
-        # The first bytes tell how the file is compressed, if it is.
+        # The first bytes tell how the file is compressed, if it is. A model of psfdae begins with
+        # eight bytes of any value, and a brace.
         start = file.read(80)
         file.seek(0)
         for magic, unpack in UNPACK.items():
-            if start.startswith(magic):
+            if start.startswith(magic) and start[8:9] != b"{":
                 with unpack(file) as content:
-                    return temporary_file(path, content)
-    if not start.startswith(b"SIMPLE  ="):
-        raise ObservationError(path, "not a FITS file")
-    return PlainFile(path, path)
+                    copy = temporary_file(path, content, unpacked_max(path.stat().st_size))
+                with copy.path.open("rb") as plain:
+                    return copy, plain.read(80)
+    return PlainFile(path, path), start
 
 
-def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
+def unpacked_max(packed_bytes: int) -> int:
+    """Return the largest number of bytes that is unpacked from so many.
+
+    It is the memory of the machine, or less: deflate packs at most 1032 bytes into one, and Rice's
+    coding fewer. No image of the sky with noise comes near that. Small files may have 64 MB.
+    """
+    memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(memory_bytes, max(2**26, 1032 * packed_bytes))
+
+
+def temporary_file(name: Path, content: IO[bytes], bytes_max: float = math.inf) -> PlainFile:
     """Return a FITS file of this content, which exists as long as the object that is returned.
+
+    Temporary files of processes that were killed are removed.
 
     Parameters
     ----------
@@ -128,10 +166,29 @@ def temporary_file(name: Path, content: IO[bytes]) -> PlainFile:
         What messages call the file.
     content : file
         Open for reading bytes, at the start of what is copied.
+    bytes_max : float
+
+    Raises
+    ------
+    ObservationError
+        If there are more bytes than `bytes_max`.
     """
-    with tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits", delete=False) as copy:
-        shutil.copyfileobj(content, copy)
-    plain, process = PlainFile(name, Path(copy.name), is_copy=True), os.getpid()
+    folder = Path(tempfile.gettempdir())
+    for unfinished in left_over(folder, "psfdae"):
+        unfinished.unlink(missing_ok=True)
+    plain, process = PlainFile(name, folder / temporary_name("psfdae"), is_copy=True), os.getpid()
+    # Only the user reads it.
+    plain.path.touch(0o600, exist_ok=False)
+    try:
+        with plain.path.open("wb") as copy:
+            while block := content.read(2**20):
+                copy.write(block)
+                if copy.tell() > bytes_max:
+                    problem = f"unpacks to more than {bytes_max / 2**20:.0f} MB"
+                    raise ObservationError(name, f"{problem}; unpack it yourself")
+    except BaseException:
+        plain.path.unlink(missing_ok=True)
+        raise
 
     def remove(path: Path) -> None:
         # A forked process has this object too, but must not delete the file.
@@ -349,6 +406,10 @@ def find_image(
         missing = hdu.fileinfo()["datLoc"] + stored.size - file.path.stat().st_size
         if missing > 0:
             raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
+        # Tiles can share their bytes, so that a small file unpacks to any size.
+        size = math.prod(shape) * abs(header["BITPIX"]) // 8
+        if stored is not hdu and size > unpacked_max(stored.size):
+            raise ObservationError(path, f"damaged: {size} bytes in tiles of {stored.size} bytes")
         # values = BSCALE · stored + BZERO
         bscale, bzero, blank = (card_value(header, key) for key in ("BSCALE", "BZERO", "BLANK"))
         bscale, bzero = float(1.0 if bscale is None else bscale), float(bzero or 0.0)
@@ -409,9 +470,11 @@ def map_kind_by_name(name: str) -> str | None:
 
 def is_science(name: str) -> bool:
     """Return True unless the name is that of a map which goes with an image, such as DQ."""
-    # Sky, context and exposure maps, samples up the ramp, and distortions of the WCS.
+    # Sky, context and exposure maps, samples up the ramp, distortions of the WCS, and the pixels
+    # whose sum is the flux of a star of Kepler or TESS.
     other_names = (
-        "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR"
+        "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR|"
+        "APERTURE"
     )
     is_other = re.fullmatch(other_names, name.strip().upper()) is not None
     return map_kind_by_name(name) is None and not is_other
@@ -444,8 +507,13 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
         return hdu
     # Else the only image that is no mask, error or the like.
     images = [hdu for hdu in hdus if has_pixels(hdu)]
+    science = [hdu for hdu in images if is_science(hdu.name)]
+    # The images of a star of Kepler or TESS are cells of a table.
+    if not science and "APERTURE" in (hdu.name for hdu in images):
+        problem = "a target pixel file: its images are in a table; write one as an image"
+        raise ObservationError(path, f"{problem}; the file has {listed}")
     # Of a file that has nothing but such extensions, any may be meant.
-    science = [hdu for hdu in images if is_science(hdu.name)] or images
+    science = science or images
     if not science:
         raise ObservationError(path, f"no image; the file has {listed}")
     # The science image of a pipeline, if there is just one, whatever other layers are called.

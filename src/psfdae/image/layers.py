@@ -369,7 +369,9 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
     """
     # An array, the path of a file, or else an extension; a text may be either of these two.
     is_array = isinstance(place, np.ndarray)
-    is_file = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
+    # A name that is no file is an extension's; a pipe is refused when it is opened.
+    is_name = isinstance(place, str) and (Path(place).is_dir() or not Path(place).exists())
+    is_file = isinstance(place, str | Path) and not is_name
     if image.values is not None and not (is_array or is_file):
         raise ObservationError(image.path, f"{role} of an array is an array, too, or a file")
     if is_array:

@@ -1,4 +1,4 @@
-"""Star lists in files: FITS tables and LDAC, text tables, VOTable, DAOPHOT, DS9, VizieR.
+"""Star lists in files: FITS tables and LDAC, text, VOTable, Parquet, DAOPHOT, DS9, VizieR.
 
 In: a file. Out: its table as astropy has it, a row for each star in the order of the file.
 
@@ -8,17 +8,27 @@ the lists of DAOPHOT itself and the regions of DS9 are read here.
 
 from __future__ import annotations
 
+import codecs
 import io
+import math
+import operator
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from psfdae.base.errors import needed_by
 from psfdae.image.errors import ObservationError, reading, shorten
-from psfdae.image.fits_file import UNPACK, open_hdus, plain_file
+from psfdae.image.fits_file import PlainFile, open_hdus, other_format, unpacked, unpacked_max
 
 if TYPE_CHECKING:
     from astropy.table import Table
+
+
+COLUMNS_MAX = 2000
+"""Largest number of columns of a list that is text; LSST's have 1300."""
 
 
 def read_list_table(path: Path) -> Table:
@@ -38,18 +48,23 @@ def read_list_table(path: Path) -> Table:
     ObservationError
         If the file is missing, damaged, or of none of the formats.
     """
+    # A FITS file or a Parquet file; of text, the first line that is not blank tells the format.
+    file, start = unpacked(path)
+    if start.startswith(b"SIMPLE  ="):
+        return fits_table(file)
+    if start.startswith(b"PAR1"):
+        return parquet_table(file)
     with reading(path):
-        content = path.read_bytes()
-    # A FITS file, perhaps packed; of text, the first line that is not blank tells the format.
-    if content.startswith((b"SIMPLE  =", *UNPACK)):
-        return fits_table(path)
+        content = file.path.read_bytes()
     # Text may begin with a mark of its encoding; a byte 0 is in no text.
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode("utf-8-sig")
+        text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = "\x00"
-    if "\x00" in text:
-        raise ObservationError(path, "neither a FITS table nor text in UTF-8")
+    other = other_format(start)
+    if "\x00" in text or other:
+        raise ObservationError(path, f"neither a FITS table nor text in UTF-8{other}")
     lines = [line for line in text.splitlines() if line.strip()]
     if not lines:
         raise ObservationError(path, "the catalogue is empty")
@@ -62,12 +77,12 @@ def read_list_table(path: Path) -> Table:
     return text_table(path, lines)
 
 
-def fits_table(path: Path) -> Table:
+def fits_table(file: PlainFile) -> Table:
     """Read the LDAC_OBJECTS or the only table of a FITS file; columns stay in the file till used.
 
     Parameters
     ----------
-    path : Path
+    file : PlainFile
 
     Raises
     ------
@@ -77,7 +92,7 @@ def fits_table(path: Path) -> Table:
     from astropy.io import fits
     from astropy.table import Table
 
-    file = plain_file(path)
+    path = file.name
     with reading(path), open_hdus(file, memmap=True) as hdus:
         # LDAC_IMHEAD has the header of the image, LDAC_OBJECTS the stars.
         tables = [
@@ -89,11 +104,44 @@ def fits_table(path: Path) -> Table:
         if len(objects) != 1:
             table_names = shorten([hdu.name or "(no name)" for hdu in objects])
             raise ObservationError(path, f"expected one table of stars, found {table_names}")
-        # Rows that the header announces and the file does not have.
-        size = objects[0].header["NAXIS1"] * objects[0].header["NAXIS2"]
-        if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
+        # Rows that the header announces and the file does not have, or arrays that share bytes.
+        file_size, header = file.path.stat().st_size, objects[0].header
+        if objects[0].fileinfo()["datLoc"] + header["NAXIS1"] * header["NAXIS2"] > file_size:
             raise ObservationError(path, "damaged: the table is larger than the file")
+        rows = np.asarray(objects[0].data)
+        arrays = [c.name for c in objects[0].columns if re.match(r"\d*[PQ]", str(c.format))]
+        if sum(np.abs(rows[name][:, 0]).sum() for name in arrays) > 8 * file_size:
+            raise ObservationError(path, "damaged: its arrays are larger than the file")
         return Table.read(objects[0], format="fits", mask_invalid=False, unit_parse_strict="silent")
+
+
+def parquet_table(file: PlainFile) -> Table:
+    """Read the columns of a Parquet file of which each row is a star.
+
+    Parameters
+    ----------
+    file : PlainFile
+
+    Raises
+    ------
+    ObservationError
+        If the file is damaged.
+    MissingExtraError
+        If pyarrow or pandas is not installed.
+    """
+    from astropy.table import Table
+
+    with needed_by(f"the star list {file.name}"), reading(file.name):
+        from pyarrow import parquet
+
+        # Rows that are equal take no space in the file.
+        described = parquet.read_metadata(file.path)
+        size = 8 * described.num_rows * described.num_columns
+        if size > unpacked_max(file.path.stat().st_size):
+            raise ObservationError(file.name, f"unpacks to {size} bytes; write it as FITS")
+        # Damaged pages are found by their checksums, if the file has them.
+        rows = parquet.read_table(file.path, page_checksum_verification=True)
+        return Table.from_pandas(rows.to_pandas())
 
 
 def text_table(path: Path, lines: Sequence[str]) -> Table:
@@ -108,28 +156,56 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
     Raises
     ------
     ObservationError
-        If there is no row of a star, or the text is no table.
+        If there is no row of a star, or no names of columns, or the text is no table.
     """
     from astropy.io import ascii as text_tables
 
-    # IRAF's DAOPHOT, ECSV and SExtractor describe their columns in comments.
-    options: dict[str, Any]
-    if lines[0].startswith(("#K ", "#N ")):
-        options = {"format": "daophot"}
-    elif lines[0].startswith("# %ECSV"):
-        options = {"format": "ecsv"}
-    elif re.match(r"#\s*\d+\s+[A-Za-z_]\w*", lines[0]):
-        options = {"format": "sextractor"}
-    else:
-        lines = plain_rows(lines)
-        # The first mark that the line of names has.
-        delimiter = next((mark for mark in ",;\t" if mark in lines[0]), " ") if lines else ","
-        options = {"format": "basic", "delimiter": delimiter}
+    options = {"format": text_format(lines)}
+    if options["format"] == "basic" and (lines := plain_rows(lines)):
+        # The first mark that the line of names has; of tabs, the first name may be blank.
+        options["delimiter"] = next((mark for mark in ",;\t" if mark in lines[0]), " ")
+        if lines[0].lstrip(" ").startswith("\t"):
+            options = {"format": "tab"}
     if not lines:
         raise ObservationError(path, "the catalogue has no stars")
+    if is_row_of_numbers(lines[0]):
+        problem = f"no names of columns: its first row is {lines[0].strip()[:40]!r}"
+        raise ObservationError(path, f"{problem}; write a row such as 'x y' above it")
+    if "X(FITS)_T1" in lines[0]:
+        raise ObservationError(path, "a table of AstroImageJ with a row for each image")
+    # The time of astropy grows with the square of the length of a name, and of their number.
+    for line in [lines[0], *(line for line in lines if line.startswith("|"))]:
+        words = re.split(r"[,;|\s]+", line)
+        if max(len(words), *map(len, words)) > COLUMNS_MAX:
+            raise ObservationError(path, f"more than {COLUMNS_MAX} columns, or letters in a name")
     with reading(path):
         # The line break at the end is what tells a table from the name of a file.
         return text_tables.read("\n".join(lines) + "\n", guess=False, **options)
+
+
+TEXT_FORMATS = {
+    "daophot": r"#[KN] ",
+    "ecsv": r"# %ECSV",
+    # Each comment is of a column. Siril's first one begins with a number, too.
+    "sextractor": r"#\s*\d+\s+[A-Za-z_].*\n#\s*\d+\s+[A-Za-z_]",
+    "ipac": r"[|\\]",
+    "cds": r"(?s:.*)^Byte-by-byte Description",
+}
+"""Formats of astropy that describe their columns above the rows, by their beginning."""
+
+
+def text_format(lines: Sequence[str]) -> str:
+    """Return the format of a text table by its lines that are not blank, "basic" for any other."""
+    head = "\n".join(lines[:200])
+    names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
+    return next(names, "basic")
+
+
+def is_row_of_numbers(row: str) -> bool:
+    """Return whether most words of a row of a text table are numbers, or sexagesimal angles."""
+    words = re.split(r"[,;|\s]+", row.strip())
+    form = re.compile(r"[-+.:\d]+([eE][-+]?\d+)?")
+    return 2 * sum(form.fullmatch(word) is not None for word in words) > len(words)
 
 
 def plain_rows(lines: Sequence[str]) -> Sequence[str]:
@@ -148,10 +224,9 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
     if not rows:
         return []
     preamble = lines[: lines.index(rows[0])]
-    # The letter e may stand in a number.
-    if preamble and not any(c.isalpha() for c in rows[0].replace("e", "").replace("E", "")):
+    if preamble and is_row_of_numbers(rows[0]):
         return [preamble[-1].lstrip("# \t"), *rows]
-    has_dashes = len(rows) > 2 and re.fullmatch(r"[-\t;|, ]*---?[-\t;|, ]*", rows[2])
+    has_dashes = len(rows) > 2 and "--" in rows[2] and not rows[2].strip("-\t;|, ")
     return [rows[0], *rows[3:]] if has_dashes else rows
 
 
@@ -173,11 +248,24 @@ def votable(path: Path, content: bytes) -> Table:
         If its data lie elsewhere, or not exactly one table has rows.
     """
     from astropy.io.votable import parse
+    from astropy.utils.xml.iterparser import get_xml_iterator
 
-    if re.search(rb"<!ENTITY|<(?:\w+:)?STREAM\b[^>]*\bhref", content):
-        raise ObservationError(path, "a VOTable whose data are not in it; write them into it")
-    # Tables of other things than stars may be there without rows.
     with reading(path):
+        # The elements as the reader of VOTables gets them, whatever their spelling in the file. It
+        # has memory for the rows and values that they announce, 256 rows at least.
+        rows, widths = 256, [0]
+        with get_xml_iterator(io.BytesIO(content)) as elements:
+            for _, tag, attributes, _ in filter(operator.itemgetter(0), elements):
+                if tag == "STREAM" and "href" in attributes:
+                    problem = "a VOTable whose data are not in it"
+                    raise ObservationError(path, f"{problem}; write them into it")
+                rows = max(rows, int(attributes.get("nrows", 0)))
+                if tag == "FIELD":
+                    sizes = re.findall(r"\d+", attributes.get("arraysize", ""))
+                    widths.append(8 * math.prod(map(int, sizes)))
+        if len(widths) > COLUMNS_MAX or rows * sum(widths) > unpacked_max(len(content)):
+            raise ObservationError(path, f"damaged: {len(widths)} columns, {rows} rows")
+        # Tables of other things than stars may be there without rows.
         tables = [
             table.to_table(use_names_over_ids=True)
             for table in parse(io.BytesIO(content), verify="ignore").iter_tables()
@@ -221,7 +309,11 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     }
     other_systems = {"physical", "fk4", "b1950", "galactic", "ecliptic", "wcs", "detector"}
     shapes = ("circle", "point", "ellipse", "box", "annulus")
-    form = re.compile(r"([+-]?)\s*([a-z]+)\s*[( ]\s*([^,\s)]+)[,\s]+([^,\s)]+)", re.IGNORECASE)
+    # Sign, shape and centre. No part gives back what it has matched (++), so that the time grows
+    # with the length of a line, and not with its square.
+    form = re.compile(
+        r"([+-]?)\s*+([a-z]++)(?:\s*+\(|\s)\s*+([^,\s)]++)[,\s]++([^,\s)]++)", re.IGNORECASE
+    )
     system, systems = "", set()
     centres, labels = [], []
     for line in lines:
@@ -246,7 +338,7 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
             systems.add(system)
             centres.append(region.group(3, 4))
             # Three ways to quote the text.
-            label = re.search(r"text\s*=\s*(?:\{([^}]*)\}|\"([^\"]*)\"|'([^']*)')", properties)
+            label = re.search(r"text\s*+=\s*+(?:\{([^}]*+)|\"([^\"]*+)|'([^']*+))", properties)
             labels.append(next(filter(None, label.groups()), "") if label else "")
     if len(systems) > 1 or not systems <= systems_known.keys():
         raise ObservationError(

@@ -70,6 +70,13 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
         origin=1,
         flags="FLAGS",
     ),
+    # SourceXtractor++ from version 0.11 on, and the FITS coordinates of AstroImageJ.
+    Positions.of_pairs("pixel_centroid_x,pixel_centroid_y", origin=1),
+    Positions.of_pairs("X(FITS),Y(FITS)", origin=1),
+    # LSST's pipelines.
+    Positions.of_pairs(
+        "slot_Centroid_x,slot_Centroid_y base_SdssCentroid_x,base_SdssCentroid_y", origin=0
+    ),
     # photutils; its xcenter counts from 0, and IRAF's XCENTER from 1.
     Positions.of_pairs("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid", origin=0),
     Positions.of_pairs("xcenter,ycenter", origin=0, exact=True),
@@ -94,13 +101,14 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
         sky=True,
         flags="FLAGS",
     ),
-    # Gaia, VizieR, Pan-STARRS and others; each pair is a convention of its own, too.
+    # Gaia, VizieR, Pan-STARRS, LSST and others; each pair is a convention of its own, too.
     *(
         Positions.of_pairs(pair, sky=True)
         for pair in (
             *("ra,dec", "RAJ2000,DEJ2000", "RAJ2000,DECJ2000", "_RAJ2000,_DEJ2000"),
             *("RA_ICRS,DE_ICRS", "RA_ICRS,DEC_ICRS", "RA_J2000,DEC_J2000"),
             *("ra_deg,dec_deg", "raMean,decMean", "radeg,decdeg", "radeg,dedeg"),
+            *("coord_ra,coord_dec", "world_centroid_alpha,world_centroid_delta"),
         )
     ),
 )

@@ -31,7 +31,8 @@ from pydantic import ValidationError
 from psfdae.base.errors import Error, needed_by, no_such_file
 from psfdae.base.files import ProductError, atomic_path
 from psfdae.base.version import __version__
-from psfdae.image.errors import one_line
+from psfdae.image.errors import ObservationError, one_line, reading
+from psfdae.image.fits_file import open_hdus, other_format, unpacked
 from psfdae.methods import method
 from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.methods.interface import Method
@@ -217,6 +218,24 @@ def shipped_path() -> Path:
     return Path(str(files("psfdae.model") / "bundles" / f"wfsat{SUFFIX}"))
 
 
+def foreign_format(path: Path) -> str:
+    """Return the name of the format of a file that is no bundle, such as "PSFEx"; else "".
+
+    Raises
+    ------
+    Error
+        If the file is missing or cannot be read.
+    """
+    file, start = unpacked(path)
+    if not start.startswith(b"SIMPLE  ="):
+        return other_format(start).removeprefix(", but ")
+    # By the names of extensions and keys.
+    with reading(path), open_hdus(file) as hdus:
+        names = {*(hdu.name for hdu in hdus), *hdus[0].header}
+    kinds = {"PSF_DATA": "PSFEx", "NXPSFS": "STDPSF", "DET_YX0": "STPSF", "PSF_WCS": "Piff"}
+    return next((kind for name, kind in kinds.items() if name in names), "FITS")
+
+
 def read_bundle(path: Path | None = None) -> Bundle:
     """Read a bundle, by default the shipped one, and check it, or raise BundleError.
 
@@ -237,6 +256,10 @@ def read_bundle(path: Path | None = None) -> Bundle:
     try:
         # A bundle of stamps of 256 × 256 pixels has some 20 MB.
         size, max_size = path.stat().st_size, 2**28
+        # A model of another program is named.
+        kind = foreign_format(path)
+        readers = "; psf and photometry read it" if kind in ("PSFEx", "STDPSF", "STPSF") else ""
+        _require(not kind, path, f"of the format {kind}, expected a model of psfdae{readers}")
         _require(size <= max_size, path, f"{size} bytes, at most {max_size}")
         with safe_open(path, framework="numpy") as file:
             text = json.loads((file.metadata() or {}).get("bundle", "null"))
@@ -258,7 +281,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         first = error.errors(include_input=False)[0]
         key = ".".join(str(part) for part in first["loc"])
         raise BundleError(f"{path}: damaged ({key[:80]}: {first['msg']})") from None
-    except BundleError:
+    except (BundleError, ObservationError):
         raise
     except OSError as error:
         raise BundleError(f"{path}: cannot be read ({error.strerror or error})") from None

@@ -9,8 +9,8 @@ centred there would get.
 
 from __future__ import annotations
 
-import hashlib
 import re
+from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -19,27 +19,157 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from psfdae.base.errors import keyword
-from psfdae.base.files import atomic_path, write_fits
+from psfdae.base.files import atomic_path, sha256_of, write_fits
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line, reading
-from psfdae.image.fits_file import BLOCK_BYTES, Card, open_hdus, plain_file
+from psfdae.image.fits_file import (
+    BLOCK_BYTES,
+    Card,
+    find_image,
+    open_hdus,
+    open_pixels,
+    plain_file,
+)
+from psfdae.model.bundle import foreign_format
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model
 from psfdae.stars.moments import measure_shapes
 
 
 def load_field(path: Path) -> FieldPsfs:
-    """Return the PSF over an image from a bundle of psfdae, or from a .psf file of PSFEx.
+    """Return the PSF over an image from a bundle of psfdae, or from a file of another program.
+
+    These are .psf of PSFEx, STDPSF, and grids of STPSF and photutils.
 
     Raises
     ------
     Error
         If the file cannot be read or is something else.
     """
-    return PsfexField(path) if path.suffix == ".psf" else load_model(path)
+    fields = {"PSFEx": PsfexField, "STDPSF": GridField, "STPSF": GridField}
+    return fields.get(foreign_format(path), load_model)(path)
 
 
-class PsfexField(FieldPsfs):
+class FieldFile(FieldPsfs):
+    """PSF over an image in a file of another program.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    image_px = None
+    order = 0
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.name = path, path.stem
+
+    def _refuse(self, problem: str) -> NoReturn:
+        """Raise PredictionError with a problem of the file."""
+        raise PredictionError(f"{self.path}: {problem}")
+
+    @cached_property
+    def sha256(self) -> str:
+        """Checksum of the file."""
+        return sha256_of(self.path)
+
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
+        """Accept any scale: these files do not say how large pixels are."""
+
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        position = position[:, :2]  # neither magnitude nor colour
+        # Offset of the star from the middle of its pixel.
+        phase = position - np.floor(position + 0.5)
+        count = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
+        axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
+        # Sum 1 in the pixels of the stamp of a star in the middle of its pixel.
+        pixels = np.arange(self.stamp_px) - self.stamp_px // 2
+        flux = self.interpolate(position, pixels, np.zeros_like(phase)).sum(axis=(1, 2))
+        return self.interpolate(position, axis, phase) / flux[:, None, None]
+
+    @abstractmethod
+    def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Interpolate the samples of PSFs at pixels about their stars.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n, 2)
+            Positions (x, y) of the stars in the image.
+        axis : ndarray, shape (m,)
+            Pixels along x and along y.
+        phase : ndarray, shape (n, 2)
+            Offsets (x, y) of the stars from the middle of their pixel.
+
+        Returns
+        -------
+        ndarray, shape (n, m, m)
+        """
+
+
+class GridField(FieldFile):
+    """PSFs on a grid, of STDPSF, STPSF or photutils; outside of the grid, the PSF of its edge.
+
+    Parameters
+    ----------
+    path : Path
+        A FITS cube of PSFs, each centred in the middle of its array.
+
+    Attributes
+    ----------
+    grid_model : GriddedPSFModel
+        A spline of each PSF, bilinear between the positions of the grid.
+
+    Raises
+    ------
+    ObservationError
+        If the file is missing or damaged, or its positions are no grid.
+    PredictionError
+        If its positions are of several detectors, or a size is out of range.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from astropy.nddata import NDData
+        from photutils.psf import GriddedPSFModel, STDPSFGrid
+
+        super().__init__(path)
+        image = find_image(path, 0)
+        header = image.headers[0]
+        with reading(path), open_pixels(image, in_pieces=False, dtype=np.float64) as pixels:
+            if "NXPSFS" in header:
+                grid = STDPSFGrid(str(image.file.path))
+                positions, oversampling = np.array(grid.grid_xypos, float), 4
+            else:
+                # Rows and columns. photutils 3.0 exchanges the two, so that they are read here.
+                pairs = [str(header[key]) for key in header if key.startswith("DET_YX")]
+                positions = np.array([p.strip("( )").split(",") for p in pairs], float)[:, ::-1]
+                oversampling = int(str(header["OVERSAMP"]))
+            meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
+            psfs = pixels[:].reshape(-1, *image.shape[-2:])
+            self.grid_model = GriddedPSFModel(NDData(psfs, meta=meta))
+        self.low, self.high = positions.min(axis=0), positions.max(axis=0)
+        # Detectors side by side, each with PSFs at its edge: positions in an image are of one.
+        nodes = [np.unique(axis) for axis in positions.T]
+        if any((np.diff(axis) <= 1).any() for axis in nodes):
+            self._refuse("PSFs of several detectors, expected those of one")
+        self.order = min(3, max(map(len, nodes)) - 1)
+        # Stamps are as large as the sampled images, rounded down to an even number of pixels.
+        self.stamp_px = 2 * int(min(psfs.shape[1:]) / oversampling / 2)
+        if not 2 <= self.stamp_px <= 1025:
+            self._refuse(f"PSFs of {self.stamp_px} px, expected 2 … 1025")
+
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first and the last position (x, y) of the grid."""
+        return self.low, self.high
+
+    def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        pixels = position[..., None] + axis - phase[..., None]
+        stars = zip(position, pixels, strict=True)
+        return np.stack(
+            [self.grid_model.evaluate(*np.meshgrid(*xy), 1.0, *star) for star, xy in stars]
+        )
+
+
+class PsfexField(FieldFile):
     """Model of PSFEx; beyond the stars it was made of, the PSF is that of their edge.
 
     Parameters
@@ -68,13 +198,11 @@ class PsfexField(FieldPsfs):
         If it is not such a model.
     """
 
-    image_px = None
-    order = 0
     unknown_width_px: ClassVar[float] = 1.0
     """Width of a field in pixels that stands for an unknown one."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.name = path, path.stem
+        super().__init__(path)
         # PSFEx writes one table with one row, the images of all terms.
         file = plain_file(path)
         with reading(path), open_hdus(file) as hdus:
@@ -91,10 +219,6 @@ class PsfexField(FieldPsfs):
             raise
         except (KeyError, TypeError, ValueError) as error:
             self._refuse(f"no model of PSFEx ({error})")
-
-    def _refuse(self, problem: str) -> NoReturn:
-        """Raise PredictionError with a problem of the file."""
-        raise PredictionError(f"{self.path}: {problem}")
 
     def _read(self, header: Mapping[str, Any], mask: np.ndarray) -> None:
         """Set polynomial, sampling and scales.
@@ -149,49 +273,16 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.stamp_px = 2 * max(1, int(side * self.step_px / 2))
 
-    @cached_property
-    def sha256(self) -> str:
-        """Checksum of the file."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()
-
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
         if (self.width <= self.unknown_width_px).any():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
-    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
-        """Accept any scale: files of PSFEx do not say how large pixels are."""
-
-    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
-        position = position[:, :2]  # neither magnitude nor colour
+    def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
-        # Offset of the star from the middle of its pixel.
-        phase = position - np.floor(position + 0.5)
-        count = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
-        axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
-        # Sum 1 in the pixels of the stamp of a star in the middle of its pixel.
-        pixels = np.arange(self.stamp_px) - self.stamp_px // 2
-        flux = self._interpolate(sampled, pixels, np.zeros_like(phase)).sum(axis=(1, 2))
-        return np.asarray(self._interpolate(sampled, axis, phase) / flux[:, None, None])
-
-    def _interpolate(self, sampled: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
-        """Interpolate sampled PSFs at pixels about their stars.
-
-        Parameters
-        ----------
-        sampled : ndarray, shape (n, h, w)
-        axis : ndarray, shape (m,)
-            Pixels along x and along y.
-        phase : ndarray, shape (n, 2)
-            Offsets (x, y) of the stars from the middle of their pixel.
-
-        Returns
-        -------
-        ndarray, shape (n, m, m)
-        """
         columns, rows = (
             _lanczos((axis - phase[:, i, None]) / self.step_px, sampled.shape[2 - i])
             for i in (0, 1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from psfdae.base.errors import no_such_file
+from psfdae.base.errors import no_such_file, require_file
 from psfdae.base.files import ProductError, atomic_path
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
     """
     from safetensors import SafetensorError, safe_open
 
+    require_file(path)
     try:
         with safe_open(path, "numpy") as file:
             metadata = dict(json.loads((file.metadata() or {}).get(METADATA_KEY, "{}")))
