@@ -30,7 +30,7 @@ from psfdae.base.files import (
     as_csv,
     atomic_path,
     check_outputs,
-    left_over,
+    find_left_over,
     read_product,
     write_columns,
     write_csv,
@@ -104,7 +104,7 @@ def test_what_a_killed_writer_leaves_is_removed_by_the_next_one(tmp_path):
     for _ in range(2):
         assert subprocess.run([sys.executable, "-c", code, path], check=False).returncode == -9
     assert path.read_text() == "old"
-    (left,) = left_over(tmp_path, path.name)
+    (left,) = find_left_over(tmp_path, path.name)
     others = [tmp_path / name for name in (".file.txt.tmp", f".x{left.name[1:]}", left.name[1:])]
     for other in others:
         other.touch()

@@ -235,23 +235,23 @@ def test_a_damaged_packed_file_leaves_no_copy(good, tmp_path, room, pack, spoil)
 @pytest.mark.parametrize("pack", PACK)
 def test_no_more_is_unpacked_than_a_file_may_hold(tmp_path, room, monkeypatch, pack):
     """A file that unpacks to the limit is read; one byte more, and nothing is left of it."""
-    monkeypatch.setattr(images, "unpacked_max", lambda packed_bytes: 2**21)
+    monkeypatch.setattr(images, "compute_unpacked_max", lambda packed_bytes: 2**21)
     path = tmp_path / "packed"
     for size in (2**21, 2**21 + 1):
         path.write_bytes(PACK[pack](bytes(size)))
         if size == 2**21:
-            assert images.unpacked(path)[0].path.stat().st_size == size
+            assert images.unpack_file(path)[0].path.stat().st_size == size
             continue
         with pytest.raises(ObservationError, match="unpacks to more than 2 MB"):
-            images.unpacked(path)
+            images.unpack_file(path)
     assert leftovers(room) == []
 
 
 def test_the_limit_of_what_is_unpacked_grows_with_the_file():
     memory_bytes = psutil.virtual_memory().total
-    assert images.unpacked_max(14_000) == 2**26
-    assert images.unpacked_max(10**6) == min(1032 * 10**6, memory_bytes)
-    assert abs(images.unpacked_max(2**50) / memory_bytes - 1) < 0.01
+    assert images.compute_unpacked_max(14_000) == 2**26
+    assert images.compute_unpacked_max(10**6) == min(1032 * 10**6, memory_bytes)
+    assert abs(images.compute_unpacked_max(2**50) / memory_bytes - 1) < 0.01
 
 
 @pytest.mark.parametrize(
@@ -546,7 +546,7 @@ def test_rows_of_parquet_that_are_equal_get_no_more_memory_than_its_size_allows(
 ):
     Table({"x": np.ones(10**5), "y": np.ones(10**5)}).to_pandas().to_parquet(tmp_path / "s")
     assert len(read_catalogue(tmp_path / "s")) == 10**5
-    monkeypatch.setattr(list_formats, "unpacked_max", lambda packed_bytes: 10**6)
+    monkeypatch.setattr(list_formats, "compute_unpacked_max", lambda packed_bytes: 10**6)
     with pytest.raises(ObservationError, match="unpacks to 1600000 bytes"):
         read_catalogue(tmp_path / "s")
 

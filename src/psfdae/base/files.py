@@ -43,20 +43,21 @@ class OutputError(Error, ValueError):
 
 
 def temporary_name(name: str) -> str:
-    """Return a new name, .NAME.HOST-PROCESS-RANDOM.tmp, by which `left_over` finds the process."""
+    """Return a new name, .NAME.HOST-PROCESS-RANDOM.tmp, which `find_left_over` looks for."""
     # A name has at most 255 bytes, and a character up to four of them.
     host = zlib.crc32(platform.node().encode())
     return f".{name[:40]}.{host:08x}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
-def left_over(folder: Path, name: str) -> list[Path]:
+def find_left_over(folder: Path, name: str) -> list[Path]:
     """Return the files of a `temporary_name` whose process was killed.
 
     Parameters
     ----------
     folder : Path
+        Folder in which they are.
     name : str
-        As for `temporary_name`. Files of processes that run, or of other hosts, are not returned.
+        Argument of `temporary_name`. Files of processes that run, or of other hosts, are left out.
     """
     # All but the number of the process and the random digits is the same.
     start = temporary_name(name).rsplit("-", 2)[0]
@@ -71,7 +72,7 @@ def left_over(folder: Path, name: str) -> list[Path]:
     return ended
 
 
-def output_path(path: Path) -> Path:
+def resolve_output(path: Path) -> Path:
     """Return the file that an output replaces or creates; symbolic links are followed.
 
     Raises
@@ -104,7 +105,7 @@ def renamed_together(main: Path) -> Iterator[None]:
     main : Path
         The output whose existence means that everything is done.
     """
-    main, unnamed = output_path(main), list[tuple[Path, Path]]()
+    main, unnamed = resolve_output(main), list[tuple[Path, Path]]()
     token = _unnamed.set(unnamed)
     try:
         yield
@@ -119,8 +120,8 @@ def renamed_together(main: Path) -> Iterator[None]:
 
 def is_cut_off(main: Path) -> bool:
     """Return whether a command was killed before its output `main`, and so all, had its name."""
-    main = output_path(main)
-    return not main.exists() and bool(left_over(main.parent, main.name))
+    main = resolve_output(main)
+    return not main.exists() and bool(find_left_over(main.parent, main.name))
 
 
 @contextmanager
@@ -149,9 +150,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     OutputError
         If `path` is a device, a pipe or a folder.
     """
-    path, unnamed = output_path(Path(path)), _unnamed.get()
+    path, unnamed = resolve_output(Path(path)), _unnamed.get()
     path.parent.mkdir(parents=True, exist_ok=True)
-    for unfinished in left_over(path.parent, path.name):
+    for unfinished in find_left_over(path.parent, path.name):
         unfinished.unlink(missing_ok=True)
     temporary = path.with_name(temporary_name(path.name))
     # Permissions of the file that is replaced; a new one has those of the user's mask.
@@ -551,5 +552,5 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> N
     # Links and relative names are followed, because they may be the same file.
     input_paths = {Path(os.path.realpath(name)) for name in inputs if isinstance(name, str | Path)}
     for out in outputs:
-        if out is not None and output_path(out) in input_paths:
+        if out is not None and resolve_output(out) in input_paths:
             raise OutputError(f"{out}: is an input, too; choose another name")

@@ -26,7 +26,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.base.errors import require_file
-from psfdae.base.files import left_over, temporary_name
+from psfdae.base.files import find_left_over, temporary_name
 from psfdae.image.errors import ObservationError, reading, shorten
 
 if TYPE_CHECKING:
@@ -71,14 +71,14 @@ UNPACK: dict[bytes, Callable[[IO[bytes]], Any]] = {
 """How files that are compressed as a whole are read, by their first bytes."""
 
 OTHER_FORMATS = {
-    **{b"\x89HDF": "HDF5", b"#ASDF": "ASDF", b"PAR1": "Parquet", b"ARROW1": "Feather"},
+    **{b"\x89HDF": "HDF5", b"#ASDF": "ASDF", b"PAR1\x15": "Parquet", b"ARROW1": "Feather"},
     **{b"\x93NUMPY": ".npy", b"\x80": "pickle", b"{": "JSON", b"[{": "JSON", b"[[": "JSON"},
     **{b"XISF": "XISF", b"II*": "TIFF", b"MM\0*": "TIFF", b"\x89PNG": "PNG", b"\xff\xd8": "JPEG"},
 }
 """Names of formats that are not read here, for messages, by their first bytes."""
 
 
-def other_format(start: bytes) -> str:
+def name_other_format(start: bytes) -> str:
     """Return ", but " and the name of a format by the first bytes of its files, or ""."""
     start = b"".join(start.split())
     names = (name for magic, name in OTHER_FORMATS.items() if start.startswith(magic))
@@ -122,13 +122,13 @@ def plain_file(path: Path) -> PlainFile:
     ObservationError
         If there is no such file, or it is not a FITS file.
     """
-    file, start = unpacked(path)
+    file, start = unpack_file(path)
     if not start.startswith(b"SIMPLE  ="):
-        raise ObservationError(path, f"not a FITS file{other_format(start)}")
+        raise ObservationError(path, f"not a FITS file{name_other_format(start)}")
     return file
 
 
-def unpacked(path: Path) -> tuple[PlainFile, bytes]:
+def unpack_file(path: Path) -> tuple[PlainFile, bytes]:
     """Return a file of any format, unpacked if need be, and its first 80 bytes."""
     require_file(path)
     with reading(path), path.open("rb") as file:
@@ -139,13 +139,13 @@ def unpacked(path: Path) -> tuple[PlainFile, bytes]:
         for magic, unpack in UNPACK.items():
             if start.startswith(magic) and start[8:9] != b"{":
                 with unpack(file) as content:
-                    copy = temporary_file(path, content, unpacked_max(path.stat().st_size))
+                    copy = temporary_file(path, content, compute_unpacked_max(path.stat().st_size))
                 with copy.path.open("rb") as plain:
                     return copy, plain.read(80)
     return PlainFile(path, path), start
 
 
-def unpacked_max(packed_bytes: int) -> int:
+def compute_unpacked_max(packed_bytes: int) -> int:
     """Return the largest number of bytes that is unpacked from so many.
 
     It is the memory of the machine, or less: deflate packs at most 1032 bytes into one, and Rice's
@@ -167,6 +167,7 @@ def temporary_file(name: Path, content: IO[bytes], bytes_max: float = math.inf) 
     content : file
         Open for reading bytes, at the start of what is copied.
     bytes_max : float
+        Largest size of the copy.
 
     Raises
     ------
@@ -174,7 +175,7 @@ def temporary_file(name: Path, content: IO[bytes], bytes_max: float = math.inf) 
         If there are more bytes than `bytes_max`.
     """
     folder = Path(tempfile.gettempdir())
-    for unfinished in left_over(folder, "psfdae"):
+    for unfinished in find_left_over(folder, "psfdae"):
         unfinished.unlink(missing_ok=True)
     plain, process = PlainFile(name, folder / temporary_name("psfdae"), is_copy=True), os.getpid()
     # Only the user reads it.
@@ -408,7 +409,7 @@ def find_image(
             raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
         # Tiles can share their bytes, so that a small file unpacks to any size.
         size = math.prod(shape) * abs(header["BITPIX"]) // 8
-        if stored is not hdu and size > unpacked_max(stored.size):
+        if stored is not hdu and size > compute_unpacked_max(stored.size):
             raise ObservationError(path, f"damaged: {size} bytes in tiles of {stored.size} bytes")
         # values = BSCALE · stored + BZERO
         bscale, bzero, blank = (card_value(header, key) for key in ("BSCALE", "BZERO", "BLANK"))

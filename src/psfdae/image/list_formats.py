@@ -2,8 +2,8 @@
 
 In: a file. Out: its table as astropy has it, a row for each star in the order of the file.
 
-The format follows from the content. astropy reads all tables once it is told their format; only
-the lists of DAOPHOT itself and the regions of DS9 are read here.
+The format follows from the content. astropy and pyarrow read all tables; only the regions of DS9
+are read here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ import numpy as np
 
 from psfdae.base.errors import needed_by
 from psfdae.image.errors import ObservationError, reading, shorten
-from psfdae.image.fits_file import PlainFile, open_hdus, other_format, unpacked, unpacked_max
+from psfdae.image.fits_file import (
+    PlainFile,
+    compute_unpacked_max,
+    name_other_format,
+    open_hdus,
+    unpack_file,
+)
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -49,10 +55,10 @@ def read_list_table(path: Path) -> Table:
         If the file is missing, damaged, or of none of the formats.
     """
     # A FITS file or a Parquet file; of text, the first line that is not blank tells the format.
-    file, start = unpacked(path)
+    file, start = unpack_file(path)
     if start.startswith(b"SIMPLE  ="):
         return fits_table(file)
-    if start.startswith(b"PAR1"):
+    if start.startswith(b"PAR1\x15"):  # PAR1 alone could be the name of a column
         return parquet_table(file)
     with reading(path):
         content = file.path.read_bytes()
@@ -62,7 +68,7 @@ def read_list_table(path: Path) -> Table:
         text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = "\x00"
-    other = other_format(start)
+    other = name_other_format(start)
     if "\x00" in text or other:
         raise ObservationError(path, f"neither a FITS table nor text in UTF-8{other}")
     lines = [line for line in text.splitlines() if line.strip()]
@@ -72,8 +78,11 @@ def read_list_table(path: Path) -> Table:
         return regions(path, lines)
     if lines[0].lstrip().startswith("<"):
         return votable(path, content)
+    # A list of DAOPHOT itself (Stetson 1987, PASP 99, 191) begins with number, x and y. Its pixels
+    # count from 1, as SExtractor's do. Two of its three head lines are not blank.
     if re.match(r"\s*NL\s+NX\s+NY\b", lines[0]):
-        return stetson(path, lines)
+        rows = (" ".join(line.split()[:3]) for line in lines[2:])
+        lines = ["id X_IMAGE Y_IMAGE", *rows]
     return text_table(path, lines)
 
 
@@ -121,6 +130,7 @@ def parquet_table(file: PlainFile) -> Table:
     Parameters
     ----------
     file : PlainFile
+        File to read.
 
     Raises
     ------
@@ -137,7 +147,7 @@ def parquet_table(file: PlainFile) -> Table:
         # Rows that are equal take no space in the file.
         described = parquet.read_metadata(file.path)
         size = 8 * described.num_rows * described.num_columns
-        if size > unpacked_max(file.path.stat().st_size):
+        if size > compute_unpacked_max(file.path.stat().st_size):
             raise ObservationError(file.name, f"unpacks to {size} bytes; write it as FITS")
         # Damaged pages are found by their checksums, if the file has them.
         rows = parquet.read_table(file.path, page_checksum_verification=True)
@@ -160,7 +170,7 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
     """
     from astropy.io import ascii as text_tables
 
-    options = {"format": text_format(lines)}
+    options = {"format": find_text_format(lines)}
     if options["format"] == "basic" and (lines := plain_rows(lines)):
         # The first mark that the line of names has; of tabs, the first name may be blank.
         options["delimiter"] = next((mark for mark in ",;\t" if mark in lines[0]), " ")
@@ -194,7 +204,7 @@ TEXT_FORMATS = {
 """Formats of astropy that describe their columns above the rows, by their beginning."""
 
 
-def text_format(lines: Sequence[str]) -> str:
+def find_text_format(lines: Sequence[str]) -> str:
     """Return the format of a text table by its lines that are not blank, "basic" for any other."""
     head = "\n".join(lines[:200])
     names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
@@ -263,7 +273,7 @@ def votable(path: Path, content: bytes) -> Table:
                 if tag == "FIELD":
                     sizes = re.findall(r"\d+", attributes.get("arraysize", ""))
                     widths.append(8 * math.prod(map(int, sizes)))
-        if len(widths) > COLUMNS_MAX or rows * sum(widths) > unpacked_max(len(content)):
+        if len(widths) > COLUMNS_MAX or rows * sum(widths) > compute_unpacked_max(len(content)):
             raise ObservationError(path, f"damaged: {len(widths)} columns, {rows} rows")
         # Tables of other things than stars may be there without rows.
         tables = [
@@ -352,34 +362,3 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     if labels and all(labels):
         table["id"] = labels
     return table
-
-
-def stetson(path: Path, lines: Sequence[str]) -> Table:
-    """Read number, x and y, the first columns of a list of DAOPHOT (Stetson 1987, PASP 99, 191).
-
-    Lists of the program itself have three head lines; those of IRAF's DAOPHOT are `text_table`'s.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for messages.
-    lines : sequence of str
-        Lines that are not blank.
-
-    Returns
-    -------
-    Table
-        Columns `id`, `X_IMAGE` and `Y_IMAGE`, text; pixels count from 1, as SExtractor's do.
-
-    Raises
-    ------
-    ObservationError
-        If a row has fewer than three numbers.
-    """
-    from astropy.table import Table
-
-    # Two of the three head lines are not blank.
-    rows = [line.split()[:3] for line in lines[2:]]
-    if any(len(row) < 3 for row in rows):
-        raise ObservationError(path, "a list of DAOPHOT with rows of fewer than three numbers")
-    return Table(rows=rows, names=("id", "X_IMAGE", "Y_IMAGE")) if rows else Table()

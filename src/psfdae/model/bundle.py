@@ -32,7 +32,7 @@ from psfdae.base.errors import Error, needed_by, no_such_file
 from psfdae.base.files import ProductError, atomic_path
 from psfdae.base.version import __version__
 from psfdae.image.errors import ObservationError, one_line, reading
-from psfdae.image.fits_file import open_hdus, other_format, unpacked
+from psfdae.image.fits_file import name_other_format, open_hdus, unpack_file
 from psfdae.methods import method
 from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.methods.interface import Method
@@ -218,7 +218,7 @@ def shipped_path() -> Path:
     return Path(str(files("psfdae.model") / "bundles" / f"wfsat{SUFFIX}"))
 
 
-def foreign_format(path: Path) -> str:
+def name_foreign_format(path: Path) -> str:
     """Return the name of the format of a file that is no bundle, such as "PSFEx"; else "".
 
     Raises
@@ -226,9 +226,9 @@ def foreign_format(path: Path) -> str:
     Error
         If the file is missing or cannot be read.
     """
-    file, start = unpacked(path)
+    file, start = unpack_file(path)
     if not start.startswith(b"SIMPLE  ="):
-        return other_format(start).removeprefix(", but ")
+        return name_other_format(start).removeprefix(", but ")
     # By the names of extensions and keys.
     with reading(path), open_hdus(file) as hdus:
         names = {*(hdu.name for hdu in hdus), *hdus[0].header}
@@ -257,7 +257,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         # A bundle of stamps of 256 × 256 pixels has some 20 MB.
         size, max_size = path.stat().st_size, 2**28
         # A model of another program is named.
-        kind = foreign_format(path)
+        kind = name_foreign_format(path)
         readers = "; psf and photometry read it" if kind in ("PSFEx", "STDPSF", "STPSF") else ""
         _require(not kind, path, f"of the format {kind}, expected a model of psfdae{readers}")
         _require(size <= max_size, path, f"{size} bytes, at most {max_size}")

@@ -30,7 +30,7 @@ from psfdae.image.fits_file import (
     open_pixels,
     plain_file,
 )
-from psfdae.model.bundle import foreign_format
+from psfdae.model.bundle import name_foreign_format
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model
 from psfdae.stars.moments import measure_shapes
@@ -46,8 +46,10 @@ def load_field(path: Path) -> FieldPsfs:
     Error
         If the file cannot be read or is something else.
     """
-    fields = {"PSFEx": PsfexField, "STDPSF": GridField, "STPSF": GridField}
-    return fields.get(foreign_format(path), load_model)(path)
+    kind = name_foreign_format(path)
+    if kind == "PSFEx":
+        return PsfexField(path)
+    return GridField(path) if kind in ("STDPSF", "STPSF") else load_model(path)
 
 
 class FieldFile(FieldPsfs):
@@ -56,6 +58,7 @@ class FieldFile(FieldPsfs):
     Parameters
     ----------
     path : Path
+        The file, whose name without its ending is the name of the model.
     """
 
     image_px = None
@@ -85,7 +88,7 @@ class FieldFile(FieldPsfs):
         # Sum 1 in the pixels of the stamp of a star in the middle of its pixel.
         pixels = np.arange(self.stamp_px) - self.stamp_px // 2
         flux = self.interpolate(position, pixels, np.zeros_like(phase)).sum(axis=(1, 2))
-        return self.interpolate(position, axis, phase) / flux[:, None, None]
+        return np.asarray(self.interpolate(position, axis, phase) / flux[:, None, None])
 
     @abstractmethod
     def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
@@ -124,7 +127,7 @@ class GridField(FieldFile):
     ObservationError
         If the file is missing or damaged, or its positions are no grid.
     PredictionError
-        If its positions are of several detectors, or a size is out of range.
+        If its positions are of several detectors.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,8 +157,6 @@ class GridField(FieldFile):
         self.order = min(3, max(map(len, nodes)) - 1)
         # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         self.stamp_px = 2 * int(min(psfs.shape[1:]) / oversampling / 2)
-        if not 2 <= self.stamp_px <= 1025:
-            self._refuse(f"PSFs of {self.stamp_px} px, expected 2 … 1025")
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the first and the last position (x, y) of the grid."""
