@@ -147,8 +147,9 @@ def test_a_model_has_the_psf_of_a_magnitude_or_colour(training, plate, colourful
     low, high = RANGES[name]
     ends = [model.psf_at(300.0, 400.0, **{KEYWORDS[name]: value}) for value in (low, high)]
     middle = model.psf_at(300.0, 400.0, **{KEYWORDS[name]: (low + high) / 2})
-    # g has next to no flux, so that the normalised PSF is f + m g, too; f is the trained one.
-    assert middle == pytest.approx((ends[0] + ends[1]) / 2, abs=2e-3 * middle.max())
+    # g has next to no flux, so that the normalised PSF is f + m g, too, but for the part of noise
+    # that changes the light with the phase; f is the trained one.
+    assert middle == pytest.approx((ends[0] + ends[1]) / 2, abs=3e-3 * middle.max())
     assert middle == pytest.approx(training.model.psf_at(300.0, 400.0), abs=1e-6)
     assert model.psf_at(300.0, 400.0) == pytest.approx(middle, abs=1e-9)
     assert ends[0].max() > 1.2 * ends[1].max()

@@ -13,10 +13,9 @@ from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
 from psfdae.model.calibration import with_model_errors
-from psfdae.model.crowded import star_flags
+from psfdae.model.crowded import photometry, star_flags
 from psfdae.model.fitting import described, fitted_to
 from psfdae.model.packing import uncalibrated, with_wings
-from psfdae.model.wings import wings_of_stars
 from small_field import GAIN, READ, SKY, noisy
 
 SIZE = 600
@@ -60,7 +59,7 @@ def fitted(seed):
     settings, of_fit = stars.settings, described(stars, FieldMixture)
     packed, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
     bundle = with_model_errors(psfdae.PsfModel(packed), field, 1)
-    wings = wings_of_stars(psfdae.PsfModel(bundle), stars.observation.with_margin(2))
+    wings = photometry(psfdae.PsfModel(bundle), stars.observation, 3.0).image_wings
     return psfdae.PsfModel(with_wings(bundle, wings))
 
 

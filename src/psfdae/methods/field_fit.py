@@ -25,6 +25,7 @@ from psfdae.methods.field_spline import (
     deform_splines,
     draw_splines,
     field_terms,
+    light_by_phase,
     solve_splines,
     spacing_of,
 )
@@ -297,10 +298,12 @@ class FieldFitter:
             coefficients, flux = coefficients / total, flux * factor * total
             splines = np.tensordot(terms, coefficients, 1)
             star_images = draw_splines(splines, self.axis, centre, spacing)
-            # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
-            # could change with that place against each other.
-            inside = star_images[:, self.in_stamp][:, :, self.in_stamp].sum(axis=(1, 2))
-            flux, star_images = flux * inside, star_images / inside[:, None, None]
+            # Each star has the sum 1 in the middle of its stamp, and as much light at every phase:
+            # fluxes and splines could change with position and phase against each other (eq. 1a).
+            in_middle = draw_splines(splines, sides, np.zeros((1, 2)), spacing)
+            light = light_by_phase(splines, np.zeros(1), centre, spacing)
+            light *= in_middle.sum(axis=(1, 2), keepdims=True)
+            flux, star_images = flux * light[:, 0, 0], star_images / light
             residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)
             # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all. In the
             # first round, the field is not known well enough to tell stars.

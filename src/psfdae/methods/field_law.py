@@ -191,8 +191,8 @@ class FieldLaw:
         """Return the field's PSFs at positions, as `FieldModel.images` draws them.
 
         The star lies at its sub-pixel phase in the middle pixel. Its flux is that for which a star
-        in the middle of its pixel has the sum 1 in its stamp: a PSF keeps its flux where it moves
-        with its star, as it does in photometry, though some light then crosses the stamp's edge.
+        in the middle of its pixel has the sum 1 in its stamp. It is the same at every phase (eq.
+        1a), though of a star with wings some light crosses the stamp's edge as it moves.
 
         Parameters
         ----------

@@ -72,13 +72,17 @@ class FieldModel:
 
         Pixels are every 1/oversampling, that at m//2 = oversampling · (side//2) is the middle;
         m is side, and one more if oversampled, so that both edges are there. Values are
-        those of whole pixels.
+        those of whole pixels. A star has the same light at every phase of the pixel grid.
         """
         # Coordinates of the pixels, and coefficients Σ_k p_k c_k at each position (eq. 1).
         count = side if oversampling == 1 else oversampling * side + 1
         axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
         splines = np.tensordot(terms, self.coefficients, 1)
-        return draw_splines(splines, axis, centre, self.spacing)
+        # Pixels that are whole pixels apart have the same phase, and the same factor (eq. 1a).
+        light = light_by_phase(splines, axis[:oversampling], centre, self.spacing)
+        phase = np.arange(count) % oversampling
+        images = draw_splines(splines, axis, centre, self.spacing)
+        return np.asarray(images / light[:, phase[:, None], phase])
 
     def on_lattice(
         self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
@@ -167,6 +171,49 @@ def draw_splines(
         cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
     return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
+
+
+def light_by_phase(
+    splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Return the light of a star that has whole pixels at some phases, over that in the middle.
+
+    Splines whose knots are not a whole number in a pixel follow undersampled stars, but not their
+    light: it changes with the phase by some per cent. The PSF divided by this factor has the same
+    light at every phase (eq. 1a).
+
+    Parameters
+    ----------
+    splines : ndarray, shape (n, N, N)
+        Coefficients of the field at the positions of the stars.
+    axis : ndarray, shape (a,)
+        Coordinates of pixels along either side, in pixels.
+    centre : ndarray, shape (n, 2) or (1, 2)
+        Centres of the stars (row, column), in the same coordinates.
+    spacing : float
+        Distance of the knots in pixels.
+
+    Returns
+    -------
+    ndarray, shape (n, a, a)
+        1 for a star in the middle of its pixel.
+    """
+    # All pixels that are whole pixels apart and in the frame, at their distances from the star,
+    # under a window w that moves with the star, so that no light crosses an edge: 1, and falling to
+    # 0 as cos² in the outer 3 px, where light changes little within a pixel.
+    knots = splines.shape[-1]
+    reach = spacing * (knots - 1) / 2 - 1.0
+    pixels = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
+
+    def light(place: np.ndarray) -> np.ndarray:
+        # Σ w f(u) with f = R c Cᵀ: sums of the windowed rows of R, and of C (eq. 1).
+        place = (place - np.floor(place + 0.5))[..., None] + pixels
+        window = np.cos(np.pi / 2 * np.clip((np.abs(place) - reach) / 3.0 + 1.0, 0.0, 1.0)) ** 2
+        sums = (window[..., None, :] @ cubic_splines(place, knots, spacing))[..., 0, :]
+        rows, columns = sums.swapaxes(0, 1)
+        return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
+
+    return np.asarray(light(axis - centre[..., None]) / light(np.zeros((1, 2, 1))))
 
 
 def adjust_stars(

@@ -19,7 +19,7 @@ from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.flux_model import is_faint
-from psfdae.model.joint_fit import fit_stars, pairs_within
+from psfdae.model.joint_fit import JointFit, fit_stars, pairs_within
 from psfdae.model.photon_noise import pixel_error
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.restoration import MAX_CHI2
@@ -48,7 +48,10 @@ class CrowdedPhotometry:
     residual, light : ndarray, shape (h, w)
         Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
-        Those of the model if no star is bright enough to show any.
+        Wings in the fluxes: those of the image, or of the model if no star is bright enough to show
+        any.
+    image_wings : Wings or None
+        Wings of the image, which faint stars hardly show; None without a star that has light.
     """
 
     model: FieldPsfs
@@ -56,6 +59,7 @@ class CrowdedPhotometry:
     residual: np.ndarray
     light: np.ndarray
     wings: Wings | None
+    image_wings: Wings | None
 
     @property
     def radius_px(self) -> float:
@@ -93,7 +97,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         If there is no sky to measure.
     """
     # PSFs of the field, and lengths that follow from the PSF in its middle.
-    psfs, fwhm, side = PsfGrid.of(model), model.fwhm_px(), model.stamp_px
+    psfs, fwhm, side = PsfGrid.of(model, by_magnitude=True), model.fwhm_px(), model.stamp_px
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
@@ -119,7 +123,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
-        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place))
+        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux))
         # At first, stars are no better known than to the error of the wings.
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, tolerance=0.1 if turn else 1.0
@@ -141,14 +145,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             place, flux, origin = place[real], flux[real], origin[real]
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    total: np.ndarray | float = 1.0
-    if wings_used is not None:
-        total, _ = wings_used.total_over_flux(outer_shares(model.on_pixels, fit.place))
-    stars = fit.table(total, 2.4 * fwhm)
-    # The error of the PSF is no noise, and is as large a part of each flux, whatever its χ²:
-    # σ² = σ_noise² + (σ_model F)².
-    model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1)) * stars["flux"]
-    stars["flux_error"] = np.hypot(stars["flux_error"], model_error)
+    stars = tabulate_stars(model, fit, wings_used, fwhm)
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Farther from where it was expected than noise explains, a star may be another one.
     distance_px = np.hypot(*(fit.place - origin).T)
@@ -159,7 +156,34 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if observation.detections is None:
         stars["id"] = observation.stars.id
         stars["flags"] |= observation.stars.flags
-    return CrowdedPhotometry(model, stars, sky.flat, fit.light + wing_light, wings_used)
+    return CrowdedPhotometry(model, stars, sky.flat, fit.light + wing_light, wings_used, wings)
+
+
+def tabulate_stars(model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: float) -> Table:
+    """Return a row for each star of a fit, with its wings in the flux and all errors of the flux.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+        Model of the PSFs, with their errors.
+    fit : JointFit
+        All stars, with their fluxes in the stamps.
+    wings : Wings or None
+        Light outside of the stamps; None adds none to the fluxes.
+    fwhm : float
+        FWHM of the PSF in pixels, which groups stars.
+    """
+    total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
+    if wings is not None:
+        shares = outer_shares(model.on_pixels, fit.place, fit.flux)
+        total, total_error = wings.total_over_flux(shares)
+    stars = fit.table(total, 2.4 * fwhm)
+    # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
+    # whatever its χ²: σ² = σ_noise² + (σ_model F)² + (σ_wings F)².
+    model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1))
+    relative_error = np.hypot(model_error, total_error / total)
+    stars["flux_error"] = np.hypot(stars["flux_error"], relative_error * stars["flux"])
+    return stars
 
 
 def star_flags(

@@ -96,6 +96,11 @@ class FieldPsfs(ImageFluxes, ABC):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return least and greatest position (x, y) of the training stars; raises as `psf_at`."""
 
+    @property
+    def magnitude_range(self) -> tuple[float, float] | None:
+        """Lowest and highest magnitude with which the PSF changes; None if it does not."""
+        return None
+
     @abstractmethod
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Raise PredictionError if pixels have not the size of the model's.
@@ -178,9 +183,12 @@ class FieldPsfs(ImageFluxes, ABC):
         return psfs if position.ndim == 2 else psfs[0]
 
     def on_pixels(self, position: np.ndarray) -> np.ndarray:
-        """Return PSFs (n, d, d) in the pixels of the image, at positions (n, 2); see `psf_at`."""
-        x, y = position.T
-        return self.psf_at(x, y, 1)
+        """Return PSFs (n, d, d) in the pixels of the image, at positions (n, 2) or (n, 3).
+
+        A third column has the magnitudes; see `psf_at`.
+        """
+        x, y, *mag = position.T
+        return self.psf_at(x, y, 1, mag=mag[0] if mag else None)
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
         """Return the flux of a star over its light within an aperture.

@@ -16,13 +16,15 @@ from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.methods.fit_files import described_by
 from psfdae.methods.interface import Method
+from psfdae.model.image_photometry import measure_stars
 from psfdae.model.packing import model_of, with_wings
+from psfdae.model.photon_noise import with_measured_gain
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords
 from psfdae.model.star_choice import ENOUGH_STARS
 from psfdae.model.star_sets import field_positions, fit_apart, noise_model
 from psfdae.model.stars import Stars
-from psfdae.model.wings import Wings, wings_of_stars
+from psfdae.model.wings import Wings
 
 Kind = TypeVar("Kind", bound=Method)
 
@@ -197,10 +199,14 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
         )
         if not fitted.knows_field or stars.observation.shape is None:
             return model
-        # Light beyond the stamps, by all stars of each image; where neighbours were subtracted,
-        # it has been measured for that.
+        # Light outside the stamps, as the photometry of each image with this model measures it:
+        # `flux_total` of a star and its flux by photometry are the same.
         measured = (
-            image.wings or wings_of_stars(model, image.observation.with_margin(model.margin_px))
+            measure_stars(
+                model,
+                with_measured_gain(model, image.observation.assuming()),
+                image.source.detection_sigma or image.source.threshold,
+            )[0].image_wings
             for image in stars.images
         )
         wings = [image_wings for image_wings in measured if image_wings is not None]

@@ -175,7 +175,7 @@ def photometry_of_image(
         )
     if source.colour_column:
         raise PhotometryError(
-            f"{source.path}: all stars get the PSF of the usual one: no {keyword('colour_column')}"
+            f"{source.path}: stars get the PSF of the mean colour: no {keyword('colour_column')}"
         )
     # With --detect, no list of the image needs an origin: it is that of the reference.
     origin = source.origin
@@ -266,6 +266,12 @@ def light_notes(measured: CrowdedPhotometry, source: ImageInput) -> list[str]:
             f"fluxes are the light within {measured.radius_px:.3g} px; the model of the PSF has "
             f"{100 * part:.2f} ± {100 * part_error:.2f} % of it"
         ]
+        model_wings = measured.model.wings
+        if model_wings is not None and measured.wings.differs_from(model_wings):
+            notes.append(
+                f"light outside the stamps: {measured.wings} in this image, which its fluxes have; "
+                f"{model_wings} in the training, which flux_total of psfdae predict has"
+            )
     if source.detect:
         # Selection by brightness: Eddington (1913, MNRAS 73, 359).
         notes.append(

@@ -230,7 +230,8 @@ class _Fit:
         side = self.psfs.side_px
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
-            stamps = self.psfs.stamps(self.place[part], self._middle[part] - side // 2, side)
+            corner = self._middle[part] - side // 2
+            stamps = self.psfs.stamps(self.place[part], corner, side, self.flux[part])
             self._light[part] = stamps[:, 0]
             self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
@@ -243,6 +244,9 @@ class _Fit:
     def set_flux(self, flux: np.ndarray) -> None:
         """Give the stars, which have none yet, fluxes (m,)."""
         self.flux = flux.astype(np.float64)
+        # Where the PSF changes with the magnitude, it is that of these fluxes from now on.
+        if self.psfs.magnitudes.size:
+            self._draw(np.arange(len(flux)))
         self._subtract(np.arange(len(flux)), self.flux)
 
     def best_flux(self) -> np.ndarray:

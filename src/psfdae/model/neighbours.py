@@ -52,6 +52,11 @@ class _Field(FieldPsfs):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low[:2], self.fitted.high[:2]
 
+    @property
+    def magnitude_range(self) -> tuple[float, float] | None:
+        low, high = self.fitted.low.tolist(), self.fitted.high.tolist()
+        return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
+
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: the fit is used on its own image."""
 
@@ -98,7 +103,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"
             return replace(stars, notes=(*stars.notes, note))
-        # The next round starts from these stars, on the image as it was; the wings are kept.
+        # The next round starts from these stars, on the image as it was.
         message = (
             f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
             f"stamps; bright stars before: {len(stars)}, no neighbour above "
@@ -106,7 +111,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
             f"px; now: {len(isolated)}, none above {100 * neighbour_ratio:g} % within "
             f"{isolation_px:.2g} px"
         )
-        stars = replace(isolated, observation=observation, wings=photometry.wings)
+        stars = replace(isolated, observation=observation)
         notes = (*isolated.notes, message)
     return replace(stars, notes=notes)
 
@@ -134,7 +139,7 @@ def light_of_others(
     # Fluxes without the wings, which belong to no stamp alone.
     stars = photometry.stars
     centre = np.stack([stars["x"], stars["y"]], axis=1)
-    flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model)
+    flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model, by_magnitude=True)
     measured = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
     # The fitted star of each star of the list; none is within 1.5 px of a star without position.
     distance, nearest = cKDTree(centre[measured]).query(np.nan_to_num(listed, nan=-np.inf))
@@ -147,7 +152,7 @@ def light_of_others(
         fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
         star = measured[nearest[rows][fitted_rows]]
         corner = np.rint(listed[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
-        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1])[:, 0]
+        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1], flux[star])[:, 0]
         stamps[fitted_rows] -= flux[star, None, None] * star_light
         return stamps
 

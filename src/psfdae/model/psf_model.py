@@ -260,17 +260,14 @@ class PsfModel(WholeImages, FieldPsfs):
         return self.restorer.wings
 
     def flux_error(self, place: np.ndarray) -> np.ndarray:
-        """Return what model and wings make of the errors of stars at places (n, 2), x and y.
+        """Return the relative flux errors of stars at positions (n, 2), x and y, due to the PSF.
 
         Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
         middle of the field, they are not below those of the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
-        # The light L of wings is known to σ_L, and with it the whole flux to σ_L / (1 + L) of it.
-        light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         errors = self.bundle.errors.measured
-        fitted_error = errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0)
-        return np.asarray(np.hypot(fitted_error, error / (1.0 + light)))
+        return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0))
 
     @property
     def image_px(self) -> tuple[int, int] | None:
@@ -287,6 +284,12 @@ class PsfModel(WholeImages, FieldPsfs):
         if not ((high > low) | ((high == low) & (low > 0))).all():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
+
+    @property
+    def magnitude_range(self) -> tuple[float, float] | None:
+        """Lowest and highest magnitude with which the PSF changes; None if it does not."""
+        low, high = (self.bundle.weights[name].tolist() for name in ("low", "high"))
+        return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
 
     def _field(self) -> Method:
         """Return the method as one that knows the PSF at every place of the field."""

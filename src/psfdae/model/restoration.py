@@ -396,7 +396,7 @@ class Restorer:
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
         # A wider PSF has more light beyond its stamp.
-        outer_part = outer_shares(self.method.psf_at, place)
+        outer_part = outer_shares(self.method.psf_at, place, flux)
         factor, factor_error = self.wings.total_over_flux(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
     from psfdae.methods.interface import Method, TrainingSet
-    from psfdae.model.wings import Wings
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +65,6 @@ class Stars:
         Settings, with the noise levels that follow from the stars.
     notes : sequence of str
         Facts about the camera and the list, and advice on settings.
-    wings : Wings or None
-        Light of stars beyond their stamps, if all stars were fitted together to find it.
     exposures : sequence of Stars
         The stars of each image, if there are several.
 
@@ -86,7 +83,6 @@ class Stars:
     held_out: np.ndarray
     settings: Settings
     notes: Sequence[str]
-    wings: Wings | None = None
     exposures: Sequence[Stars] = ()
     split_kind: ClassVar[str] = "held_out"
     """Kind of the split: all images of a star are in the training, or all are in the test."""

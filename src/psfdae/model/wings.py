@@ -25,13 +25,11 @@ from psfdae.base.errors import keyword
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import level_and_noise
-from psfdae.model.photon_noise import pixel_error
+from psfdae.stars.bright_stars import magnitude
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
-    from psfdae.image.observation import Observation
     from psfdae.model.field_psfs import FieldPsfs
-    from psfdae.model.psf_model import PsfModel
 
 
 @dataclass(frozen=True)
@@ -111,6 +109,11 @@ class Wings:
         scale = self.scale(outer_share)
         light, error = self.light()
         return 1.0 + scale * light, np.hypot(scale * error, 0.5 * (scale - 1.0) * light)
+
+    def differs_from(self, wings: Wings) -> bool:
+        """Return True if the light differs by more than 3 σ from the light of these wings."""
+        (light, error), (wing_light, wing_error) = self.light(), wings.light()
+        return abs(light - wing_light) > 3.0 * float(np.hypot(error, wing_error))
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Return the light that the model lacks within a radius in px, and its standard error.
@@ -198,19 +201,24 @@ def aperture_correction(
     return (1.0 + all_wings) / (inside + inner_wings)
 
 
-def outer_shares(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
+def outer_shares(
+    draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray, flux: np.ndarray | None = None
+) -> np.ndarray:
     """Return the part of a star's flux in the outer part of its stamp, (n,), at places (n, 2).
 
     Pixels between 0.7 times half the side of the stamp and half the side count. `draw` makes PSFs
-    (m, d, d) at m places, which are finite. NaN where a place, x and y in px, is not known.
+    (m, d, d) of m stars by their x, y and, if fluxes (n,) in counts are given, magnitude. NaN where
+    a place, x and y in px, or a flux is not known.
     """
     shares = np.full(len(place), np.nan)
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    position = np.rint(place)  # at whole pixels, so that phases do not change the share
+    if flux is not None:
+        position = np.column_stack([position, magnitude(flux)])
+    located = np.flatnonzero(np.isfinite(position).all(axis=1))
     # Some at a time, so that their PSFs take little memory.
     for first in range(0, len(located), 2048):
         part = located[first : first + 2048]
-        # At whole pixels, so that phases do not change the share.
-        psf = draw(np.rint(place[part]))
+        psf = draw(position[part])
         side = psf.shape[-1]
         # Pixels by their distance from the middle of the stamp.
         axis = np.arange(side) - side // 2
@@ -548,7 +556,8 @@ def _wings_beside(
     at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
     is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
     del squares, mean_square, good_part  # of a large image, each map takes much memory
-    stars = stars._replace(flux=np.where(is_star, stars.flux, np.nan))
+    stars = all_stars._replace(flux=np.where(is_star, all_stars.flux, np.nan))
+    unlike_psf = all_stars._replace(flux=np.where(is_star, np.nan, all_stars.flux))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
     for _ in steps("light beyond the stamps", range(8)):
         previous = wings
@@ -556,6 +565,9 @@ def _wings_beside(
             without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
             residual = without_stars - level_and_noise(without_wings, bad, sky.steps)[0]
+            # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
+            # small.
+            residual -= wing_light(bad.shape, unlike_psf, previous)
         wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break
@@ -564,41 +576,3 @@ def _wings_beside(
         if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
             break
     return wings
-
-
-def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
-    """Return the wings of stars that are restored one by one; None if there is no light at all.
-
-    In a crowded image, where stars restored alone lack light, the wings come out too large.
-
-    Raises
-    ------
-    ObservationError
-        If there is no sky to measure.
-    """
-    sky, side = observation.sky(), model.stamp_px
-    middles, fluxes, shares = [], [], []
-    # With the room of a stamp on all sides, for those that reach beyond the image.
-    star_light = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
-    # The light of each restored star at the pixels that its stamp has in the image.
-    for stamps, prediction in model.stream(observation, threads=1):
-        place = np.stack([stamps.x, stamps.y], axis=1)
-        shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
-        # First pixel (x, y) of each stamp in the map with its margin.
-        corner = np.floor(np.nan_to_num(place) + 0.5).astype(int) + shift + side - side // 2
-        is_restored = np.isfinite(place).all(axis=1) & np.isfinite(prediction.psf).all(axis=(1, 2))
-        for x, y, psf in zip(*corner[is_restored].T, prediction.psf[is_restored], strict=True):
-            stamp = np.s_[y : y + side, x : x + side]
-            if min(x, y) >= 0 and star_light[stamp].shape == psf.shape:
-                star_light[stamp] += psf
-        shares.append(outer_shares(model.on_pixels, place))
-        # Tents are centred on stamps, not on stars, so that they begin where the stamps end.
-        middles.append(np.where(is_restored[:, None], corner - side + 0.5 * (side - 1), np.nan))
-        fluxes.append(np.where(is_restored, prediction.flux, np.nan))
-    core = np.s_[side:-side, side:-side]
-    light_of_models = star_light[core]
-    stars = StarFluxes(*map(np.concatenate, (middles, fluxes, shares)))
-    error = pixel_error(sky.noise, light_of_models, observation.gain)
-    sigma = error_beside_models(error, light_of_models)
-    without_stars = sky.flat + sky.level - light_of_models
-    return _wings_beside(without_stars, sky, sigma, stars, side)
