@@ -286,6 +286,18 @@ def test_a_full_disk_at_any_output_is_one_line(inputs, expected):
     assert number > 1
 
 
+@pytest.mark.parametrize("expected", ["photometry", "predict", "psf"], indirect=True)
+def test_a_command_without_space_writes_nothing(inputs, expected):
+    """At a limit of the kernel, whichever library writes."""
+    (words, whole), out = expected, inputs / "out"
+    clear(out)
+    with largest_file(2900):
+        result = psfdae(*words)
+    assert result.exit_code == 2 and "File too large" in result.output
+    assert any(str(out / name) in result.output for name in whole)
+    assert not [path for path in out.rglob("*") if path.is_file()]
+
+
 @pytest.mark.parametrize("expected", ["photometry"], indirect=True)
 def test_outputs_of_another_are_kept(inputs, expected):
     """Without a cut-off run, a file with the name of a second output is the user's."""

@@ -88,12 +88,12 @@ def resolve_output(path: Path) -> Path:
     return path
 
 
-_unnamed: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("unnamed", default=None)
-"""Whole temporary files and their paths inside `renamed_together`; None outside of it."""
+_pending_renames: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("pending", default=None)
+"""Whole temporary files and their paths inside `rename_together`; None outside of it."""
 
 
 @contextmanager
-def renamed_together(main: Path) -> Iterator[None]:
+def rename_together(main: Path) -> Iterator[None]:
     """Give the files of a block their names at its end, `main` last; if it fails, write none.
 
     A command with several outputs is inside it. If `main` exists, all outputs are whole. If the
@@ -105,23 +105,23 @@ def renamed_together(main: Path) -> Iterator[None]:
     main : Path
         The output whose existence means that everything is done.
     """
-    main, unnamed = resolve_output(main), list[tuple[Path, Path]]()
-    token = _unnamed.set(unnamed)
+    main, renames = resolve_output(main), list[tuple[Path, Path]]()
+    token = _pending_renames.set(renames)
     try:
         yield
         # Each file is on the disk already: the renames need no space.
-        for temporary, path in sorted(unnamed, key=lambda pair: pair[1] == main):
+        for temporary, path in sorted(renames, key=lambda pair: pair[1] == main):
             temporary.replace(path)
     finally:
-        _unnamed.reset(token)
-        for temporary, _ in unnamed:
+        _pending_renames.reset(token)
+        for temporary, _ in renames:
             temporary.unlink(missing_ok=True)
 
 
 def is_cut_off(main: Path) -> bool:
     """Return whether a command was killed before its output `main`, and so all, had its name."""
     main = resolve_output(main)
-    return not main.exists() and bool(find_left_over(main.parent, main.name))
+    return not main.exists() and any(main.parent.glob(f".{escape(main.name[:40])}.*.tmp"))
 
 
 @contextmanager
@@ -150,7 +150,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     OutputError
         If `path` is a device, a pipe or a folder.
     """
-    path, unnamed = resolve_output(Path(path)), _unnamed.get()
+    path = resolve_output(Path(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     for unfinished in find_left_over(path.parent, path.name):
         unfinished.unlink(missing_ok=True)
@@ -167,17 +167,17 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         # The content is on the disk before it has its name, in case that the power fails between.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        if unnamed is None:
+        if (renames := _pending_renames.get()) is None:
             temporary.replace(path)
         else:
-            unnamed.append((temporary, path))
+            renames.append((temporary, path))
     except OSError as error:
         # Libraries leave out which file a full disk has no space for, or name the temporary one.
         if error.errno is not None and error.filename in (None, temporary, str(temporary)):
             error.filename = str(path)
         raise
     finally:
-        if (temporary, path) not in (unnamed or ()):
+        if (temporary, path) not in (_pending_renames.get() or ()):
             temporary.unlink(missing_ok=True)
 
 
@@ -211,7 +211,7 @@ def no_formula(cell: Any) -> Any:
     return cell
 
 
-def without_apostrophe(cell: Any) -> Any:
+def strip_apostrophe(cell: Any) -> Any:
     """Return the cell that `no_formula` has changed; any other one stays."""
     is_changed = isinstance(cell, str) and cell[:1] == "'" and no_formula(cell[1:]) == cell
     return cell[1:] if is_changed else cell
@@ -222,10 +222,10 @@ def map_texts(table: DataFrame, change: Callable[[Any], Any]) -> DataFrame:
     table = table.copy(deep=False)
     for name in [name for name in table if table[name].dtype.kind == "O"]:
         values = table[name].tolist()
-        changed = [*map(change, values)]
+        new_values = [*map(change, values)]
         # A column of which nothing changes keeps its type.
-        if any(new is not old for new, old in zip(changed, values, strict=True)):
-            table[name] = changed
+        if any(new is not old for new, old in zip(new_values, values, strict=True)):
+            table[name] = new_values
     return table.rename(columns=change)
 
 
@@ -400,11 +400,11 @@ class _SafeFile(io.FileIO):
 
     def write(self, content: Any) -> int:
         """Write all bytes, or none after an error."""
-        rest = memoryview(content).cast("B")
-        size = len(rest)
+        unwritten = memoryview(content).cast("B")
+        size = len(unwritten)
         # The system may write fewer bytes than it is given, the last time before an error.
-        while self.error is None and rest:
-            rest = rest[self._call(super().write, rest) :]
+        while self.error is None and unwritten:
+            unwritten = unwritten[self._call(super().write, unwritten) :]
         return size
 
     def truncate(self, size: int | None = None) -> int:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from psfdae.base.errors import no_such_file, require_file
-from psfdae.base.files import ProductError, map_texts, without_apostrophe
+from psfdae.base.files import ProductError, map_texts, strip_apostrophe
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -163,7 +163,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
             # pyarrow verifies the checksums of pages only if it is asked to.
             table = pd.read_parquet(path, page_checksum_verification=True, **options)
         else:
-            table = map_texts(pd.read_csv(path, **options), without_apostrophe)
+            table = map_texts(pd.read_csv(path, **options), strip_apostrophe)
     except FileNotFoundError:
         raise ProductError(no_such_file(path)) from None
     except (OSError, ValueError, pd.errors.ParserError, RecursionError) as error:

@@ -14,7 +14,7 @@ from psfdae.base.errors import Error
 from psfdae.base.files import (
     check_outputs,
     is_cut_off,
-    renamed_together,
+    rename_together,
     write_bytes,
     write_columns,
     write_product,
@@ -384,7 +384,7 @@ def write_model(
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
     # The bundle gets its name after all others: if it exists, everything is done.
-    with renamed_together(files.bundle):
+    with rename_together(files.bundle):
         model.save(files.bundle)
         # The field of each exposure, by its own stars.
         exposure_models = for_exposures(model, stars)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from psfdae.base.files import renamed_together, write_fits
+from psfdae.base.files import rename_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
@@ -61,7 +61,7 @@ def photometry_command(
     photometry = photometry_of_image(
         load_field(model), source, zero_point, reference, magnitude_column
     )
-    with renamed_together(out):
+    with rename_together(out):
         write_table(out, photometry.table)
         if residual is not None:
             write_fits(residual, photometry.residual.to_hdu()[0])

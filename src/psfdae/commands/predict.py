@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import atomic_path, check_outputs, is_cut_off, renamed_together
+from psfdae.base.files import atomic_path, check_outputs, is_cut_off, rename_together
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
@@ -110,7 +110,7 @@ def predict_command(
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
         # The FITS file gets its name last: if it exists, everything is done.
-        with renamed_together(out), atomic_path(out) as unfinished:
+        with rename_together(out), atomic_path(out) as unfinished:
             flag_counts, unflagged, list_note = write_prediction(
                 loaded, source, observation, unfinished, threads, fixed_positions
             )
@@ -172,10 +172,10 @@ def check_targets(
     OutputError, PredictionError
         If a path is an input, a folder or an existing file, or two outputs have the same name.
     """
+    overwrite = overwrite or is_cut_off(out)
     # An output is neither an input nor another output, and replaces nothing without a word.
     targets = [out, *filter(None, other_outputs)]
     check_outputs(targets, inputs)
-    overwrite = overwrite or is_cut_off(out)
     for target in targets:
         if target.exists() and not overwrite:
             raise PredictionError(f"{target}: exists already; --overwrite replaces it")

@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import renamed_together, write_fits
+from psfdae.base.files import rename_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
@@ -87,7 +87,7 @@ def wavefront_command(
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
     lines = [observation.summary(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
     # The FITS file gets its name last: if it exists, everything is done.
-    with renamed_together(out):
+    with rename_together(out):
         if list_path is not None:
             write_list(observation, list_path)
         if plot is not None:
