@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import stat
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -46,6 +47,12 @@ def words_of_a_command() -> Iterator[None]:
         yield
     finally:
         _in_command.reset(token)
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Warn the user of a call in Python, line by line; a command prints the lines itself."""
+    for line in () if _in_command.get() else lines:
+        warnings.warn(line, UserWarning, stacklevel=5)
 
 
 def keyword(name: str, value: object = None) -> str:

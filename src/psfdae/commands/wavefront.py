@@ -18,6 +18,7 @@ from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
 from psfdae.image.catalogue import as_catalogue
+from psfdae.image.detector_frame import find_offset
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
@@ -82,10 +83,12 @@ def wavefront_command(
     observation = source.open(stamp_px)
     check_scale(observation, optics)
     field_deg = field_angles(observation, source.catalogue, optics, axis)
+    notes = note_axis(observation) if axis is None else []
     # All stars are one piece: the joint fit takes them together.
     stamps = next(observation.chunks(observation.count))
     wavefronts = measure_wavefronts(stamps, optics, field_deg=field_deg, joint=joint, seed=seed)
-    lines = [observation.summary(), *_list_note(wavefronts, observation), *report_lines(wavefronts)]
+    notes += _list_note(wavefronts, observation)
+    lines = [observation.summary(), *notes, *report_lines(wavefronts)]
     # The FITS file gets its name last: if it exists, everything is done.
     with rename_together(out):
         if list_path is not None:
@@ -131,6 +134,17 @@ def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     offset = np.where(wavefronts.explained, offset, np.nan).T
     note = list_offset(observation.catalogue, offset, accept=True)
     return [] if note is None else [note]
+
+
+def note_axis(observation: Observation) -> list[str]:
+    """Return a sentence if the image is a part of the detector, whose middle is not the axis."""
+    frames, any_size = observation.detector_frames, np.full(2, np.inf)
+    offset = find_offset({}, any_size, frames, np.zeros(2))
+    if offset is None or not offset.any():
+        return []
+    x, y = offset
+    first = f"{observation.path}: its first pixel is x {x:g}, y {y:g} of the detector"
+    return [f"{first}, but field angles count from the image's middle: --axis gives the axis"]
 
 
 def check_scale(observation: Observation, telescope: OwnTelescope) -> None:

@@ -381,10 +381,12 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
     A WCS is damaged if its keys announce coordinates of the sky, but astropy makes none of them.
     """
     projection = str(image.card("CTYPE1") or "")
-    if image.wcs is None and projection[:4].strip("-") in ("RA", "DEC", "GLON", "GLAT"):
+    names = {str(image.card(f"CTYPE{axis}") or "")[:4].strip("-") for axis in (1, 2, 3)}
+    if image.wcs is None and names & {"RA", "DEC", "GLON", "GLAT", "ELON", "ELAT"}:
         return [
-            f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
-            "coordinates, and the pixel scale is that of other keys"
+            f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used, or its sky "
+            "axes are not those of the pixels: no sky coordinates, and the pixel scale is that of "
+            "other keys"
         ]
     # astropy applies a polynomial that the projection does not announce.
     distorted = image.wcs is not None and image.wcs.sip is not None

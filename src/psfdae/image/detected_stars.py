@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.base.arguments import check_arguments
 from psfdae.image.image_input import ImageInput
 from psfdae.image.tables import star_table
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from psfdae.image.containers import Image
 
 
+@check_arguments
 def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
     """Find the stars of an image.
 

@@ -30,6 +30,7 @@ from psfdae.base.files import find_left_over, temporary_name
 from psfdae.image.errors import ObservationError, reading, shorten
 
 if TYPE_CHECKING:
+    from astropy.coordinates import BaseCoordinateFrame, SkyCoord
     from astropy.io.fits import HDUList, Header
     from astropy.wcs import WCS
     from numpy.typing import DTypeLike
@@ -550,9 +551,11 @@ def has_pixels(hdu: Any) -> bool:
 
 
 def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
-    """Return the celestial WCS of an image; None without a stated scale or celestial axes.
+    """Return the WCS of the first two pixel axes if they are celestial, in the order of the header.
 
-    None as well if the WCS is damaged.
+    Right ascension may be its second axis: pixels stay x and y (`WCS.celestial` would exchange
+    them). None without a scale, for other axes, for a frame that astropy does not know, and if the
+    WCS is damaged or cannot be inverted.
 
     Parameters
     ----------
@@ -567,10 +570,47 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
         return None
     try:
-        wcs = WCS(header, fobj=hdus)
-        return wcs.celestial if wcs.has_celestial else None
+        # Axes beyond the plane of the image, such as a wavelength, do not mix with the sky.
+        wcs = WCS(header, fobj=hdus).sub([1, 2])
+        # The reference pixel has a place on the sky, in a frame with a way to ICRS, and this place
+        # has the same pixel: wcslib exchanges signs of TPV where declination is the first axis.
+        pixel_to_sky(wcs, *wcs.wcs.crpix[:, None])
+        pixel = wcs.wcs_world2pix(wcs.wcs_pix2world([wcs.wcs.crpix], 1), 1)
+        return wcs if np.allclose(pixel, wcs.wcs.crpix, rtol=0.0, atol=1e-3) else None
     except Exception:  # wcslib and astropy raise many kinds, all of which mean the same here
         return None
+
+
+def sky_frame(wcs: WCS) -> BaseCoordinateFrame:
+    """Return the frame of a celestial WCS.
+
+    astropy knows no ecliptic frame of a header, and lets RADESYS, which is of equatorial
+    coordinates alone, override galactic axes.
+
+    Raises
+    ------
+    ValueError
+        If the frame is not known.
+    """
+    from astropy.coordinates import BarycentricMeanEcliptic, Galactic, Supergalactic
+    from astropy.wcs.utils import wcs_to_celestial_frame
+
+    # Ecliptic of the mean equinox, of 2000 if the header has none (Calabretta & Greisen 2002, A&A
+    # 395, 1077, sect. 3.1).
+    year = 2000.0 if np.isnan(wcs.wcs.equinox) else wcs.wcs.equinox
+    ecliptic = BarycentricMeanEcliptic(equinox=f"J{year}")
+    frames = {"GLON": Galactic(), "SLON": Supergalactic(), "ELON": ecliptic}
+    kind = wcs.wcs.lngtyp
+    return frames[kind] if kind in frames else wcs_to_celestial_frame(wcs)
+
+
+def pixel_to_sky(wcs: WCS, x: np.ndarray, y: np.ndarray) -> SkyCoord:
+    """Return ICRS coordinates (n,) of 0-based pixels (n,), distortions included."""
+    from astropy.coordinates import SkyCoord
+
+    world = wcs.all_pix2world(x, y, 0)
+    longitude, latitude = world[wcs.wcs.lng], world[wcs.wcs.lat]
+    return SkyCoord(longitude, latitude, unit="deg", frame=sky_frame(wcs)).icrs
 
 
 # Pixels.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
+from psfdae.base.arguments import check_values
 from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.options import Extension, File
 from psfdae.image.camera import HEADER_KEYS
@@ -103,6 +104,12 @@ class ImageInput(ImageStatements):
     image: Path | PlainFile | np.ndarray
     flux_column: str | None = field(default=None, kw_only=True)
     background_column: str | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the types of all values."""
+        from astropy.units import Quantity
+
+        check_values(type(self).__init__, vars(self), Number=float | Quantity, StarList=Any)
 
     @classmethod
     def of(cls, image: Image, statements: Mapping[str, Any]) -> ImageInput:
@@ -223,8 +230,6 @@ class ImageInput(ImageStatements):
             raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
         if margin < 0:
             raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
-        if self.origin not in (None, 0, 1):
-            raise ObservationError(self.path, f"{keyword('origin', self.origin)}: expected 0 or 1")
         # A mask has up to 63 bits and a sign.
         if self.bad_bits is not None and not 0 < self.bad_bits < 2**63:
             typed = keyword("bad_bits", self.bad_bits)

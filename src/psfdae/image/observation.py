@@ -23,8 +23,9 @@ import numpy as np
 from psfdae.image.camera import CameraValue
 from psfdae.image.catalogue import Catalogue
 from psfdae.image.detection import Sky
+from psfdae.image.detector_frame import detector_frames
 from psfdae.image.errors import ObservationError, reading, shorten, silent
-from psfdae.image.fits_file import Card, Pixels, open_pixels
+from psfdae.image.fits_file import Card, Pixels, open_pixels, pixel_to_sky
 from psfdae.image.layers import Layers
 from psfdae.image.positions import repeated_rows
 from psfdae.image.stamps import (
@@ -173,6 +174,11 @@ class Observation:
         scale = CameraValue(self.assumed_scale_arcsec, "assumed")
         return replace(self, camera=self.camera | {"pixel scale": scale})
 
+    @property
+    def detector_frames(self) -> dict[str, list[float]]:
+        """Where its pixels lie on the detector, as far as the header gives it."""
+        return detector_frames(self._layers.image)
+
     def sky(self) -> Sky:
         """Return the whole image with its sky; ObservationError if none can be measured."""
         return self._layers.sky()
@@ -197,13 +203,10 @@ class Observation:
         tuple of ndarray, or None
             Right ascension and declination, shape (n,) each.
         """
-        from astropy.wcs.utils import pixel_to_skycoord
-
         if (wcs := self.wcs) is None:
             return None
-        # A WCS may have any frame of the sky, such as galactic coordinates.
         with reading(self.path):
-            coordinates = pixel_to_skycoord(x, y, wcs).icrs
+            coordinates = pixel_to_sky(wcs, x, y)
         return coordinates.ra.deg, coordinates.dec.deg
 
     def summary(self) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from psfdae.base.errors import keyword
 from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.errors import ObservationError, reading
-from psfdae.image.fits_file import ImageFile
+from psfdae.image.fits_file import ImageFile, sky_frame
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
@@ -269,18 +269,18 @@ def sky_to_pixel(
     """
     from astropy.coordinates import SkyCoord
     from astropy.wcs import NoConvergence
-    from astropy.wcs.utils import skycoord_to_pixel
 
-    # First by the projection without its distortions.
-    stars = SkyCoord(ra, dec, unit="deg")
-    # Mode "wcs" is the linear part and the projection, without SIP or look-up tables.
-    x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
+    # Longitude and latitude in the order of the header's axes.
+    stars = SkyCoord(ra, dec, unit="deg").transform_to(sky_frame(wcs)).spherical
+    world = np.stack([stars.lon.deg, stars.lat.deg])[:: 1 if wcs.wcs.lng < wcs.wcs.lat else -1]
+    # First the linear part and the projection, without SIP or look-up tables.
+    x, y = wcs.wcs_world2pix(*world, 0)
     # Stars at most one size of the image off its edge.
     rows, columns = shape
     is_near = (np.abs(x - columns / 2) < 1.5 * columns) & (np.abs(y - rows / 2) < 1.5 * rows)
     if wcs.has_distortion and is_near.any():
         try:
-            x[is_near], y[is_near] = skycoord_to_pixel(stars[is_near], wcs, mode="all")
+            x[is_near], y[is_near] = wcs.all_world2pix(*world[:, is_near], 0)
         # Where the iteration does not end, its last step counts, unless it runs away.
         except NoConvergence as error:
             solution = np.array(error.best_solution, dtype=np.float64)

@@ -106,7 +106,11 @@ class StarFlag(IntFlag):
         "brightest pixel farther from the centre than the stamp could be moved; in "
         "photometry, the fit moved the star by half a FWHM and three errors of its place",
     )
-    UNLIKE_TRAINING = 512, "farther from the training set than 99.9 % of its test stars"
+    UNLIKE_TRAINING = (
+        512,
+        "farther from the training set than 99.9 % of its test stars; in photometry, of an "
+        "image with far larger chi2 than the training's",
+    )
     BLENDED = (
         1024,
         "the star list says that it was parted from a neighbour; in photometry, a star is "

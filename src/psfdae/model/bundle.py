@@ -20,6 +20,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,11 @@ class Bundle:
     flux_model: FluxModel
     errors: ErrorModel
 
-    @property
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy what a file has."""
+        return bundle_from_arrays, (self.info, bundle_arrays(self))
+
+    @cached_property
     def sha256(self) -> str:
         """Checksum of everything but the date."""
         return _digest(self.info.model_dump(mode="json"), bundle_arrays(self))
@@ -290,6 +295,11 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
+    return bundle_from_arrays(info, arrays)
+
+
+def bundle_from_arrays(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> Bundle:
+    """Return a bundle from its description and the arrays of its file (`bundle_arrays`)."""
     # Groups of arrays, without their prefix, make the parts of the bundle.
     flux, errors, weights = (
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
     from psfdae.model.field_psfs import FieldPsfs
 
+MAX_CHI2_RATIO = 2.5
+"""Median χ² of an image's bright stars, over that of the training, from which all are flagged."""
+
 
 @dataclass(frozen=True)
 class CrowdedPhotometry:
@@ -52,6 +55,8 @@ class CrowdedPhotometry:
         any.
     image_wings : Wings or None
         Wings of the image, which faint stars hardly show; None without a star that has light.
+    chi2_ratio : float
+        Median χ² of bright stars over the χ² that the training stars would have; NaN if not known.
     """
 
     model: FieldPsfs
@@ -60,6 +65,7 @@ class CrowdedPhotometry:
     light: np.ndarray
     wings: Wings | None
     image_wings: Wings | None
+    chi2_ratio: float = np.nan
 
     @property
     def radius_px(self) -> float:
@@ -149,14 +155,17 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Farther from where it was expected than noise explains, a star may be another one.
     distance_px = np.hypot(*(fit.place - origin).T)
-    sigma_px = np.hypot(stars["x_error"], stars["y_error"])
-    is_far = distance_px > np.maximum(same_px, 3.0 * sigma_px)
+    is_far = distance_px > np.maximum(same_px, 3.0 * np.hypot(stars["x_error"], stars["y_error"]))
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
+    # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
+    chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(_box(fwhm)))
     # Stars of a list keep its numbers and flags.
     if observation.detections is None:
         stars["id"] = observation.stars.id
         stars["flags"] |= observation.stars.flags
-    return CrowdedPhotometry(model, stars, sky.flat, fit.light + wing_light, wings_used, wings)
+    return CrowdedPhotometry(
+        model, stars, sky.flat, fit.light + wing_light, wings_used, wings, chi2_ratio
+    )
 
 
 def tabulate_stars(model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: float) -> Table:
@@ -184,6 +193,35 @@ def tabulate_stars(model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: f
     relative_error = np.hypot(model_error, total_error / total)
     stars["flux_error"] = np.hypot(stars["flux_error"], relative_error * stars["flux"])
     return stars
+
+
+def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float, min_stars: int = 3) -> float:
+    """Return the median of bright stars' χ² over the χ² that the training stars would have.
+
+    All stars are flagged UNLIKE_TRAINING if it is above `MAX_CHI2_RATIO`.
+
+    Parameters
+    ----------
+    fit : JointFit
+    flags : ndarray, shape (n,)
+        Changed here; bright stars are those without another flag than POOR_FIT.
+    variance : float
+        Variance v of the training stars about their PSF, summed over the noise-equivalent area.
+    min_stars : int
+        Fewer bright stars are not compared.
+
+    Returns
+    -------
+    float
+        NaN if the variance is not known or stars are too few.
+    """
+    # χ² = 1 + (F/σ_F)² v: noise, and residuals of variance v F².
+    snr = fit.flux / fit.flux_error
+    is_bright = (flags & ~np.uint16(StarFlag.POOR_FIT) == 0) & (snr > 20.0)
+    ratio = (fit.chi2 / (1.0 + snr**2 * variance))[is_bright]
+    median_ratio = float(np.median(ratio)) if len(ratio) >= min_stars else np.nan
+    raise_flag(flags, StarFlag.UNLIKE_TRAINING, np.full(len(flags), median_ratio > MAX_CHI2_RATIO))
+    return median_ratio
 
 
 def star_flags(

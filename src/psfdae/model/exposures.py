@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
+from psfdae.base.errors import warn
 from psfdae.base.version import __version__
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
@@ -79,6 +81,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
+    model, frame_notes = model.moved_to(observation)
     difference = other_instrument(model, observation)
     bright = collect(observation, calibration, settings.framing).bright
     if not np.isfinite(bright.position).all():
@@ -89,8 +92,33 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     offset_note = list_offset(
         observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
     )
-    lines = [*observation.remarks, *filter(None, [offset_note]), sentence]
-    return _adapt(model, field, observation, bright, name), "\n".join(lines)
+    # The part of the field that the image shows.
+    last_pixel = np.array(observation.shape[::-1]) - 1.0
+    low, high = np.clip(model.field_range(), 0.0, last_pixel)
+    warnings = [*frame_notes, *note_empty_quarters(low, high, bright.position)]
+    warn(warnings)
+    lines = [*observation.remarks, *filter(None, [offset_note]), *warnings, sentence]
+    return _adapt(model, observation, bright, name), "\n".join(lines)
+
+
+def note_empty_quarters(low: np.ndarray, high: np.ndarray, position: np.ndarray) -> list[str]:
+    """Return a sentence on quarters of a field with hardly a star; none if all have some.
+
+    Parameters
+    ----------
+    low, high : ndarray, shape (2,)
+        Range of the field along x and y.
+    position : ndarray, shape (n, 2)
+        Positions of the stars, x and y.
+    """
+    # A quarter is a half along x and a half along y; a 16th of the stars is too few for one.
+    middle, few, empty = 0.5 * (low + high), len(position) // 16, []
+    for quarter in product((False, True), repeat=2):
+        if ((position > middle) == quarter).all(axis=1).sum() <= few:
+            (x0, y0), (x1, y1) = np.where(quarter, (middle, high), (low, middle))
+            empty.append(f"x {x0:.0f} … {x1:.0f}, y {y0:.0f} … {y1:.0f}")
+    note = f"{few} bright stars or fewer in {len(empty)} of the 4 quarters ({'; '.join(empty)})"
+    return [f"{note}: the change of the PSF is not measured there"] if empty else []
 
 
 def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
@@ -114,7 +142,7 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
     for image in stars.exposures:
         bright, models[image.name] = image.candidates.bright, model
         if isinstance(field, FieldMixture) and len(bright) >= MIN_STARS_WITH_ERROR:
-            models[image.name] = _adapt(model, field, image.observation, bright, image.name)
+            models[image.name] = _adapt(model, image.observation, bright, image.name)
     return models
 
 
@@ -129,21 +157,19 @@ def adapted_to_stars(model: PsfModel, stars: Stars) -> PsfModel:
     stars : Stars
         Bright stars of the other image.
     """
-    field, train = model.method, stars.split.train
-    assert isinstance(field, FieldMixture)
+    model, train = model.moved_to(stars.observation)[0], stars.split.train
     bright = stars.candidates.bright.of(np.flatnonzero(~stars.held_out))
-    adapted = _adapt(model, field, stars.observation, bright, stars.name)
+    adapted = _adapt(model, stars.observation, bright, stars.name)
     # The checksum of the stars that were learnt from shows a test that it saw no other.
     learnt = checksum(stars.product["realisation"][train], stars.product[stars.reference][train])
     info = adapted.info.model_copy(update={"training_sha256": learnt})
     return PsfModel(replace(adapted.bundle, info=info))
 
 
-def _adapt(
-    model: PsfModel, field: FieldMixture, observation: Observation, bright: BrightStars, name: str
-) -> PsfModel:
+def _adapt(model: PsfModel, observation: Observation, bright: BrightStars, name: str) -> PsfModel:
     """Return a copy of a model with the field of an exposure, and a description that says so."""
-    info, training = model.info, model.info.config["stars"]
+    info, training, field = model.info, model.info.config["stars"], model.method
+    assert isinstance(field, FieldMixture)
     # New coefficients of the field; all other arrays, and errors, stay those of the training.
     sky = bright.sky_photons(observation.gain, field.noise.background)
     arrays, _ = field.of_exposure(bright, sky).pack(info.stamp_px, info.noise_min)
@@ -156,6 +182,7 @@ def _adapt(
         "image_sha256": observation.sha256(),
         "trained_on": training.get("image_sha256", ""),
         "image_px": [*reversed(observation.shape or ())],
+        "detector": observation.detector_frames,
         "instrument": observation.instrument,
         "adapted": {"from": model.sha256, "stars": len(bright)},
     }

@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pydantic import Field
 
+from psfdae.base.arguments import check_arguments, real_numbers
 from psfdae.base.errors import Error
 from psfdae.model.image_photometry import ImageFluxes
 from psfdae.stars.moments import measure_shapes
@@ -17,6 +18,7 @@ from psfdae.stars.moments import measure_shapes
 if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel
 
+    from psfdae.image.observation import Observation
     from psfdae.model.wings import Wings
 
 
@@ -28,6 +30,13 @@ class _Array(Protocol):
 
 Numbers: TypeAlias = float | Sequence[float] | _Array
 """Number, or several; `ArrayLike` would include texts."""
+
+
+NodeCount: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+"""Number of positions along an axis."""
+
+Oversampling: TypeAlias = Annotated[int, Field(ge=1, le=32)]
+"""Values per pixel; memory grows as the square, and no PSF has structure at a 32nd of a pixel."""
 
 
 class PredictionError(Error, ValueError):
@@ -108,6 +117,38 @@ class FieldPsfs(ImageFluxes, ABC):
         `source` names the image in the message.
         """
 
+    def moved_to(self, observation: Observation) -> tuple[Self, list[str]]:
+        """Return the model in the pixel coordinates of an image of a part of the detector.
+
+        Returns
+        -------
+        model : FieldPsfs
+            The same where the headers do not show the place (`psfdae.image.detector_frame`).
+        notes : list of str
+            A sentence on an image of another size or place than the training's.
+
+        Raises
+        ------
+        PredictionError
+            If the headers show another binning, or a mirrored image.
+        """
+        return self, []
+
+    def residual_variance(self, side_px: int) -> float:
+        """Return the mean variance of training stars about their PSF, over the flux squared.
+
+        Parameters
+        ----------
+        side_px : int
+            Odd side of the square of pixels about a star.
+
+        Returns
+        -------
+        float
+            NaN if it is not known.
+        """
+        return np.nan
+
     @abstractmethod
     def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         """Return PSFs (n, m, m) as `psf_at`, at checked positions (n, 2) to (n, 4).
@@ -115,11 +156,12 @@ class FieldPsfs(ImageFluxes, ABC):
         Columns are x, y, magnitude and colour; NaN stands for an average over the training stars.
         """
 
+    @check_arguments
     def psf_at(
         self,
         x: Numbers,
         y: Numbers,
-        oversampling: int = 4,
+        oversampling: Oversampling = 4,
         *,
         mag: Numbers | None = None,
         colour: Numbers | None = None,
@@ -156,7 +198,7 @@ class FieldPsfs(ImageFluxes, ABC):
         is_stated = [value is not None for value in columns.values()]
         count = 4 if is_stated[3] else 3 if is_stated[2] else 2
         numbers = [
-            real_numbers(name, np.nan if value is None else value)
+            real_numbers(name, np.nan if value is None else value, PredictionError)
             for name, value in columns.items()
         ]
         position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
@@ -164,9 +206,6 @@ class FieldPsfs(ImageFluxes, ABC):
             raise PredictionError(
                 "positions, mag and colour must be finite, one of each or arrays of as many"
             )
-        # Memory grows as its square; the PSF has no structure at a 32nd of a pixel.
-        if not 1 <= oversampling <= 32:
-            raise PredictionError(f"oversampling {oversampling}: 1 to 32")
         # A position far outside the image may overflow, which is refused below.
         with np.errstate(all="ignore"):
             psfs = self.draw_psfs(position.reshape(-1, count), oversampling)
@@ -190,6 +229,7 @@ class FieldPsfs(ImageFluxes, ABC):
         x, y, *mag = position.T
         return self.psf_at(x, y, 1, mag=mag[0] if mag else None)
 
+    @check_arguments
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
         """Return the flux of a star over its light within an aperture.
 
@@ -213,7 +253,8 @@ class FieldPsfs(ImageFluxes, ABC):
 
         return aperture_correction(self, self.wings, x, y, radius_px)
 
-    def grid(self, columns: int, rows: int) -> np.ndarray:
+    @check_arguments
+    def grid(self, columns: NodeCount, rows: NodeCount) -> np.ndarray:
         """Return positions (n, 2), x and y, evenly over the field; raises as `field_range`."""
         # Rows of the grid follow each other: x changes fastest.
         low, high = self.field_range()
@@ -226,7 +267,8 @@ class FieldPsfs(ImageFluxes, ABC):
         x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
         return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
-    def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
+    @check_arguments
+    def to_photutils(self, nodes: NodeCount = 9, oversampling: Oversampling = 4) -> GriddedPSFModel:
         """Return the field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
 
         Its PSFs have an odd number of values along an axis.
@@ -275,20 +317,3 @@ def pickled_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
 def blank_grid(name: str) -> GriddedPSFModel:
     """Return an object of the class `grid_class(name)` without values, for unpickling."""
     return object.__new__(grid_class(name))
-
-
-def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
-    """Return an array of float32 or float64 in the machine's byte order.
-
-    Raises
-    ------
-    PredictionError
-        If the values, called `name` in the message, are no real numbers.
-    """
-    # Floats of up to 32 bits become float32, all other numbers float64.
-    # Texts, complex numbers and objects are refused.
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiub":
-        raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
-    is_single = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-    return array.astype(np.float32 if is_single else np.float64, copy=False)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import needed_by
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
@@ -29,6 +30,7 @@ from psfdae.model.wings import Wings
 Kind = TypeVar("Kind", bound=Method)
 
 
+@check_arguments
 def fit(
     stars: Stars,
     method: str | None = None,

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from psfdae.base.errors import Error, keyword
+from psfdae.base.arguments import check_arguments
+from psfdae.base.errors import Error, keyword, warn
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.image_input import ImageInput
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
     from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
     from psfdae.model.field_psfs import FieldPsfs
+
+
+TURNED = "an image that is turned, of another part of the detector, or of another PSF?"
+"""What stars that are all unlike the training's may mean."""
 
 
 class PhotometryError(Error, ValueError):
@@ -72,6 +77,7 @@ class ImagePhotometry:
 class ImageFluxes:
     """Photometry of a whole image, for all models that know the PSF at every place."""
 
+    @check_arguments
     def photometry(
         self,
         image: Image,
@@ -188,6 +194,8 @@ def photometry_of_image(
     if observation.shape is None:
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
+    # The image may show another part of the detector than that of the training.
+    model, frame_notes = model.moved_to(observation)
     # Read the stars of the reference before the long work, in case they cannot be used.
     magnitudes = scatter = None
     if reference is not None:
@@ -201,6 +209,7 @@ def photometry_of_image(
             str(table_of_reference.path),
         )
 
+    from psfdae.model.crowded import MAX_CHI2_RATIO
     from psfdae.model.photon_noise import with_measured_gain
 
     # All stars of the image, and the zero point by those that the reference has.
@@ -221,7 +230,12 @@ def photometry_of_image(
         **({} if zero_point is None else {"ZEROPT": zero_point}),
         **({} if scatter is None else {"ZEROPTSD": scatter}),
     }
+    if measured.chi2_ratio > MAX_CHI2_RATIO:
+        misfit = f"χ² of bright stars is {measured.chi2_ratio:.3g} times the training's (median)"
+        frame_notes.append(f"{source.path}: {misfit}, all are flagged UNLIKE_TRAINING: {TURNED}")
+    warn(frame_notes)
     notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
+    notes = (*notes, *frame_notes)
     return ImagePhotometry(measured, table, tuple(filter(None, notes)), observation.wcs)
 
 

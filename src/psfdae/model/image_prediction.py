@@ -10,7 +10,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from pydantic import PositiveInt
 
+from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import call, keyword
 from psfdae.image.camera import other_instruments
 from psfdae.image.image_input import ImageInput
@@ -18,6 +20,7 @@ from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.model.field_psfs import PredictionError
+from psfdae.model.image_photometry import TURNED
 from psfdae.model.prediction import Prediction
 
 if TYPE_CHECKING:
@@ -29,13 +32,14 @@ if TYPE_CHECKING:
 class WholeImages:
     """Calls of a `PsfModel` that take a whole image, as the commands of the same names do."""
 
+    @check_arguments
     def predict_image(
         self,
         image: Image,
         catalogue: StarList | None = None,
         *,
         fixed: bool = False,
-        threads: int | None = None,
+        threads: PositiveInt | None = None,
         **statements: Any,
     ) -> Prediction:
         """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
@@ -68,6 +72,7 @@ class WholeImages:
         source = ImageInput.of(image, {**statements, "catalogue": catalogue})
         return predict_stars(cast("PsfModel", self), source, threads, fixed)
 
+    @check_arguments
     def adapt(
         self,
         image: Image,
@@ -129,8 +134,10 @@ def predict_stars(
     # The stars are near the listed positions, or the list is refused.
     offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     notes = [observation.summary(), offset_note if observation.shape else None]
-    notes += notes_on_model(model, observation)
-    return replace(Prediction.joined(predictions), notes=tuple(filter(None, notes)))
+    prediction = Prediction.joined(predictions)
+    unlike = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
+    notes += notes_on_model(model, observation, unlike)
+    return replace(prediction, notes=tuple(filter(None, notes)))
 
 
 def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> Observation:
@@ -157,12 +164,20 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
     return observation
 
 
-def notes_on_model(model: PsfModel, observation: Observation) -> list[str]:
-    """Return sentences on another instrument than the training's, and on light beyond stamps."""
-    notes = []
+def notes_on_model(model: PsfModel, observation: Observation, unlike: int) -> list[str]:
+    """Return sentences on what limits the trust in predictions of an image.
+
+    They are on another frame or instrument than the training's, on stars unlike the training's
+    (`unlike` is their number), and on light outside of stamps.
+    """
+    notes = model.moved_to(observation)[1]
     # Another telescope, camera or filter, as far as both images name theirs.
     if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
+    # Of stars as in the training, 0.1 % have this flag.
+    if unlike >= max(3, 0.1 * observation.count):
+        misfit = f"{unlike} of {observation.count} stars are flagged UNLIKE_TRAINING"
+        notes.append(f"{observation.path}: {misfit}: {TURNED}")
     if observation.shape and model.method.knows_field and not model.wings:
         notes.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "

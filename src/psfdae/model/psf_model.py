@@ -10,18 +10,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import NonNegativeInt, PositiveInt
 
+from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import call, keyword
 from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
+from psfdae.image.detector_frame import find_offset
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.image.tables import html_table
 from psfdae.methods.bundle_info import BundleInfo
+from psfdae.methods.field_law import FieldLaw
 from psfdae.methods.interface import Method
 from psfdae.model.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
@@ -35,6 +39,7 @@ SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
 
 
+@check_arguments
 def load_model(path: str | Path | None = None) -> PsfModel:
     """A trained model, ready to predict the PSFs of stars.
 
@@ -99,6 +104,10 @@ class PsfModel(WholeImages, FieldPsfs):
         self.restorer = Restorer(bundle, estimator(bundle) if method is None else method)
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy the bundle alone, from which all else is made."""
+        return type(self), (self.bundle,)
+
     def __repr__(self) -> str:
         info = self.info
         return (
@@ -131,10 +140,12 @@ class PsfModel(WholeImages, FieldPsfs):
         """Fitted method that restores the stars."""
         return self.restorer.method
 
+    @check_arguments
     def save(self, path: str | Path) -> None:
         """Write the model to a file, by custom NAME.psf.safetensors, for `load_model`."""
         write_bundle(self.bundle, Path(path))
 
+    @check_arguments
     def predict(
         self,
         stamps: ArrayLike,
@@ -148,8 +159,8 @@ class PsfModel(WholeImages, FieldPsfs):
         position: ArrayLike | None = None,
         centre: ArrayLike | None = None,
         fixed: bool = False,
-        margin: int = 0,
-        threads: int | None = 1,
+        margin: NonNegativeInt = 0,
+        threads: PositiveInt | None = 1,
     ) -> Prediction:
         """Return the PSFs of stars, with uncertainties, photometry, shapes and flags.
 
@@ -196,8 +207,8 @@ class PsfModel(WholeImages, FieldPsfs):
         PredictionError
             If shapes or types do not fit.
         """
-        # Check the arrays, and make them to stamps. A margin below 0 leaves no side that fits.
-        side = self.stamp_px + 2 * margin if margin >= 0 else 0
+        # Check the arrays, and make them to stamps.
+        side = self.stamp_px + 2 * margin
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
@@ -217,11 +228,12 @@ class PsfModel(WholeImages, FieldPsfs):
         taken.
         """
         # Stamps are read in chunks, each of which is restored in blocks by a thread of its own.
-        size = self.restorer.block_size
+        restorer = self.moved_to(observation)[0].restorer
+        size = restorer.block_size
 
         def predicted(stamps: Stamps) -> Prediction:
-            blocks = self.restorer.blocks(stamps)
-            return Prediction.joined([self.restorer.restore(block, fixed) for block in blocks])
+            blocks = restorer.blocks(stamps)
+            return Prediction.joined([restorer.restore(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
@@ -281,7 +293,7 @@ class PsfModel(WholeImages, FieldPsfs):
         # The field's polynomial has its range in its arrays.
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
         # Stars without places leave zeros; a star alone is at one place.
-        if not ((high > low) | ((high == low) & (low > 0))).all():
+        if not ((high > low) | ((high == low) & (low != 0))).all():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
 
@@ -302,8 +314,48 @@ class PsfModel(WholeImages, FieldPsfs):
             )
         return field
 
+    def residual_variance(self, side_px: int) -> float:
+        if not isinstance(self.method, FieldLaw):
+            return np.nan
+        # Residuals of stars in the middle of their pixel (eq. 6): squares of modes, and diagonal.
+        _, modes, diagonal = self.method.residuals_at(np.zeros(2))
+        variance = (np.square(modes).sum(axis=0) + diagonal).reshape(self.stamp_px, -1)
+        begin = self.stamp_px // 2 - side_px // 2
+        middle = slice(max(begin, 0), begin + side_px)
+        return float(variance[middle, middle].mean())
+
     def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         return self._field().psf_at(place, oversampling)
+
+    def moved_to(self, observation: Observation) -> tuple[Self, list[str]]:
+        size = self.image_px
+        if not self.method.knows_field or size is None or observation.shape is None:
+            return self, []
+        # Frames of both images; models of older releases do not have one.
+        sizes = np.array(observation.shape[::-1]), np.array(size)
+        frames = self.info.config["stars"].get("detector", {})
+        try:
+            offset = find_offset(frames, sizes[1], observation.detector_frames, sizes[0])
+        except ValueError as error:
+            raise PredictionError(f"{observation.path}: {error} as {self.name!r} has") from None
+        is_moved = offset is not None and np.abs(offset).max() > 1e-3
+        if not is_moved and (sizes[0] == sizes[1]).all():
+            return self, []
+        words = "{}×{} pixels, {}×{} in the training".format(*sizes[0], *sizes[1])
+        if offset is None:
+            place = "headers do not show which part it is: positions are used as in the training"
+            return self, [f"{observation.path}: {words}; {place}"]
+        # Positions of a model are the range of its field, and the middle from which errors grow.
+        bundle, weights = self.bundle, dict(self.bundle.weights)
+        for name in ("low", "high"):
+            weights[name] = weights[name] - np.pad(offset, (0, len(weights[name]) - 2))
+        measured = bundle.errors.measured
+        measured = measured._replace(middle=measured.middle - offset)
+        moved = replace(bundle, weights=weights, errors=replace(bundle.errors, measured=measured))
+        # Results name the file of the model.
+        vars(moved)["sha256"] = bundle.sha256
+        place = "by the headers, its first pixel is x {:g}, y {:g} there".format(*offset)
+        return type(self)(moved), [f"{observation.path}: {words}; {place}"]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Refuse stars whose pixels are not those of the training.

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.base.arguments import real_numbers
 from psfdae.image.containers import parts_of_array, sigma_of
 from psfdae.image.stamps import Stamps
-from psfdae.model.field_psfs import PredictionError, real_numbers
+from psfdae.model.field_psfs import PredictionError
 
 
 def stamps_of_arrays(
@@ -50,7 +51,7 @@ def stamps_of_arrays(
     """
     # The stamps; a single one has two axes, and counts as a cube of one.
     values, masked, sigma, unit = _unpacked(stamps)
-    data = real_numbers("stamps", values)
+    data = real_numbers("stamps", values, PredictionError)
     is_single = data.ndim == 2
     data = data[None] if is_single else data
     if data.ndim != 3 or data.shape[1:] != (side, side):
@@ -74,11 +75,13 @@ def stamps_of_arrays(
                 raise PredictionError(
                     f"{name} in {value.unit}, but that of the stamps is {stamp_unit}"
                 ) from None
-        number = real_numbers(name, number)
+        number = real_numbers(name, number, PredictionError)
         if number.shape not in ((), (count,)):
             raise PredictionError(
                 f"{name} of shape {number.shape}, expected one for {count} stamps"
             )
+        if name in ("noise", "gain") and (number < 0).any():
+            raise PredictionError(f"{name}: expected numbers of at least 0")
         star_columns[name] = np.broadcast_to(number.astype(np.float64), (count,))
     # Masks of the shape of the stamps; of a single one, they may be (s, s).
     pixel_masks = {}
@@ -120,6 +123,8 @@ def _unpacked(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | 
             f"{type(stamps).__name__} in place of stamps: its array is its attribute data; "
             "psfdae.Stars.from_image takes images in FITS files"
         )
+    if isinstance(stamps, list | tuple):
+        stamps = real_numbers("stamps", stamps, PredictionError)
     values, mask, unit = parts_of_array(stamps)
     return values, mask, None, unit
 
@@ -127,7 +132,8 @@ def _unpacked(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | 
 def _columns(name: str, values: ArrayLike | None, count: int, max_columns: int) -> np.ndarray:
     """Return two numbers per star, or up to `max_columns` (n, max_columns); NaN where unknown."""
     # Two columns of NaN where nothing is stated.
-    numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
+    values = np.full((count, 2), np.nan) if values is None else values
+    numbers = real_numbers(name, values, PredictionError)
     if numbers.shape not in [(count, columns) for columns in range(2, max_columns + 1)]:
         raise PredictionError(
             f"{name} of shape {numbers.shape}, expected ({count}, 2)"

@@ -289,6 +289,9 @@ def require_one_camera(opened: Sequence[Observation]) -> None:
             name, (stated, text) = "the pixel scale", (f"{scale:.6g} arcsec" for scale in scales)
         elif differences:
             name, stated, text = (differences[0][0], *map(repr, differences[0][1:]))
+        elif (parts := [image.detector_frames for image in images])[0] != parts[1]:
+            # Positions of a star on different parts of the detector would be mixed.
+            name, (stated, text) = "the part of the detector", map(str, parts)
         else:
             continue
         problem = f"{name} is {text}, but that of {first.path} is {stated}; a model is of one"

@@ -282,6 +282,8 @@ class Stars:
         }
         if observation.shape:
             description["image_px"] = [*reversed(observation.shape)]
+        if frames := observation.detector_frames:
+            description["detector"] = frames
         if observation.instrument:
             description["instrument"] = observation.instrument
         if observation.colour_column:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.base.arguments import check_arguments
+from psfdae.base.errors import warn
 from psfdae.base.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.base.files import write_text
 from psfdae.base.progress import steps
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@check_arguments
 def validate(
     model: PsfModel, stars: Stars, further_fits: Mapping[str, Method] | None = None
 ) -> Report:
@@ -80,6 +83,8 @@ def validate(
     True
     """
     _require_unseen(model, stars)
+    model, notes = model.moved_to(stars.observation)
+    warn(notes)
     settings = stars.settings
     # The fits that exist already, that of the model included.
     fits = {**(further_fits or {}), model.info.method: model.method}
@@ -337,6 +342,7 @@ class Report:
         area = star_area(self.stars.product, self.stars.split.train)
         return {signal_to_noise(kappa * level, area): level for level in self.restored}
 
+    @check_arguments
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other.
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from psfdae.base.arguments import ArgumentError
 from psfdae.base.errors import keyword
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
@@ -188,7 +189,7 @@ def aperture_correction(
 
     radius_max = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
     if not 0 < radius_px <= radius_max:
-        raise ValueError(f"radius {radius_px} px, expected above 0 up to {radius_max:g}")
+        raise ArgumentError(f"radius_px {radius_px} px, expected above 0 up to {radius_max:g}")
     # Light of the PSF in the aperture, about the star's place in the stamp.
     psf = model.psf_at(x, y, 1)
     middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import NonNegativeInt
 
+from psfdae.base.arguments import check_arguments, real_numbers
 from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 
+@check_arguments
 def wavefront(
     stars: ArrayLike | Stamps,
     telescope: OwnTelescope | str | Path,
@@ -34,7 +37,7 @@ def wavefront(
     noise: ArrayLike | None = None,
     gain: ArrayLike | None = None,
     joint: bool = False,
-    seed: int = 0,
+    seed: NonNegativeInt = 0,
 ) -> Wavefronts:
     """Measure the wavefronts of stars that a known telescope has imaged.
 
@@ -72,7 +75,7 @@ def wavefront(
         telescope = read_telescope(Path(telescope))
     stamps = stars if isinstance(stars, Stamps) else sensed_stamps(stars, noise, gain)
     # A field angle for each star: aberrations change over the field.
-    angle = np.asarray(field_deg, float)
+    angle = real_numbers("field_deg", field_deg).astype(float)
     if angle.shape != (len(stamps), 2) or not np.isfinite(angle).all():
         raise SensingError(
             f"field_deg of shape {angle.shape}, expected ({len(stamps)}, 2) finite numbers"
@@ -100,14 +103,14 @@ def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | N
         If shapes do not fit, or noise or gain is not above 0.
     """
     # Square stamps in double precision, one or more.
-    data = np.asarray(stars, float)
+    data = real_numbers("stars", stars).astype(float)
     if data.ndim != 3 or data.shape[1] != data.shape[2] or not len(data):
         raise SensingError(f"stars of shape {data.shape}, expected (n, d, d)")
     count = len(data)
 
     def per_star(name: str, value: ArrayLike | None) -> np.ndarray:
         # One number serves all stars; NaN stands for a number that is to be estimated.
-        numbers = np.asarray(np.nan if value is None else value, float)
+        numbers = real_numbers(name, np.nan if value is None else value).astype(float)
         if numbers.shape not in ((), (count,)):
             raise SensingError(
                 f"{name} of shape {numbers.shape}, expected one number or one for each of the "

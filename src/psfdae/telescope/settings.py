@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from psfdae.base.arguments import check_arguments
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Fraction, Group, Name, Positive, parse_settings
 from psfdae.optics.pupil import pixel_width
@@ -144,6 +145,7 @@ def telescope_by_keys(tree: Any) -> Any:
 AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(telescope_by_keys)]
 
 
+@check_arguments
 def read_telescope(path: str | Path) -> OwnTelescope:
     """Read a telescope of one's own from its YAML file.
 

@@ -1,0 +1,103 @@
+"""Where the pixels of an image lie on the detector, by the header, and how two images differ.
+
+In: the headers of two images. Out: the position of the one in the other, in pixels. Programs write
+the place under different keys, which count from different zeros, so that the numbers under a key of
+one header are compared with those under the same key of the other one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from psfdae.image.fits_file import ImageFile, card_value
+
+BINNING_KEYS = (
+    *(("XBINNING", "YBINNING"), ("CCDSUM",), ("CCDBIN1", "CCDBIN2"), ("CCDXBIN", "CCDYBIN")),
+    *(("BINX", "BINY"), ("XBIN", "YBIN"), ("BINAXIS1", "BINAXIS2"), ("BINNING",)),
+    *(("ESO DET WIN1 BINX", "ESO DET WIN1 BINY"), ("LTM1_1", "LTM2_2")),
+)
+"""Keys of the binning along x and y; a single key has a text with both."""
+
+ORIGIN_KEYS = {
+    ("DETSEC",): (1, 1),
+    ("LTV1", "LTV2"): (-1, 0),
+    ("XORGSUBF", "YORGSUBF"): (1, 0),
+    ("SUBSTRT1", "SUBSTRT2"): (1, 1),
+    ("ESO DET WIN1 STRX", "ESO DET WIN1 STRY"): (1, 1),
+    ("CCDSEC",): (1, 1),
+}
+"""Keys of the first pixel in (binned) pixels, with their sign, and their number for the whole
+detector; LTV of IRAF counts the other way. The first key that both headers have is used: DETSEC
+differs between the chips of a mosaic."""
+
+
+def detector_frames(image: ImageFile) -> dict[str, list[float]]:
+    """Return the numbers along x and y under the first key of each system in a header.
+
+    Sections of the detector are of the whole image, or of its DATASEC or TRIMSEC; they give the
+    number of the image's first pixel, and under "DETSEC step" the binning, below 0 if mirrored.
+    """
+
+    def numbers(*keys: str) -> list[float]:
+        """Return all numbers in the cards of some keys; the image's own header overrides."""
+        values = [[card_value(header, key) for header in image.headers] for key in keys]
+        texts = [str(next((v for v in value if v is not None), "")) for value in values]
+        return [float(number) for number in re.findall(r"-?\d+\.?\d*", " ".join(texts))]
+
+    cards = {keys[0]: numbers(*keys) for keys in (*BINNING_KEYS, *ORIGIN_KEYS)}
+    frames = {key: values for key, values in cards.items() if len(values) == 2}
+    size_px = np.array(image.shape[:-3:-1])
+    for key in ("DETSEC", "CCDSEC"):
+        for part in ([1, size_px[0], 1, size_px[1]], numbers("DATASEC"), numbers("TRIMSEC")):
+            if len(cards[key]) == len(part) == 4 and key not in frames:
+                # Pixels begin … end of the image are pixels first … last of the detector.
+                (first, last), (begin, end) = (np.reshape(a, (2, 2)).T for a in (cards[key], part))
+                step = (last - first + np.where(first <= last, 1, -1)) / (end - begin + 1)
+                if (step % 1 == 0).all() and (end <= size_px).all():
+                    frames[f"{key} step"] = step.tolist()
+                    frames[key] = ((first - 1) / step + 2 - begin).tolist()
+    return frames
+
+
+def find_offset(
+    trained: Mapping[str, Sequence[float]],
+    trained_px: np.ndarray,
+    frames: Mapping[str, Sequence[float]],
+    image_px: np.ndarray,
+) -> np.ndarray | None:
+    """Return the position (x, y) of an image's first pixel in another image, of the training.
+
+    A header without a place is taken for that of the whole detector, if this image then holds all
+    of the other one. None where the headers do not show the offset.
+
+    Parameters
+    ----------
+    trained, frames : mapping
+        Frames of both, from `detector_frames`.
+    trained_px, image_px : ndarray, shape (2,)
+        Columns and rows.
+
+    Raises
+    ------
+    ValueError
+        If the images are binned differently, or one is mirrored.
+    """
+    origins = {keys[0]: rule for keys, rule in ORIGIN_KEYS.items()}
+    for key in trained.keys() & frames.keys() - origins.keys():
+        if not np.allclose(trained[key], frames[key], rtol=1e-3):
+            steps = ("×".join(f"{step:g}" for step in f[key]) for f in (frames, trained))
+            raise ValueError(f"{key} is {', not '.join(steps)}")
+    known = [[key for key in origins if key in f] for f in (trained, frames)]
+    shared = [key for key in known[0] if key in known[1]]
+    if not shared and bool(known[0]) == bool(known[1]):
+        return None
+    key = [*shared, *known[0], *known[1]][0]
+    sign, whole = origins[key]
+    offset = sign * np.subtract(frames.get(key, [whole] * 2), trained.get(key, [whole] * 2))
+    # The first and the last pixel of the one lie within the other.
+    ends = np.stack([offset, trained_px - offset - image_px])
+    is_contained = (ends >= 0).all() or (ends <= 0).all()
+    return np.asarray(offset) if shared or is_contained else None
