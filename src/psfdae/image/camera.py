@@ -61,11 +61,22 @@ class SkySample:
         and, where pixels share their noise, that of sums of pixels.
     highest : float
         Largest pixel of all squares.
+    checker : float
+        Level of the pixels of even rows and columns and of odd ones, less the level of the others,
+        in units of the noise: that of the squares of a chessboard.
     """
 
     level: float
     noise: float
     highest: float
+    checker: float
+
+
+ONE_COLOUR = (
+    "neighbouring pixels are of different colours: debayer it, or take the pixels of one colour, "
+    "such as data[0::2, 0::2]"
+)
+"""What is wrong with an undebayered frame, and what to do."""
 
 
 def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[str, CameraValue]:
@@ -181,7 +192,8 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     rows, columns = image.shape
     # Bands of rows, evenly spread over the image.
     last_row = max(rows - square_px, 0)
-    starts = np.unique(np.linspace(0, last_row, min(32, -(-rows // square_px))).astype(int))
+    count = min(32, -(-rows // square_px))
+    starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
     levels, noises, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
     deviations: list[np.ndarray] = []
@@ -207,9 +219,14 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
                     noises.append(noise)
     if not levels:
         return None
+    # Bands begin at even rows. Stars count as 3 σ; medians would be the same for most whole counts.
+    joined = np.concatenate(deviations)
+    is_white = np.indices(joined.shape).sum(axis=0) % 2 == 0
+    white, black = (np.clip(joined[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
+    checker = float(np.nanmean(white) - np.nanmean(black))
     # Resampled pixels share noise: sums of them scatter by more than independent ones.
-    correlation = noise_correlation(np.concatenate(deviations))
-    return SkySample(float(np.median(levels)), correlation * float(np.median(noises)), highest)
+    noise = noise_correlation(joined) * float(np.median(noises))
+    return SkySample(float(np.median(levels)), noise, highest, checker)
 
 
 def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
@@ -278,6 +295,13 @@ def checked_camera(
     if sky is None:
         return values, []
     values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
+    # Noise makes less than 0.1 in 100 × 100 pixels; readout changes levels along rows or columns.
+    if abs(sky.checker) > 0.3:
+        remarks.append(
+            f"{image.path}: the sky of pixels with an even sum of row and column differs from the "
+            f"sky of the others by {abs(sky.checker):.2g} times the noise: if it is an undebayered "
+            f"colour frame, {ONE_COLOUR}"
+        )
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
@@ -406,7 +430,7 @@ def refuse_colours(image: ImageFile) -> None:
     ------
     ObservationError
         If the image has 3 or 4 large planes, the fourth for luminance or transparency; or one plane
-        of which BAYERPAT or its like names several colours.
+        of which BAYERPAT, FILTER or the like names several colours.
     """
     shape = image.shape
     if len(shape) == 3:
@@ -425,14 +449,13 @@ def refuse_colours(image: ImageFile) -> None:
         return
     # The pattern of a colour filter array, four letters.
     for header in image.headers:
-        for key in ("BAYERPAT", "COLORTYP", "CFAPAT"):
+        for key in ("BAYERPAT", "COLORTYP", "CFAPAT", "BAYER", "CFA", "FILTER"):
             pattern = str(card_value(header, key) or "").strip().upper()
             if len(pattern) == 4 and set(pattern) <= set("RGBCMYW") and len(set(pattern)) > 1:
                 raise ObservationError(
                     image.path,
-                    f"an undebayered colour frame ({key} = {pattern}), neighbouring pixels are of "
-                    "different colours: debayer it, or take the pixels of one colour, such as "
-                    "data[0::2, 0::2], and write them without this card",
+                    f"an undebayered colour frame ({key} = {pattern}), {ONE_COLOUR}, and write "
+                    "them without this card",
                 )
 
 

@@ -37,6 +37,7 @@ from psfdae.image.stamps import (
     raise_flag,
     sky_around,
 )
+from psfdae.stars.moments import robust_scatter
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -280,6 +281,28 @@ class Observation:
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
 
+    def check_planes(self) -> None:
+        """Reject a cube whose planes show the same stars, also outside the stamps in their middle.
+
+        Raises
+        ------
+        ObservationError
+            If it is a time series of a field, and no list says that each plane is a star.
+        """
+        if self.shape is not None or self._list is not None or self.count < 4:
+            return
+        # At most 64 planes, spread over the cube.
+        step, image = -(-self.count // 64), self._layers.image
+        with open_pixels(image, in_pieces=True) as pixels:
+            planes = [pixels[slice(row, row + 1)] for row in range(0, self.count, step)]
+        if has_common_stars(np.concatenate(planes), self.stamp_px):
+            raise ObservationError(
+                self.path,
+                "a time series: its planes show the same stars, also away from the middle, where "
+                "the star of a stamp is: write one plane to a file of its own, or take all as "
+                "exposures, such as psfdae.Stars.from_image([*cube], detect=True)",
+            )
+
     def sha256(self) -> str:
         """Return SHA-256 of all pixels of the image or cube, as float32.
 
@@ -312,6 +335,31 @@ class Observation:
                     yield _with_stars(self, part, *_cut_from_cube(self, part, pixels, mask))
                 else:
                     yield _with_stars(self, part, *_cut_from_image(self, part, pixels, noise))
+
+
+def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
+    """Return True if planes (n, h, w) share a star outside the stamp in their middle.
+
+    Different stars of an image have different neighbours. Light of the star itself, such as spikes
+    or the ring of a star out of focus, lies on both sides of the middle, or all around it.
+    """
+    from scipy import ndimage
+
+    # Means of 3 × 3 pixels above the sky; their noise, and what nine of ten planes have at least.
+    smooth = ndimage.uniform_filter(np.nan_to_num(planes), (0, 3, 3))
+    smooth -= np.median(smooth, axis=(1, 2), keepdims=True)
+    noise = np.median(robust_scatter(smooth.reshape(len(planes), -1).T))
+    light, common = np.median(smooth, axis=0), np.percentile(smooth, 10, axis=0, method="lower")
+    # Distance from the middle, and the light at this distance, or opposite if it is more.
+    offset = np.indices(light.shape) - (np.array(light.shape).reshape(2, 1, 1) - 1) / 2.0
+    radius = np.hypot(*offset).astype(int)
+    own_light = ndimage.median(light, radius, np.arange(radius.max() + 1))[radius]
+    own_light = np.maximum(own_light, light[::-1, ::-1])
+    # Peaks outside the stamp, at least a tenth as high as the highest, are other stars.
+    is_star = (np.abs(offset).max(axis=0) > stamp_px / 2) & (common > 5.0 * noise)
+    is_star &= light >= np.maximum(ndimage.maximum_filter(light, 5), 0.1 * light.max())
+    is_star &= own_light < 0.4 * light
+    return bool(is_star.any())
 
 
 def _cut_from_cube(

@@ -227,8 +227,11 @@ def collect(
     bright, missing = completed(bright, framing.stamp_px, settings.search_px, centring)
     # A star with more than a fifth of its light in bad pixels is not learnt from.
     bright = refuse(bright, missing > 0.2, Verdict.INCOMPLETE)
-    # Galaxies and blends, which are wider than the stars around them.
-    bright = refuse(bright, wider_than_stars(bright.area(), bright.position), Verdict.EXTENDED)
+    # Galaxies and blends, which are wider than the stars around them. The error of ln A, with
+    # A = (F/(σ S/N))², is 2 σ √P/F by the noise of the P pixels of a stamp.
+    size_error = 2.0 * framing.stamp_px * bright.noise / bright.flux
+    is_extended = wider_than_stars(bright.area(), bright.position, size_error)
+    bright = refuse(bright, is_extended, Verdict.EXTENDED)
     # Stars that are unlike their neighbours.
     aligned = cut(bright.aligned(), framing.stamp_px)
     score = misfit(aligned, bright.position, bright.noise / bright.flux)

@@ -10,6 +10,7 @@ radius from which it is no more than its own noise: there the stars meet the sky
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,6 +38,8 @@ class SourceSize:
     light: np.ndarray
     peak_offset_px: float
     sharpness_px: float
+    sides: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64)
+    """Sides of stamps in px."""
 
     @property
     def fwhm_px(self) -> float:
@@ -56,20 +59,19 @@ class SourceSize:
         return self.peak_offset_px > 1.0
 
     def side(self, light_min: float) -> int:
-        """Return the side of stamps, of 16, 24, 32, 48 and 64 px.
+        """Return the side of stamps, one of `sides`.
 
         It is 16 px if these hold `light_min` of the light, else the first that holds 98 %.
         The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
         star lies, and 99 % of its light must.
         """
-        sides = (16, 24, 32, 48, 64)
         if self.hollow:
-            enough = [side for side in sides if self.light_within(side - 2) >= 0.99]
-        elif self.light_within(sides[0]) >= light_min:
-            return sides[0]
+            enough = [side for side in self.sides if self.light_within(side - 2) >= 0.99]
+        elif self.light_within(self.sides[0]) >= light_min:
+            return self.sides[0]
         else:
-            enough = [side for side in sides if self.light_within(side) >= 0.98]
-        return enough[0] if enough else sides[-1]
+            enough = [side for side in self.sides if self.light_within(side) >= 0.98]
+        return enough[0] if enough else self.sides[-1]
 
 
 def measure_size(

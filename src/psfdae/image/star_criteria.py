@@ -149,7 +149,7 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     return np.asarray(size < np.median(size) - limit)
 
 
-def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
+def wider_than_stars(area: np.ndarray, position: np.ndarray, size_error: np.ndarray) -> np.ndarray:
     """Return which sources have a far larger noise-equivalent area than the stars around them.
 
     Stars have nearly one size, other sources any: of the logarithms of all areas, each less the
@@ -158,40 +158,109 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
     that the interval implies, are no stars; the interval is then searched again. Where the PSF
     changes over the field, so do the sources around.
 
+    Where the sources that are left have many sizes even so, most are galaxies. The stars are then
+    the narrowest group of bright sources of one size, and a source is a star only if its size is
+    known well enough to say so.
+
     Parameters
     ----------
     area : ndarray, shape (n,)
     position : ndarray, shape (n, 2)
         In the image; all sources are near where one is not finite.
+    size_error : ndarray, shape (n,)
+        Standard error of the logarithm of the area.
     """
-    from scipy.spatial import cKDTree
-
-    # With fewer than eight sources there is no locus to see.
+    # With fewer than four sources there is no locus to see, with fewer than eight a rough one.
     is_wide = np.zeros(len(area), dtype=bool)
-    if len(area) < 8:
+    if len(area) < 4:
         return is_wide
-    size = np.log(area)
+    size, factor = np.log(area), 1.5 if len(area) >= 8 else 3.0
     for _ in range(10):
         # The locus is searched among those that are not yet known to be wide.
         star = np.flatnonzero(~is_wide)
-        if len(star) < 8:
+        if len(star) < 4:
             break
-        # Size beside that of the nearest eight: usually one of these is a star.
-        around = size[star] * np.ones((len(size), 1))
-        if np.isfinite(position).all():
-            around = size[star][cKDTree(position[star]).query(position, k=8)[1]]
-        excess = size - np.percentile(around, 25, axis=1)
-        # A quarter of a normal distribution about its middle has the width 0.637 σ.
-        ordered, count = np.sort(excess[star]), -(-len(star) // 4)
-        width = ordered[count:] - ordered[:-count]
-        # The shortest interval, its middle and the scatter that it implies.
-        first = int(width.argmin())
-        local_area, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
-        is_wider = excess > local_area + max(np.log(1.5), 5.0 * float(scatter))
+        excess = size - size_around(size[star], position[star], position)
+        middle, scatter = shortest_interval(excess[star])
+        is_wider = excess > middle + max(np.log(factor), 5.0 * scatter)
         if not (is_wider & ~is_wide).any():
             break
         is_wide |= is_wider
+    rest = ~is_wide
+    if has_many_sizes(size[rest], position[rest], size_error[rest]):
+        middle, scatter = narrowest_group(size[size_error < 0.1])
+        limit = middle + max(np.log(1.2), min(5.0 * scatter, np.log(1.5)))
+        return np.asarray(size + 2.0 * size_error > limit)
     return is_wide
+
+
+def size_around(
+    star_size: np.ndarray, star_position: np.ndarray, position: np.ndarray
+) -> np.ndarray:
+    """Return the lower quartile of the sizes of the eight stars nearest to each position, (n,).
+
+    Usually one of these eight sources is a star.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(star_size) <= 8 or not np.isfinite(position).all():
+        return np.full(len(position), np.percentile(star_size, 25))
+    nearest = cKDTree(star_position).query(position, k=8)[1]
+    return np.asarray(np.percentile(star_size[nearest], 25, axis=1))
+
+
+def shortest_interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the middle of the shortest interval that has a quarter of the values, and the scatter.
+
+    A quarter of a normal distribution about its middle has the width 0.637 σ.
+    """
+    ordered, count = np.sort(values), -(-len(values) // 4)
+    width = ordered[count:] - ordered[:-count]
+    first = int(width.argmin())
+    return float(np.median(ordered[first : first + count + 1])), float(width[first]) / 0.637
+
+
+def has_many_sizes(size: np.ndarray, position: np.ndarray, size_error: np.ndarray) -> bool:
+    """Return True if sources differ in size more than stars do, also of a PSF that changes.
+
+    ln A of stars scatters by 0.25 at most about the sizes of their neighbours, and that of bright
+    stars about a plane over the image; ln A of galaxies by 0.4 and more.
+
+    Parameters
+    ----------
+    size, size_error : ndarray, shape (n,)
+        ln A and its standard error.
+    position : ndarray, shape (n, 2)
+    """
+    # With fewer than ten sources, neighbours and a plane say nothing.
+    excess, is_sharp = size - size_around(size, position, position), size_error < 0.1
+    if np.count_nonzero(is_sharp) < 10 or shortest_interval(excess)[1] < 0.2:
+        return False
+    # The plane is a constant where no position is known.
+    terms = np.nan_to_num(np.column_stack([np.ones(len(size)), position]))[is_sharp]
+    excess = size[is_sharp] - terms @ np.linalg.lstsq(terms, size[is_sharp], rcond=None)[0]
+    return bool(robust_scatter(excess) > 0.35)
+
+
+def narrowest_group(size: np.ndarray) -> tuple[float, float]:
+    """Return middle and scatter of the narrowest sources that share one size, such as stars.
+
+    The stellar locus among galaxies in a diagram of size and magnitude, as Piff (`SizeMag`;
+    Jarvis et al. 2021, MNRAS 501, 1282) and PSFEx (Bertin 2011, ASP Conf. 442, 435) find it: no
+    source is narrower than the PSF.
+
+    Parameters
+    ----------
+    size : ndarray, shape (n,)
+        ln A of sources of which it is known to a tenth.
+    """
+    # Four sources or more within 3 % in diameter, or the four that are nearest to this.
+    ordered = np.sort(size)
+    width = ordered[3:] - ordered[:-3]
+    first = int(np.argmax(width <= max(width.min(), 0.06)))
+    middle = np.median(ordered[first : first + 4])
+    group = ordered[np.abs(ordered - middle) <= max(width[first], 0.1)]
+    return float(np.median(group)), float(robust_scatter(group))
 
 
 def misfit(

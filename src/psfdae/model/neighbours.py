@@ -23,6 +23,7 @@ from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
 from psfdae.model.fitting import fitted_to
 from psfdae.model.psf_grid import PsfGrid
+from psfdae.model.star_residuals import reject_misfits
 from psfdae.model.stars import Stars, stars_of_candidates
 
 
@@ -99,6 +100,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
             light = light_of_others(photometry, observation.positions)
             cleaned = replace(observation, neighbour_light=light)
             candidates = collect(cleaned, calibration, settings.framing, isolation_px)
+            candidates = reject_misfits(candidates, settings, cleaned.gain)
             isolated = stars_of_candidates(stars.source, cleaned, candidates, settings)
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"

@@ -18,7 +18,7 @@ from psfdae.image.camera import other_instruments
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
-from psfdae.image.selection import Candidates, Verdict, collect
+from psfdae.image.selection import CalibrationStarsError, Candidates, Verdict, collect
 from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import Settings
@@ -112,7 +112,10 @@ def collect_enough(
         return sum(len(candidates.bright) for candidates in selection[1])
 
     selection = collect_all(snr_min=calibration.least_snr)
-    if bright_count(selection) >= ENOUGH_STARS:
+    # In an image of galaxies, fainter stars cannot be told from galaxies.
+    verdicts = np.concatenate([measured.verdict for measured in selection[1]])
+    has_galaxies = np.count_nonzero(verdicts == Verdict.EXTENDED) > max(9, bright_count(selection))
+    if bright_count(selection) >= (MIN_STARS_WITH_ERROR if has_galaxies else ENOUGH_STARS):
         return selection
     # Fainter stars: three times as many as needed while their S/N is above 20. Of two selections
     # with as many stars, the first one stays.
@@ -152,12 +155,17 @@ def enlarge_stamps(
         Size of the stars and of the stamps.
         None in place of both, if the stamps hold the light of the stars and these have their
         brightest pixels in their middle.
+
+    Raises
+    ------
+    CalibrationStarsError
+        If the largest stamps hold less than 80 % of the light: the sources are no stars.
     """
     calibration, framing = settings.calibration_stars, settings.framing
     # A stated size of stamps and a stated centring leave nothing to adapt.
     if not calibration.light_min and calibration.centring_px is not None:
         return None
-    largest = _largest_size(opened, candidates)
+    largest = _largest_size(opened, candidates, 0.8 if calibration.light_min else 0.0)
     if largest is None:
         return None
     # The side of stamps that hold the stated part of the light, at least that of the settings.
@@ -198,13 +206,17 @@ def enlarge_stamps(
             f"; stamps of {side} px, which hold {new_part:.1f} % of it, are used instead of "
             f"{framing.stamp_px} px ({old_part:.0f} %); {keyword('stamp_px')} sets another size"
         )
+    # Seeing is at most about 6 arcsec; a pixel may be larger.
+    scale_arcsec = 0.0 if opened[0].scale_assumed else opened[0].pixel_scale_arcsec or 0.0
+    if largest.fwhm_px * min(scale_arcsec, 1.0) > 6.0:
+        note += "; this is more than seeing makes: they are out of focus, or no stars"
     if largest.hollow:
         note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
     return settings.model_copy(update=groups), note
 
 
 def _largest_size(
-    opened: Sequence[Observation], candidates: Sequence[Candidates]
+    opened: Sequence[Observation], candidates: Sequence[Candidates], light_min: float
 ) -> SourceSize | None:
     """Return the size of stars in the image where it is largest; cubes of stamps tell none.
 
@@ -213,15 +225,29 @@ def _largest_size(
     opened : sequence of Observation
     candidates : sequence of Candidates
         Measured stars of each observation.
+    light_min : float
+        Least part of the light of a star in the largest stamps.
+
+    Raises
+    ------
+    CalibrationStarsError
+        If these hold less: they hold 98 % of a star of FWHM 23 px, and a small part of a nebula.
     """
     sizes = []
     for observation, measured in zip(opened, candidates, strict=True):
         if observation.shape is not None and observation.positions is not None:
-            # Stars that are good in small stamps are not saturated; without such stars, all count.
+            # Stars that are good in small stamps are not saturated; without such stars, all count
+            # that are not wider than these.
             sky, position = observation.sky(), measured.bright.position
             if len(position) < MIN_STARS_WITH_ERROR:
-                position = observation.positions
-            sizes.append(measure_size(sky.flat, sky.bad, position))
+                position = measured.position[measured.verdict != Verdict.EXTENDED]
+            size = measure_size(sky.flat, sky.bad, position)
+            if size is not None and size.light_within(size.sides[-1]) < light_min:
+                raise CalibrationStarsError(
+                    f"{observation.path}: no star: half of the light of its sources is within "
+                    f"{size.fwhm_px:.3g} px, and the largest stamps have {size.sides[-1]} px"
+                )
+            sizes.append(size)
     return max(filter(None, sizes), key=lambda size: size.fwhm_px, default=None)
 
 

@@ -33,6 +33,7 @@ from psfdae.model.star_choice import (
     require_one_camera,
     require_unique_names,
 )
+from psfdae.model.star_residuals import reject_misfits
 from psfdae.model.star_sets import split_stars, training_set
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
@@ -144,11 +145,14 @@ class Stars:
             source.open(settings.framing.stamp_px, calibration.margin_px).assuming()
             for source in sources
         ]
+        for observation in opened:
+            observation.check_planes()
         require_one_camera(opened)
         opened, candidates, relaxed, notes = choose_bright_stars(opened, settings)
         # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
-        for source, observation, measured in zip(sources, opened, candidates, strict=True):
+        for source, observation, compared in zip(sources, opened, candidates, strict=True):
+            measured = reject_misfits(compared, relaxed, observation.gain)
             # Of several images, one may have few stars or none.
             if len(sources) == 1:
                 min_stars = relaxed.calibration_stars.stars_min
