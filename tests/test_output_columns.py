@@ -304,11 +304,16 @@ def test_columns_of_photometry(folder, stars, true, model):
 
 
 def errors_of_photometry(table, true, model):
-    """Errors of the noise, √χ² times as large where the fit is bad; with those of the model."""
+    """Errors of the noise, √χ² times as large where the fit is bad; with the model and the wings.
+
+    The wings of the training are those of the same image.
+    """
     place = np.stack([table["x"], table["y"]], axis=1)
     excess, total = np.sqrt(np.maximum(table["chi2"], 1)), table["flux"] / table["flux_model"]
     noise_error = np.array(true["flux_error_box"] * excess * total)
-    return noise_error, np.hypot(noise_error, model.flux_error(place) * table["flux"])
+    light, light_error = model.wings.light()
+    relative_error = np.hypot(model.flux_error(place), light_error / (1.0 + light))
+    return noise_error, np.hypot(noise_error, relative_error * table["flux"])
 
 
 def test_errors_of_photometry_grow_with_chi2(folder, stars, true, model):
