@@ -154,6 +154,9 @@ def blank_areas(
     for value, _ in candidates:
         # The whole of each connected area of this value that holds a square or a line of it.
         area = ndimage.binary_propagation(solid & (values == value), mask=values == value)
+        # Whole counts of little noise fill a few squares by chance, and much is connected to them.
+        if np.count_nonzero(solid & area) < 0.5 * np.count_nonzero(area):
+            continue
         # Of a large image, one pixel of 16 says how far the rest is from the value.
         outside = ~area & ~bad
         sample = np.s_[:] if outside.size < 2**22 else np.s_[::4, ::4]

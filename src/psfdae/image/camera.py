@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +17,9 @@ import numpy as np
 from psfdae.base.errors import keyword
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
+from psfdae.image.header_units import count_powers, parse_number, parse_unit
 from psfdae.image.sky_level import noise_correlation
+from psfdae.stars.moments import count_step, dither, remove_dither
 
 LARGEST_STAMP_PX = 256
 """Side of the largest stamps; planes of a cube that are larger are images."""
@@ -38,6 +40,9 @@ HEADER_KEYS: dict[str, tuple[str, ...]] = {
     "saturation": ("SATURATE", "SATLEVEL", "SATURATA", "MAXLIN"),
 }
 """Keys under which headers have a value of the camera; the first number above 0 is taken."""
+
+HEADER_UNITS = dict(zip(HEADER_KEYS, ("arcsec", "electron/adu", "electron", "adu"), strict=True))
+"""Units of these values, as astropy calls them."""
 
 
 class CameraValue(NamedTuple):
@@ -92,20 +97,21 @@ def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[
     values = {
         "pixel scale": pixel_scale(image),
         "gain": electrons_per_count(image),
-        "read noise": header_number(image, HEADER_KEYS["read noise"]),
-        "saturation": header_number(image, HEADER_KEYS["saturation"]),
+        "read noise": header_number(image, "read noise"),
+        "saturation": header_number(image, "saturation"),
     }
     values |= {name: CameraValue(v, "given") for name, v in stated.items() if v is not None}
     return values
 
 
-def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
-    """Return the first finite number above 0 under one of the keys, in the order of the keys.
+def header_number(image: ImageFile, name: str) -> CameraValue:
+    """Return the first finite number above 0 under one of the keys of a value of the camera.
 
     Parameters
     ----------
     image : ImageFile
-    keys : sequence of str
+    name : str
+        A key of `HEADER_KEYS`. Cards may have other units than `HEADER_UNITS`, such as "10 mas".
 
     Returns
     -------
@@ -113,16 +119,23 @@ def header_number(image: ImageFile, keys: Sequence[str]) -> CameraValue:
         With the key as origin; the number is None if no header has one.
     """
     # Its own header goes before that of the file; a truth value is no number.
-    for key in keys:
+    for key in HEADER_KEYS[name]:
         for header in image.headers:
-            value = card_value(header, key)
-            try:
-                number = float("nan" if isinstance(value, bool) else value)
-            except (TypeError, ValueError):
-                continue
-            if np.isfinite(number) and number > 0:
+            number = parse_number(card_value(header, key), HEADER_UNITS[name])
+            if number is not None and np.isfinite(number) and number > 0:
                 return CameraValue(number, key)
     return CameraValue(None, "not known")
+
+
+def unread_card_remarks(image: ImageFile) -> list[str]:
+    """Return a sentence on each card of the camera whose text is not a number of its unit."""
+    return [
+        f"{image.path}: {key} = {value!r} is not used: expected a number of {HEADER_UNITS[name]}"
+        for name, keys in HEADER_KEYS.items()
+        for key in keys
+        for value in dict.fromkeys(card_value(header, key) for header in image.headers)
+        if isinstance(value, str) and value and parse_number(value, HEADER_UNITS[name]) is None
+    ]
 
 
 def pixel_scale(image: ImageFile) -> CameraValue:
@@ -143,11 +156,14 @@ def pixel_scale(image: ImageFile) -> CameraValue:
         if math.isfinite(scale) and scale > 0:
             # A WCS in degrees has no more digits.
             return CameraValue(float(f"{scale:.9g}"), "WCS")
-    header_scale = header_number(image, HEADER_KEYS["pixel scale"])
+    header_scale = header_number(image, "pixel scale")
     # Amateurs' cameras have the width of a pixel in micrometres, and the focal length in
     # millimetres: angle = width / focal length.
-    width_um, focus_mm = (header_number(image, (key,)).value for key in ("XPIXSZ", "FOCALLEN"))
-    if header_scale.value is None and width_um and focus_mm:
+    width_um, focus_mm = (
+        next(filter(None, (parse_number(card_value(h, key), unit) for h in image.headers)), 0.0)
+        for key, unit in (("XPIXSZ", "um"), ("FOCALLEN", "mm"))
+    )
+    if header_scale.value is None and width_um > 0 and 0 < focus_mm < np.inf:
         scale = float(np.rad2deg(width_um * 1e-3 / focus_mm)) * 3600.0
         return CameraValue(scale, "XPIXSZ and FOCALLEN")
     return header_scale
@@ -159,15 +175,20 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
     per second, or of a calibrated brightness, the gain of the camera is not that of the pixels.
     """
-    # By the unit of the pixels, whose writing differs.
-    unit = image.unit.lower().replace(" ", "")
-    if unit in {"electron", "electrons", "e-", "e"}:
-        return CameraValue(1.0, "BUNIT")
-    if unit.endswith(("/s", "/sec", "/second", "s-1", "s**-1", "s^-1")):
-        return CameraValue(None, "not known, the image is a rate")
-    if "jy" in unit or "erg" in unit:
+    # By the unit of the pixels: electrons and photons, counts, a rate of these, or another one.
+    unit = parse_unit(image.unit)
+    if unit is None:
+        is_counts = not re.search("/|jy|erg|mag", image.unit, re.IGNORECASE)
+    else:
+        powers = count_powers(unit)
+        if powers in ({"electron": 1.0}, {"ph": 1.0}):
+            return CameraValue(float(unit.scale), "BUNIT")
+        if powers.get("s", 0.0) < 0 and powers.keys() <= {"electron", "ph", "adu", "s"}:
+            return CameraValue(None, "not known, the image is a rate")
+        is_counts = powers in ({}, {"adu": 1.0})
+    if not is_counts:
         return CameraValue(None, f"not known, the image is in {image.unit}")
-    gain = header_number(image, HEADER_KEYS["gain"])
+    gain = header_number(image, "gain")
     if gain.origin == "GAIN":
         # A whole number from 20 on without a unit is a setting, as of amateurs' cameras.
         header = next(h for h in image.headers if card_value(h, "GAIN") is not None)
@@ -201,6 +222,9 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
         for start in starts:
             band = pixels[start : start + square_px]
             band = np.where(np.isfinite(band), band, np.nan)
+            highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
+            # Medians of whole counts are those of the counts before rounding.
+            band, dither_variance = dither(band, count_step(band))
             deviation = np.full((square_px + 4, columns), np.nan)
             deviations.append(deviation)
             for column in range(0, columns, square_px):
@@ -209,10 +233,10 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
                 if values.size < square_px:
                     continue
                 # Stars in a square hardly change its median.
-                highest = max(highest, float(values.max()))
                 level = float(np.median(values))
                 # σ of a normal distribution is 1.4826 times its median deviation.
                 noise = 1.4826 * float(np.median(np.abs(values - level)))
+                noise = float(remove_dither(np.array(noise), dither_variance))
                 if noise > 0:
                     deviation[: len(band), column : column + square_px] = (square - level) / noise
                     levels.append(level)

@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, sky_level
 from psfdae.image.source_size import measure_size
-from psfdae.stars.moments import FWHM_OF_SIGMA
+from psfdae.stars.moments import FWHM_OF_SIGMA, count_step
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class Sky:
         Rows and columns at which the level has a step.
     notes : tuple of str
         Sentences on what is unusual in the sky.
+    count : float
+        Step of the image's pixels if they are whole counts and noise is not much wider, else 0.
     """
 
     flat: np.ndarray
@@ -48,6 +50,7 @@ class Sky:
     noise_scale: float
     steps: tuple[Sequence[int], Sequence[int]] = ((), ())
     notes: tuple[str, ...] = ()
+    count: float = 0.0
     least_px: ClassVar[int] = 5
     """Least number of connected pixels above the threshold that are a source."""
 
@@ -187,6 +190,7 @@ def sky_of(
     sigma: np.ndarray | None = None,
     least_noise: float = 0.0,
     measured: SkyLevel | None = None,
+    count: float | None = None,
 ) -> Sky:
     """Return an image without its sky, and what was subtracted.
 
@@ -201,6 +205,8 @@ def sky_of(
         The noise is nowhere below this.
     measured : SkyLevel, optional
         Sky of the image, if it was measured before.
+    count : float, optional
+        Step of the pixels if they are whole counts; by default the pixels show it.
 
     Raises
     ------
@@ -208,8 +214,10 @@ def sky_of(
         If no mesh has enough pixels that count.
     """
     # Level and noise by the pixels that count.
+    count = count_step(np.where(bad, np.nan, image)) if count is None else count
     image = np.where(bad, 0.0, image)
-    level, noise, steps, notes = sky_level(image, bad) if measured is None else measured
+    sky = sky_level(image, bad, count=count) if measured is None else measured
+    level, noise, steps, notes = sky
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
     noise = np.maximum(noise, least_noise, out=noise)
@@ -217,6 +225,7 @@ def sky_of(
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
-        noise = (scale * sigma).astype(np.float32)
+        # Bad pixels, of which the map may have no σ, keep the noise of the sky around.
+        noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
     flat = interpolated((image - level).astype(np.float32), bad)[0]
-    return Sky(flat, level, noise, bad, scale, steps, notes)
+    return Sky(flat, level, noise, bad, scale, steps, notes, count)

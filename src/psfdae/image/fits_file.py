@@ -246,6 +246,8 @@ class ImageFile:
         Celestial WCS.
     values : ndarray or None
         Pixels of an image that is an array and in no file (`array_image`).
+    unit_factor : float
+        Factor from the unit of the file to that of the pixels that are read (`to_noise_unit`).
     """
 
     file: PlainFile
@@ -258,6 +260,7 @@ class ImageFile:
     headers: tuple[Header, ...] = ()
     wcs: WCS | None = None
     values: np.ndarray | None = None
+    unit_factor: float = 1.0
 
     @property
     def path(self) -> Path:
@@ -285,8 +288,6 @@ class ImageFile:
     def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return physical values of stored ones, in native byte order, same shape.
 
-        If all are below 1e-15, but not all 0, they are float64 instead of float32.
-
         Parameters
         ----------
         stored : ndarray
@@ -302,11 +303,34 @@ class ImageFile:
             values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
         if self.blank is not None and stored.dtype.kind in "iu":
             values[stored == self.blank] = np.nan
-        # In a unit in which stars have 1e-20, squares of single precision would be 0.
-        largest = np.abs(values).max(initial=0.0, where=np.isfinite(values))
-        if values.dtype == np.float32 and 0.0 < largest < 1e-15:
-            values = values.astype(np.float64)
         return values
+
+    def times(self, factor: float) -> ImageFile:
+        """Return the image with all pixels times a factor."""
+        return replace(
+            self,
+            bscale=self.bscale * factor,
+            bzero=self.bzero * factor,
+            unit_factor=self.unit_factor * factor,
+        )
+
+    def to_noise_unit(self) -> ImageFile:
+        """Return the image in a unit in which squares of its pixels fit into single precision.
+
+        The unit is a power of 2⁴⁰, so that nothing is rounded and most images keep their own: the
+        median deviation of 32 rows, or stamps of a cube, is between 2⁻²⁰ and 2²⁰ then. Where most
+        pixels are the same, the largest deviation is.
+        """
+        # Rows, spread evenly over the image.
+        rows = np.unique(np.linspace(0, self.shape[0] - 1, 32).astype(int))
+        with open_pixels(self, in_pieces=True, dtype=np.float64) as pixels:
+            values = np.concatenate([pixels[slice(row, row + 1)].ravel() for row in rows])
+        values = values[np.isfinite(values)]
+        deviation = np.abs(values - np.median(values)) if values.size else np.zeros(1)
+        scatter = float(np.median(deviation)) or float(deviation.max())
+        if not 0.0 < scatter < np.inf:
+            return self
+        return self.times(2.0 ** (-40.0 * round(np.log2(scatter) / 40.0)))
 
     def one_plane(self) -> ImageFile:
         """Return the image without its first axis, which has length 1 (NAXIS3 = 1)."""

@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 NOISE_MAPS = {"weight": "a weight map", "variance": "a variance map", "error": "a map of σ"}
 """Words for the kinds of maps of noise: 1/σ² but for a factor, σ², σ."""
 
+POWER_OF_SIGMA = {"weight": -2, "variance": 2, "error": 1}
+"""Powers of σ that these maps have."""
+
 
 @dataclass(frozen=True, eq=False)
 class NoiseMap:
@@ -101,9 +104,9 @@ class Layers:
         Bits of the mask that are bad; None for all.
     noise : NoiseMap or None
     least_noise : float
-        Read noise in counts; 0 where it or the gain is not known.
+        Read noise in the unit of the pixels; 0 where it or the gain is not known.
     saturate : float or None
-        Counts from which a pixel is saturated.
+        Counts from which a pixel is saturated, in the unit of the file.
     """
 
     image: ImageFile
@@ -188,7 +191,9 @@ class Layers:
         if not self._bad_pixels:
             try:
                 with silent():
-                    bad_pixels = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    # In the unit of the file, which messages have.
+                    counts = image / self.image.unit_factor
+                    bad_pixels = find_bad_pixels(counts, masked, self.image.headers, self.saturate)
                     self._bad_pixels.append(with_trails(image, bad_pixels))
             except ClippedSkyError as error:
                 raise ObservationError(self.image.path, str(error)) from None
@@ -220,8 +225,9 @@ def _sky(layers: Layers) -> Sky:
     # σ without the photons of the stars, whose light is known now.
     with layers.open(in_pieces=False) as (_, _, noise):
         assert noise is not None
-        sigma = layers.noise.sigma(noise[:], sky.flat)
-    return replace(sky, noise=(sky.noise_scale * sigma).astype(np.float32))
+        sigma = sky.noise_scale * layers.noise.sigma(noise[:], sky.flat)
+    # Bad pixels, of which the map has no σ, keep the noise of the sky around.
+    return replace(sky, noise=np.where(np.isfinite(sigma), sigma, sky.noise).astype(np.float32))
 
 
 def find_layers(
@@ -251,6 +257,7 @@ def find_layers(
         other.
     """
     # The mask, and the noise of the electronics in counts: read noise / gain.
+    factor = image.unit_factor
     layers_of_file = {} if is_cube else layers_beside(image)
     mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
     gain, read_noise = camera["gain"].value, camera["read noise"].value
@@ -258,7 +265,7 @@ def find_layers(
         image,
         mask,
         bad_bits,
-        least_noise=read_noise / gain if read_noise and gain else 0.0,
+        least_noise=factor * read_noise / gain if read_noise and gain else 0.0,
         saturate=camera["saturation"].value,
     )
     # The map of noise: one that is stated, else that of the file, if nothing is.
@@ -271,7 +278,7 @@ def find_layers(
         )
     notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
     for kind, place in stated.items():
-        noise = _layer_of(image, place, NOISE_MAPS[kind])
+        noise = _layer_of(image, place, NOISE_MAPS[kind]).times(factor ** POWER_OF_SIGMA[kind])
         # A pixel of σ or weight 0 has no data; the map is checked at the same time.
         if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
@@ -279,7 +286,8 @@ def find_layers(
     # Without a statement, the map of the image's own file.
     if all(place is None for place in maps.values()):
         for kind in layers_of_file.keys() & NOISE_MAPS.keys():
-            noise_map, note = noise_of_file(layers_of_file[kind], kind)
+            of_file = layers_of_file[kind].times(factor ** POWER_OF_SIGMA[kind])
+            noise_map, note = noise_of_file(of_file, kind)
             layers, notes = replace(layers, noise=noise_map), [note, *notes]
     if notes:
         line = f"{source.path}: uses {' and '.join(notes)}"
@@ -309,10 +317,12 @@ def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
     """
     # Part of the pixels that have a σ or σ² above 0.
     with open_pixels(noise, in_pieces=False) as pixels:
-        good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
+        has_value = np.nan_to_num(pixels[:], posinf=0.0) > 0
+    good, without = float(has_value.mean()), int(np.count_nonzero(~has_value))
     if good < 0.5:
         return None, f"not {noise.label} ({100 * good:.0f} % of its pixels are above 0)"
-    return NoiseMap(noise, kind), f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}"
+    words = f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}"
+    return NoiseMap(noise, kind), words + (f" (bad pixels: {without})" if without else "")
 
 
 def mask_and_bits(
@@ -390,7 +400,7 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
 
 
 def count_zeros(noise: ImageFile, kind: str) -> int:
-    """Return the number of pixels, bad ones, in which a map of noise that is stated is 0.
+    """Return the number of pixels in which a noise map of the user is 0: these have no data.
 
     Raises
     ------
@@ -409,14 +419,16 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
         values = pixels[:]
     # Values that no σ², 1/σ² or σ has.
     negative, zeros = int(np.count_nonzero(values < 0)), int(np.count_nonzero(values == 0))
-    # SWarp and SExtractor write the weight or σ 0 where there are no data.
-    may_be_0 = kind != "variance"
-    if negative or (zeros and not may_be_0):
+    # SWarp and SExtractor write 0 where there are no data; other programs NaN or infinity.
+    if negative:
         raise ObservationError(
             noise.path,
-            f"{NOISE_MAPS[kind]} of which {negative + (not may_be_0) * zeros} of {values.size} "
-            f"pixels are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, "
-            "or a mask",
+            f"{NOISE_MAPS[kind]} of which {negative} of {values.size} pixels are below 0; 0 or NaN "
+            "is for bad pixels, or a mask",
+        )
+    if not (np.isfinite(values) & (values > 0)).any():
+        raise ObservationError(
+            noise.path, f"{NOISE_MAPS[kind]} without a finite value above 0, expected one per pixel"
         )
     return zeros
 
@@ -471,8 +483,10 @@ def with_photons(
     if camera["gain"].value is not None:
         return layers, camera, []
     label = noise_map.image.label
-    words = f"{layers.image.path}: {label} grows with the light of the stars: gain {1 / slope:.4g}"
-    return layers, camera | {"gain": CameraValue(1.0 / slope, label)}, [words]
+    # In the unit of the file, light / g is its variance.
+    gain = layers.image.unit_factor / slope
+    words = f"{layers.image.path}: {label} grows with the light of the stars: gain {gain:.4g}"
+    return layers, camera | {"gain": CameraValue(gain, label)}, [words]
 
 
 def layers_beside(image: ImageFile) -> dict[str, ImageFile]:

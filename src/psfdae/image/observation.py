@@ -160,7 +160,7 @@ class Observation:
     @property
     def least_noise(self) -> float:
         """Read noise in counts; 0 where it or the gain is not known."""
-        return self._layers.least_noise
+        return self._layers.least_noise / self.unit_factor
 
     @property
     def scale_assumed(self) -> bool:
@@ -181,8 +181,29 @@ class Observation:
         return detector_frames(self._layers.image)
 
     def sky(self) -> Sky:
-        """Return the whole image with its sky; ObservationError if none can be measured."""
+        """Return the whole image with its sky; ObservationError if none can be measured.
+
+        It is in the unit of the image times `unit_factor`, as is `to_sky_unit`.
+        """
         return self._layers.sky()
+
+    @property
+    def unit_factor(self) -> float:
+        """Factor from the unit of the image, which stamps have, to the unit of `sky`."""
+        return self._layers.image.unit_factor
+
+    def to_sky_unit(self) -> Observation:
+        """Return the same with gain and saturation for pixels in the unit of `sky`."""
+        gain, saturation = self.camera["gain"], self.camera["saturation"]
+        if gain.value is not None:
+            gain = gain._replace(value=gain.value / self.unit_factor)
+        if saturation.value is not None:
+            saturation = saturation._replace(value=saturation.value * self.unit_factor)
+        return replace(self, camera=self.camera | {"gain": gain, "saturation": saturation})
+
+    def to_image_unit(self, values: np.ndarray) -> np.ndarray:
+        """Return values in the unit of the image; in double precision if the sky's is another."""
+        return values if self.unit_factor == 1.0 else values / np.float64(self.unit_factor)
 
     @property
     def wcs(self) -> WCS | None:
@@ -312,7 +333,7 @@ class Observation:
         digest, rows = hashlib.sha256(), 256
         with open_pixels(self._layers.image, in_pieces=True) as pixels:
             for start in range(0, pixels.image.shape[0], rows):
-                values = pixels[slice(start, start + rows)]
+                values = self.to_image_unit(pixels[slice(start, start + rows)])
                 digest.update(values.astype(np.float32, copy=False).tobytes())
         return digest.hexdigest()
 
@@ -392,7 +413,7 @@ def _cut_from_cube(
 
     # The star of a larger stamp stands in its middle, too.
     side, count = observation.stamp_px + 2 * observation.margin, part.stop - part.start
-    data = stamps_of(pixels, part)
+    data = observation.to_image_unit(stamps_of(pixels, part))
     masked = np.zeros(data.shape, dtype=bool)
     if mask is not None:
         # All stamps may share one mask.
@@ -427,6 +448,7 @@ def _cut_from_image(
     # All layers are cut at the same places.
     window = (shape, x, y, stamp_px, margin)
     data, inside, truncated = cut_image(pixels, *window)
+    data = observation.to_image_unit(data)
     # Other stars of a crowded image are subtracted.
     raw = data
     if observation.neighbour_light is not None:
@@ -443,14 +465,15 @@ def _cut_from_image(
         light: np.ndarray | float = 0.0
         if layers.noise.photons:
             level, _ = sky_around(raw, masked, stamp_px)
-            light = raw - level[:, None, None]
-        sigma = layers.noise.sigma(cut_image(noise, *window)[0], light)
+            light = (raw - level[:, None, None]) * observation.unit_factor
+        sigma = layers.noise.sigma(cut_image(noise, *window)[0], light) / observation.unit_factor
         stamp_sigma = np.ma.array(sigma, mask=masked)[:, stamp, stamp]
         sky_noise = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
     else:
         # In the stamp of a bright star, light that no PSF explains would pass for noise.
         _, sky_noise = sky_around(data, masked | ~np.isfinite(data), stamp_px)
-        sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, layers.least_noise), np.nan)
+        least_noise = observation.least_noise
+        sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, least_noise), np.nan)
     return data[:, stamp, stamp], masked[:, stamp, stamp], truncated, sky_noise
 
 

@@ -23,6 +23,7 @@ from psfdae.image.camera import (
     checked_camera,
     refuse_colours,
     sky_coordinate_remarks,
+    unread_card_remarks,
 )
 from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.errors import ObservationError, shorten, silent
@@ -63,10 +64,12 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
     table = None if source.catalogue is None else as_catalogue(source.catalogue)
     image, is_cube = image_or_cube(source, image, table, stamp_px)
     # The camera: values of a header are used as far as the pixels do not contradict them.
-    camera, remarks = camera_values(image, stated_camera), list[str]()
+    camera, remarks = camera_values(image, stated_camera), unread_card_remarks(image)
     if not is_cube:
-        camera, remarks = checked_camera(image, camera)
-        remarks += sky_coordinate_remarks(image)
+        camera, camera_remarks = checked_camera(image, camera)
+        remarks += [*camera_remarks, *sky_coordinate_remarks(image)]
+    # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
+    image = image.to_noise_unit()
     # Mask and map of noise. The map is scaled to the scatter of the sky, above which stars are
     # searched.
     layers, layer_remarks = find_layers(source, image, is_cube, camera)
@@ -82,7 +85,7 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
                 layers, camera, photon_remarks = with_photons(layers, camera, sky)
                 remarks += photon_remarks
             if threshold is not None:
-                detections = detected_stars(source.path, sky, threshold)
+                detections = detected_stars(source.path, sky, threshold, image.unit_factor)
     stars, positions, list_remarks = locate_stars(
         source, image, detections or table, layers, is_cube
     )
@@ -161,7 +164,7 @@ def image_or_cube(
     return image, not is_image
 
 
-def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
+def detected_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.0) -> Catalogue:
     """Return the stars of an image that are `threshold` σ above its sky.
 
     Parameters
@@ -172,6 +175,8 @@ def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
         The image without its sky.
     threshold : float
         In σ of the slightly smoothed image.
+    unit_factor : float
+        Factor from the unit of the list to that of the sky.
 
     Raises
     ------
@@ -183,6 +188,8 @@ def detected_stars(path: Path, sky: Sky, threshold: float) -> Catalogue:
     with silent():
         # The list has the columns of SExtractor, as a list in a file might.
         table = Table(sky.stars(threshold))
+        for name in {"FLUX_ISO", "BACKGROUND"}.intersection(table.colnames):
+            table[name] /= unit_factor
     if len(table) == 0:
         raise ObservationError(
             path,

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.image.interpolation import interpolated
+from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
 
 
 class SkyLevel(NamedTuple):
@@ -44,6 +45,7 @@ def sky_level(
     bad: np.ndarray,
     steps: tuple[Sequence[int], Sequence[int]] | None = None,
     mesh_px: int = 64,
+    count: float | None = None,
 ) -> SkyLevel:
     """Measure level and noise of the sky of an image.
 
@@ -57,12 +59,17 @@ def sky_level(
         Rows and columns at which the sky has steps, if they were found before.
     mesh_px : int
         Side of the squares in which the sky is measured.
+    count : float, optional
+        Step of the pixels if they are whole counts; by default the pixels show it.
 
     Raises
     ------
     ValueError
         If no mesh has enough pixels that count.
     """
+    # Medians of whole counts are those of the counts before rounding.
+    count = count_step(np.where(bad, np.nan, image)) if count is None else count
+    image, dither_variance = dither(image, count)
     if steps is None:
         steps = sky_steps(image, bad, axis=0), sky_steps(image, bad, axis=1)
     notes = []
@@ -76,14 +83,16 @@ def sky_level(
             f"the sky has structure within {mesh_px} px in {100 * share:.0f} % of the image: "
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
+    noise = remove_dither(noise, dither_variance)
     # Errors are of sums of pixels, which have more noise where neighbours share it.
     with np.errstate(all="ignore"):
         correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
     if correlation > 1.0:
         noise *= correlation
         notes.append(
-            f"neighbouring pixels share their noise, as in resampled images: that of sums of "
-            f"pixels is {correlation:.2f} times as large, and errors are of sums"
+            "pixels share their noise, as neighbours of resampled images do, or rows or columns "
+            f"with offsets: that of sums of pixels is {correlation:.2f} times as large, and errors "
+            "are of sums"
         )
     return SkyLevel(level, noise, steps, tuple(notes))
 
@@ -148,8 +157,10 @@ def noise_correlation(deviation: np.ndarray) -> float:
     """Return the noise of sums of pixels over that of independent ones, at least 1.
 
     √(Σ ρ) over the correlations ρ of pixels up to 2 px apart. Faint sources and structure of the
-    sky correlate pixels 3 and 4 px apart nearly as much as neighbours; the ρ at these distances is
-    of them, and is subtracted. Unless 0.15 are left of that of neighbours, the result is 1.
+    sky correlate pixels 3 and 4 px apart nearly as much as neighbours, along rows and columns
+    alike; the ρ at these distances is of them, and is subtracted. A ρ that is larger along rows or
+    columns only is noise: offsets of rows or columns, as of 1/f noise. Unless 0.15 are left of the
+    correlation of neighbours, or 0.05 of rows or columns, the result is 1.
 
     Parameters
     ----------
@@ -167,15 +178,18 @@ def noise_correlation(deviation: np.ndarray) -> float:
     light = np.abs(ndimage.uniform_filter(np.nan_to_num(values), 3)) > 1.5
     values = np.where(ndimage.binary_dilation(light, iterations=3), np.nan, values)
     values[np.abs(values) > 3.0] = np.nan
-    # Neighbours below and on the right; most images end here.
+    # Faint sources and structure, by pixels 3 and 4 px apart, and offsets of rows or columns.
+    along_rows, along_columns = (
+        0.5 * (_correlation(values, *near) + _correlation(values, *far))
+        for near, far in (((0, 3), (0, 4)), ((3, 0), (4, 0)))
+    )
+    shared = max(min(along_rows, along_columns), 0.0)
+    offsets = max(along_rows, along_columns, 0.0) - shared
+    # Neighbours below and on the right; without correlation, most images end here.
     nearest = 0.5 * (_correlation(values, 0, 1) + _correlation(values, 1, 0))
-    if nearest < 0.15:
-        return 1.0
-    # What faint sources and structure add, by pixels 3 and 4 px apart.
-    distant = [_correlation(values, *lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
-    shared = max(float(np.mean(distant)), 0.0)
-    if nearest - shared < 0.15:
-        return 1.0
+    if nearest - shared - 0.5 * offsets < 0.15:
+        # Offsets alone: pixels of a row up to 2 px apart on both sides.
+        return float(np.sqrt(1.0 + 4.0 * offsets)) if offsets > 0.05 else 1.0
     # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
     excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
@@ -223,13 +237,8 @@ def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarra
     """
     from photutils.background import Background2D
 
-    # Squares of the pixels of an image in a very small or large unit would be 0 or infinite.
-    highest, lowest = (float(f(image, initial=0.0, where=~bad)) for f in (np.max, np.min))
-    largest = max(highest, -lowest)
-    unit = 1.0 if largest == 0.0 or 1e-9 < largest < 1e15 else largest
-    values = image if unit == 1.0 else image / unit
-    meshes = Background2D(values, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
-    level, sigma = unit * meshes.background_mesh, unit * meshes.background_rms_mesh
+    meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
+    level, sigma = meshes.background_mesh, meshes.background_rms_mesh
     neighbours = _of_neighbours(level)
     # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
     # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself
@@ -465,7 +474,8 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     """Return the rows of some columns (h, n) at which the level has a step.
 
     It is the same in all eighths of the columns, up to 3 px from the row and from 3 to 12 and 12 to
-    24 px, slopes subtracted; and above a tenth of the noise and eight times its error.
+    24 px, slopes subtracted; and above a tenth of the noise, eight times its error, and four times
+    the scatter of all rows.
 
     Parameters
     ----------
@@ -512,7 +522,10 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
         jump = middle - 3.0 * slope
         noise = spread * np.sqrt(1.5)
         error = 1.25 * spread / np.sqrt(count)
-        candidates = np.flatnonzero(np.abs(jump) > np.maximum(0.1 * noise, 8.0 * error))
+        # Offsets of single rows, as of 1/f noise, are shared by all columns: jumps scatter by them.
+        row_scatter = float(robust_scatter(jump[np.isfinite(jump)]))
+        limit = np.maximum(np.maximum(0.1 * noise, 8.0 * error), 4.0 * row_scatter)
+        candidates = np.flatnonzero(np.abs(jump) > limit)
         # Candidates from the largest jump on: each must be the same in most eighths of the line and
         # at all three distances.
         steps: list[int] = []

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from psfdae.stars.moments import FWHM_OF_SIGMA
+from psfdae.stars.moments import FWHM_OF_SIGMA, count_step, dither, remove_dither
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Pixels
@@ -278,6 +278,9 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     start = side // 2 - hole_px // 2
     ring = np.ones((side, side), dtype=bool)
     ring[start : start + hole_px, start : start + hole_px] = False
+    # Medians of whole counts are those of the counts before rounding.
+    step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
+    window, dither_variance = dither(window, step)
     # Pixels of the ring more than 3 σ off their median belong to other stars.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
@@ -293,7 +296,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
     statistics = np.nan_to_num(statistics).astype(float)
     level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
-    return level, noise
+    return level, np.where(noise > 0, remove_dither(noise, dither_variance), 0.0)
 
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).

@@ -67,6 +67,15 @@ class CrowdedPhotometry:
     image_wings: Wings | None
     chi2_ratio: float = np.nan
 
+    def times(self, factor: float) -> CrowdedPhotometry:
+        """Return the same in a unit in which all light is larger by a factor."""
+        stars = self.stars.copy()
+        for name in ("flux", "flux_error", "flux_model"):
+            stars[name] *= factor
+        return replace(
+            self, stars=stars, residual=factor * self.residual, light=factor * self.light
+        )
+
     @property
     def radius_px(self) -> float:
         """Radius within which a flux is the light of its star; half a stamp without wings."""
@@ -102,16 +111,17 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     ObservationError
         If there is no sky to measure.
     """
+    observation, unit = observation.to_sky_unit(), observation.unit_factor
     # PSFs of the field, and lengths that follow from the PSF in its middle.
-    psfs, fwhm, side = PsfGrid.of(model, by_magnitude=True), model.fwhm_px(), model.stamp_px
+    psfs = PsfGrid.of(model, by_magnitude=True).times(unit)
+    fwhm, side = model.fwhm_px(), model.stamp_px
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
     same_px = 0.5 * fwhm  # two stars nearer to each other cannot be told apart: they are one
     # The image with its sky; saturated pixels are not fitted.
-    sky = observation.sky()
+    sky, limit = observation.sky(), observation.saturate
     image = sky.flat + sky.level
-    limit = observation.saturate
     saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
     bad = sky.bad | saturated
     sky = replace(sky, bad=bad)
@@ -129,7 +139,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
-        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux))
+        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux / unit))
         # At first, stars are no better known than to the error of the wings.
         sky, wing_light, wings, sigma = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, tolerance=0.1 if turn else 1.0
@@ -151,7 +161,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             place, flux, origin = place[real], flux[real], origin[real]
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    stars = tabulate_stars(model, fit, wings_used, fwhm)
+    stars = tabulate_stars(model, fit, wings_used, fwhm, unit)
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Farther from where it was expected than noise explains, a star may be another one.
     distance_px = np.hypot(*(fit.place - origin).T)
@@ -163,12 +173,14 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if observation.detections is None:
         stars["id"] = observation.stars.id
         stars["flags"] |= observation.stars.flags
-    return CrowdedPhotometry(
-        model, stars, sky.flat, fit.light + wing_light, wings_used, wings, chi2_ratio
-    )
+    light = fit.light + wing_light
+    result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
+    return result.times(1.0 / unit)  # in the unit of the image
 
 
-def tabulate_stars(model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: float) -> Table:
+def tabulate_stars(
+    model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: float, unit: float
+) -> Table:
     """Return a row for each star of a fit, with its wings in the flux and all errors of the flux.
 
     Parameters
@@ -181,10 +193,12 @@ def tabulate_stars(model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: f
         Light outside of the stamps; None adds none to the fluxes.
     fwhm : float
         FWHM of the PSF in pixels, which groups stars.
+    unit : float
+        Factor from the unit of the image to the unit of the fluxes.
     """
     total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
-        shares = outer_shares(model.on_pixels, fit.place, fit.flux)
+        shares = outer_shares(model.on_pixels, fit.place, fit.flux / unit)
         total, total_error = wings.total_over_flux(shares)
     stars = fit.table(total, 2.4 * fwhm)
     # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,

@@ -44,15 +44,16 @@ def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observatio
     """
     if observation.gain is not None or observation.positions is None:
         return observation
-    sky = observation.sky()
+    sky, limit = observation.sky(), observation.to_sky_unit().saturate
     bad = sky.bad
-    if observation.saturate is not None:
-        bad = bad | (sky.flat + sky.level >= observation.saturate)
+    if limit is not None:
+        bad = bad | (sky.flat + sky.level >= limit)
     measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
     if measured is None:
         return observation
-    gain = CameraValue(measured[0], "about, by the scatter of the pixels of stars")
-    return replace(observation, camera=observation.camera | {"gain": gain})
+    gain = measured[0] * observation.unit_factor
+    value = CameraValue(gain, "about, by the scatter of the pixels of stars")
+    return replace(observation, camera=observation.camera | {"gain": value})
 
 
 def measure_gain(

@@ -9,7 +9,7 @@ splines), and its derivatives by the position of the star another one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -66,6 +66,10 @@ class PsfGrid:
         psfs = np.pad(psfs, ((0, 0), (0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
         psfs = psfs.reshape(*[3] * (ends is not None), nodes, nodes, *psfs.shape[2:])
         return cls(x[:nodes], y[::nodes], psfs, oversampling, magnitudes)
+
+    def times(self, factor: float) -> PsfGrid:
+        """Return the grid for fluxes in a unit in which all fluxes are larger by a factor."""
+        return replace(self, magnitudes=self.magnitudes + magnitude(np.float64(factor)))
 
     @cached_property
     def splines(self) -> np.ndarray:

@@ -520,7 +520,7 @@ def reduced_chi2(
         expected = part * (mean_variance + part * (variance - mean_variance)) / variance
     total, expected_total = (
         np.where(is_used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
-        for values in (residual**2 / variance, expected)
+        for values in (np.square(residual / np.sqrt(variance)), expected)
     )
     chi2 = total / np.where(expected_total > 0, expected_total, np.inf)
     return np.where(is_used.any(axis=(1, 2)), chi2, np.nan)

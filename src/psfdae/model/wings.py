@@ -27,6 +27,7 @@ from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import level_and_noise
 from psfdae.stars.bright_stars import magnitude
+from psfdae.stars.moments import dither
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
@@ -404,12 +405,12 @@ def wings_of(
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
     # So σ² is averaged over a stamp.
-    unit_sigma = float(sigma.mean(dtype=np.float64))  # no square of a pixel's unit may overflow
-    variance = np.square(sigma / unit_sigma)
+    unit_sigma = float(sigma.mean(dtype=np.float64))
+    variance = np.square(sigma)
     smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
     # A mean is not below the least value, but for the rounding of running sums.
     np.maximum(smooth_variance, variance.min(), out=smooth_variance)
-    smooth_sigma = unit_sigma * np.sqrt(smooth_variance, out=smooth_variance)
+    smooth_sigma = np.sqrt(smooth_variance, out=smooth_variance)
     del variance, smooth_variance
     # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
     # of A is (F s h_k, mean σ)/σ of a pixel, so that the even light is in units of the mean σ, and
@@ -514,18 +515,18 @@ def around_stars(
     light_of_wings = wing_light(image.shape, stars, wings)
     # The sky without them, with its noise map if it has one.
     has_noise_map = np.isfinite(sky.noise_scale)
-    sky = sky_of(without_stars - light_of_wings, sky.bad, sky.noise if has_noise_map else None)
+    noise_map = sky.noise if has_noise_map else None
+    sky = sky_of(without_stars - light_of_wings, sky.bad, noise_map, count=sky.count)
     # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
     clipped = sky.bad | (np.abs(deviation) > 4.0)
-    # Mean deviation Σ (d/σ)/σ over Σ 1/σ², in units of the mean σ.
-    unit_sigma = float(sigma.mean(dtype=np.float64))
-    weight = np.where(clipped, 0.0, unit_sigma / sigma)
+    # Mean deviation Σ (d/σ)/σ over Σ 1/σ².
+    weight = np.where(clipped, 0.0, 1.0 / sigma)
     deviation *= weight
     weight *= weight
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
-    even_light = unit_sigma * float(deviation.sum(dtype=np.float64)) / total_weight
+    even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
     # Wings are round here; those of a telescope may differ from that by 30 % in a pixel.
     return sky, light_of_wings, wings, np.hypot(sigma, 0.3 * light_of_wings)
@@ -565,6 +566,7 @@ def _wings_beside(
         if previous is not None:
             without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
+            without_wings, _ = dither(without_wings, sky.count)
             residual = without_stars - level_and_noise(without_wings, bad, sky.steps)[0]
             # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
             # small.

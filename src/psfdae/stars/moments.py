@@ -29,6 +29,41 @@ def robust_scatter(values: np.ndarray) -> np.ndarray:
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
 
+def count_step(values: np.ndarray) -> float:
+    """Return the step of pixels (m, n) in whole counts, if it is above a tenth of their scatter.
+
+    It is the least difference of two values, whatever the unit; 0 where noise is wider, or pixels
+    are not in steps. Pixels that are not finite do not count.
+    """
+    # At most 2 million pixels, and the scatter of neighbours in a row, without their light.
+    sample = values[:: len(values) * values.shape[1] // 2_000_000 + 1]
+    distinct = np.unique(sample[np.isfinite(sample)])
+    differences = np.diff(sample, axis=1)
+    differences = differences[np.isfinite(differences)]
+    if distinct.size < 2 or not differences.size:
+        return 0.0
+    step = float(np.diff(distinct).min())
+    return step if robust_scatter(differences) < 10.0 * np.sqrt(2.0) * step else 0.0
+
+
+def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
+    """Return pixels (…, m, n) with even noise of ± one step, and the variance of this noise.
+
+    Medians of whole counts are whole, whatever the level and the scatter of the sky. With this
+    noise, which is always the same, medians, modes and clipped deviations are within 0.2 σ of those
+    of the pixels before they were rounded, from a noise of 0.3 steps on.
+    """
+    if not step:
+        return values, 0.0
+    noise = np.random.default_rng(0).uniform(-step, step, values.shape[-2:])
+    return values + noise.astype(values.dtype), step**2 / 3.0
+
+
+def remove_dither(sigma: np.ndarray, variance: float) -> np.ndarray:
+    """Return σ of dithered pixels without the variance of `dither`; rounding remains, a quarter."""
+    return np.sqrt(np.maximum(sigma**2 - variance, variance / 4.0)) if variance else sigma
+
+
 def shift_stamps(
     stamps: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None
 ) -> np.ndarray:
