@@ -13,6 +13,7 @@ import numpy as np
 from astropy.table import Table
 from scipy.spatial import cKDTree
 
+from psfdae.model.field_psfs import FieldPsfs
 from psfdae.stars.moments import robust_scatter
 
 SKY, READ_NOISE = 400.0, 3.0  # electrons, which are the counts of the image
@@ -53,6 +54,37 @@ def moffat(dx, dy, u, v, fwhm_px, beta):
     return (1 + square) ** -beta * (beta - 1) / (np.pi * scale**2)
 
 
+class TrueField(FieldPsfs):
+    """The true PSFs of a field as a model, of the sum 1 in stamps of 24 px."""
+
+    name, stamp_px, sha256, order, image_px = "true", 24, "0" * 64, 0, None
+
+    def __init__(self, size_px, fwhm_px, beta=3.0):
+        self.size_px, self.profile = size_px, (fwhm_px, beta)
+
+    def field_range(self):
+        return np.array([10.0, 10.0]), np.array([self.size_px - 11.0] * 2)
+
+    def check_scale(self, pixel_scale_arcsec, source):
+        pass
+
+    def draw_psfs(self, position, oversampling):
+        psfs = []
+        for x, y in position[:, :2]:
+            u, v = 2 * x / self.size_px - 1, 2 * y / self.size_px - 1
+            side = self.stamp_px if oversampling == 1 else oversampling * self.stamp_px + 1
+            # Points within a pixel about each value; those of the stamp of a star in the middle of
+            # its pixel are the unit of the flux.
+            inside = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+            axis = ((np.arange(side) - side // 2)[:, None] / oversampling + inside).ravel()
+            dx, dy = axis - (x - np.rint(x)), axis - (y - np.rint(y))
+            psf = moffat(dx, dy[:, None], u, v, *self.profile)
+            axis = ((np.arange(self.stamp_px) - self.stamp_px // 2)[:, None] + inside).ravel()
+            total = moffat(axis, axis[:, None], u, v, *self.profile).sum() / SAMPLES**2
+            psfs.append(psf.reshape((side, SAMPLES) * 2).mean(axis=(1, 3)) / total)
+        return np.array(psfs)
+
+
 def power_law_fluxes(rng, count, low, high, slope):
     """Return fluxes (count,) from low to high of which the number above F goes as F^−slope."""
     share = rng.uniform(size=count)
@@ -60,7 +92,7 @@ def power_law_fluxes(rng, count, low, high, slope):
 
 
 def simulate_field(
-    size_px, count, fwhm_px, *, beta=3.0, flux=(400.0, 3e5), slope=0.5, seed=1, nebula=0.0
+    size_px, count, fwhm_px, *, beta=3.0, flux=(400.0, 1e5), slope=0.25, seed=1, nebula=0.0
 ):
     """Return a field of `count` stars at random positions, which may overlap.
 

@@ -119,21 +119,6 @@ def test_there_are_as_many_stars_as_are_true(sky, phot):
     assert abs(np.median(phot.residual)) < 0.5
 
 
-def test_a_star_behind_a_brighter_one_is_found_in_the_second_round():
-    level, noise = np.zeros((60, 60)), np.ones((60, 60))
-    rows, columns = np.mgrid[:60, :60]
-    residual = 40 * np.exp(-((rows - 20) ** 2 + (columns - 33) ** 2) / 4.0)
-    residual += 40 * np.exp(-((rows - 40) ** 2 + (columns - 10) ** 2) / 4.0)
-    sky = crowded.Sky(residual, level, noise, level > 0, np.nan)
-    bright = np.array([[10.2, 40.1], [30.0, 20.0]])
-    place, flux = crowded.with_hidden_stars(sky, noise, bright, np.array([1e4, 1e4]), 5.0, 3.0)
-    assert place[:2].tolist() == bright.tolist() and len(place) == len(flux) == 3
-    assert place[2] == pytest.approx([33, 20], abs=0.1)
-    # Beside a bright star, as much light may be a PSF that is a little off.
-    doubt = np.where(residual > 1, 40.0, 1.0)
-    assert len(crowded.with_hidden_stars(sky, doubt, bright, flux[:2], 5.0, 3.0)[0]) == 2
-
-
 def test_aperture_corrections(phot):
     for x, y in ((100.0, 100.3), (290.4, 150.0)):
         image = stamps(np.array([x]), np.array([y]))[0]

@@ -210,7 +210,7 @@ class TrueField:
 def with_truth(stem: str, catalogue: str) -> None:
     """The catalogue of `psfdae photometry --detect` with the true PSF."""
     observation = ImageInput(Path(f"{stem}.fits"), detect=5.0).open(TrueField.stamp_px)
-    crowded.photometry(TrueField(), observation, 5.0).stars.write(catalogue, overwrite=True)
+    crowded.photometry(TrueField(), observation).stars.write(catalogue, overwrite=True)
 
 
 def pipeline(stem: str, catalogue: str, psf: str) -> None:
@@ -232,7 +232,7 @@ def apertures(stem: str, table: str, bundle: str) -> None:
     """Compare aperture corrections with the true ones, at places over the field."""
     model = load_model(bundle)
     source = ImageInput(Path(f"{stem}.fits"), detect=5.0)
-    measured = crowded.photometry(model, source.open(model.info.stamp_px), 5.0)
+    measured = crowded.photometry(model, source.open(model.info.stamp_px))
     side = 2 * HALF_PX[1] + 1
     axis = (np.arange(side * INTEGRATED) + 0.5) / INTEGRATED - 0.5 - side // 2
     shape = (side, INTEGRATED) * 2

@@ -31,7 +31,7 @@ def photometry_command(
 ) -> None:
     """Measure the fluxes of all stars of IMAGE, overlapping ones together.
 
-    --detect finds the stars, and in a second round those that brighter ones hide; those of
+    --detect finds the stars, and with the PSF those that are faint or hidden; those of
     --catalogue are measured where it says, and no others. Fluxes have the light beyond the
     stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
 

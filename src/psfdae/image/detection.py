@@ -85,9 +85,7 @@ class Sky:
         smooth = ndimage.gaussian_filter(self.flat, sigma)
         return smooth, threshold * self.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
-    def stars(
-        self, threshold: float, fwhm_px: float | None = None, wide_px: float = 7.0
-    ) -> dict[str, np.ndarray]:
+    def stars(self, threshold: float, wide_px: float = 7.0) -> dict[str, np.ndarray]:
         """Return columns of a star list as SExtractor names them, positions from 1, ids too.
 
         Where stars are wide, noise would part a star into many: the image is smoothed by a Gaussian
@@ -97,14 +95,10 @@ class Sky:
         ----------
         threshold : float
             Least height of a source, in σ of the smoothed image.
-        fwhm_px : float, optional
-            FWHM of stars; measured if it is not given.
         wide_px : float
             FWHM from which stars are wide.
         """
-        # Slightly smoothed at first, or with the FWHM that is given.
-        if fwhm_px is not None:
-            return self._sources(threshold, fwhm_px if fwhm_px >= wide_px else 0.0)
+        # Slightly smoothed at first.
         columns, smoothing = self._sources(threshold), 0.0
         # The size of the sources, and the sources smoothed by it, until both agree.
         for _ in range(3):

@@ -52,7 +52,10 @@ class ImageStatements:
     catalogue: Annotated[StarList | None, "Star list of an image, FITS or CSV."] = None
     detect: Annotated[bool | float, "Find the stars of an image; the list is written, too."] = False
     on_image: Annotated[bool, "Leave out stars of the list that are off the image."] = False
-    threshold: Annotated[float, "Detection limit of --detect, in σ above the sky."] = 5.0
+    threshold: Annotated[
+        float | None,
+        "Detection limit of --detect in σ.  [default: 5 above the sky, 4 with photometry's PSF]",
+    ] = None
     pixel_scale_arcsec: Annotated[
         Number | None, {"flag": "--pixel-scale"}, "Arcseconds per pixel.  [default: the WCS's]"
     ] = None
@@ -80,12 +83,17 @@ class ImageStatements:
     accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
 
     @property
+    def given_threshold(self) -> float | None:
+        """Threshold of all searches for stars in σ; None where each has its default."""
+        # In Python, `detect` may be the threshold itself.
+        return self.threshold if isinstance(self.detect, bool) else float(self.detect)
+
+    @property
     def detection_sigma(self) -> float | None:
         """Threshold of the search for stars in σ above the sky; None without a search."""
         if not self.detect:
             return None
-        # In Python, `detect` may be the threshold itself.
-        return self.threshold if self.detect is True else float(self.detect)
+        return 5.0 if self.given_threshold is None else self.given_threshold
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class StarFlag(IntFlag):
 
     MASKED = 1, "pixels that are masked, not finite or off the image; replaced"
     OUTLIER = 2, "pixels that no star of the training set can have; replaced"
-    FAINT = 4, "flux below three times its error"
+    FAINT = 4, "flux below three times its error; below five for stars that photometry detects"
     NO_FLUX = 8, "no usable flux: PSF, residual and uncertainty are NaN"
     SATURATED = 16, "saturated pixels, replaced; or the star list says so"
     TRUNCATED = 32, "part of the stamp is off the image; or the star list says so"

@@ -1,29 +1,36 @@
 """Photometry of all stars of an image, those that overlap together, with a model of its field.
 
-All stars are fitted at once (`psfdae.model.joint_fit`). What brighter stars hid is then found where
-their models are subtracted, and all are fitted again, on a sky without the light of stars. Stars
-that were hidden and have no flux of 3 σ are dropped, and the others fitted a last time. The light
-that a star has beyond its stamp is measured with them (`psfdae.model.wings`).
+All stars are fitted at once (`psfdae.model.joint_fit`). Stars that are fainter, or in the light of
+brighter ones, are then found where the models are subtracted (`psfdae.model.matched_filter`), and
+all are fitted again, on a sky without the light of stars, until no more are found. Stars that were
+found there and have no flux of 3 σ are dropped. The light that a star has beyond its stamp is
+measured with them (`psfdae.model.wings`).
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.progress import steps
-from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.flux_model import is_faint
 from psfdae.model.joint_fit import JointFit, fit_stars, pairs_within
+from psfdae.model.matched_filter import find_stars
 from psfdae.model.photon_noise import pixel_error
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.restoration import MAX_CHI2
-from psfdae.model.wings import StarFluxes, Wings, aperture_correction, around_stars, outer_shares
+from psfdae.model.wings import (
+    StarFluxes,
+    Wings,
+    aperture_correction,
+    around_stars,
+    error_without_models,
+    outer_shares,
+)
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -32,6 +39,12 @@ if TYPE_CHECKING:
 
 MAX_CHI2_RATIO = 2.5
 """Median χ² of an image's bright stars, over that of the training, from which all are flagged."""
+
+MAX_TURNS = 5
+"""Joint fits; stars are looked for after all but the last two."""
+
+RESIDUAL_SNR = 4.0
+"""Minimum S/N of a star in the residuals: of 10⁶ pixels of noise, some 25 peaks are higher."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +105,9 @@ class CrowdedPhotometry:
         return aperture_correction(self.model, self.wings, x, y, radius_px)
 
 
-def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> CrowdedPhotometry:
+def photometry(
+    model: FieldPsfs, observation: Observation, threshold: float = RESIDUAL_SNR
+) -> CrowdedPhotometry:
     """Fit positions and fluxes of all stars of an image.
 
     Parameters
@@ -102,7 +117,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     observation : Observation
         The image with its stars. No others are looked for if they are those of a list.
     threshold : float
-        Of hidden stars, in σ above the sky.
+        Minimum S/N of stars that are found where the models of others are subtracted.
 
     Raises
     ------
@@ -118,7 +133,6 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
-    same_px = 0.5 * fwhm  # two stars nearer to each other cannot be told apart: they are one
     # The image with its sky; saturated pixels are not fitted.
     sky, limit = observation.sky(), observation.saturate
     image = sky.flat + sky.level
@@ -131,7 +145,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.flat, observation.gain)
-    for turn in steps("photometry", range(3)):
+    # Positions of all stars that were found in residuals: each is tried once.
+    tried = np.empty((0, 2))
+    for turn in steps("photometry", range(MAX_TURNS)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
         fit = fit_stars(psfs, without_wings, error, bad, place, flux, _box(fwhm), fwhm, origin)
@@ -141,71 +157,92 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         # Sky and light beyond the stamps, from the image without the light of stars.
         fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux / unit))
         # At first, stars are no better known than to the error of the wings.
-        sky, wing_light, wings, sigma = around_stars(
+        sky, wing_light, wings = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, tolerance=0.1 if turn else 1.0
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
-        if turn == 0 and observation.detections is not None:
-            place, flux = with_hidden_stars(sky, sigma, place, flux, threshold, fwhm)
-            origin = np.concatenate([origin, place[len(origin) :]])
-        elif turn > 0:
-            # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
-            # or if it has moved to another star.
-            sigma = _psf_doubt(place, flux, side, area_px)
-            real = flux > 3.0 * np.hypot(fit.flux_error, sigma)
-            real[pairs_within(place, same_px)] = False
-            real[: observation.count] = True
-            if real.all() or turn == 2:
-                break
-            place, flux, origin = place[real], flux[real], origin[real]
+        if turn == MAX_TURNS - 1 or (turn > 0 and observation.detections is None):
+            break
+        # A star found in residuals is none if it is faint, if it may be what the PSF of another
+        # star lacks, or if it has moved to another star.
+        sigma = np.hypot(fit.flux_error, _psf_doubt(place, flux, side, area_px))
+        real = flux > min(threshold, 3.0) * sigma
+        real[pairs_within(place, 0.5 * fwhm)] = False  # of one star
+        real[: observation.count] = True
+        place, flux, origin = place[real], flux[real], origin[real]
+        # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
+        # stars and find none.
+        if observation.detections is not None and turn < MAX_TURNS - 2:
+            sigma = np.where(bad, np.inf, error_without_models(error, fit.light, wing_light))
+            known = np.concatenate([place, tried])
+            found, light = find_stars(psfs, sky.flat, sigma, known, threshold, fwhm)
+            place, origin, tried = (np.concatenate([p, found]) for p in (place, origin, tried))
+            flux = np.append(flux, light)
+        if turn > 0 and real.all() and len(place) == len(real):
+            break
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    stars = tabulate_stars(model, fit, wings_used, fwhm, unit)
-    stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
-    # Farther from where it was expected than noise explains, a star may be another one.
-    distance_px = np.hypot(*(fit.place - origin).T)
-    is_far = distance_px > np.maximum(same_px, 3.0 * np.hypot(stars["x_error"], stars["y_error"]))
-    raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
+    stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm)
+    stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(_box(fwhm)))
-    # Stars of a list keep its numbers and flags.
-    if observation.detections is None:
-        stars["id"] = observation.stars.id
-        stars["flags"] |= observation.stars.flags
     light = fit.light + wing_light
     result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
     return result.times(1.0 / unit)  # in the unit of the image
 
 
 def tabulate_stars(
-    model: FieldPsfs, fit: JointFit, wings: Wings | None, fwhm: float, unit: float
+    model: FieldPsfs,
+    observation: Observation,
+    fit: JointFit,
+    origin: np.ndarray,
+    wings: Wings | None,
+    fwhm: float,
 ) -> Table:
-    """Return a row for each star of a fit, with its wings in the flux and all errors of the flux.
+    """Return a row for each star with all its light, all errors, and flags that need no pixels.
 
     Parameters
     ----------
     model : FieldPsfs
         Model of the PSFs, with their errors.
+    observation : Observation
+        The image with its stars, in the unit of the fit.
     fit : JointFit
         All stars, with their fluxes in the stamps.
+    origin : ndarray, shape (n, 2)
+        Expected positions of the stars, x and y in pixels.
     wings : Wings or None
         Light outside of the stamps; None adds none to the fluxes.
     fwhm : float
         FWHM of the PSF in pixels, which groups stars.
-    unit : float
-        Factor from the unit of the image to the unit of the fluxes.
     """
     total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
-        shares = outer_shares(model.on_pixels, fit.place, fit.flux / unit)
-        total, total_error = wings.total_over_flux(shares)
+        flux = fit.flux / observation.unit_factor
+        total, total_error = wings.total_over_flux(outer_shares(model.on_pixels, fit.place, flux))
+    is_detected = observation.detections is not None
+    # With a list, the errors of stars that overlap are larger than this bias, and of either sign.
+    if is_detected:
+        fit = replace(fit, flux=fit.flux - fit.flux_bias)
     stars = fit.table(total, 2.4 * fwhm)
     # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
     # whatever its χ²: σ² = σ_noise² + (σ_model F)² + (σ_wings F)².
     model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1))
     relative_error = np.hypot(model_error, total_error / total)
     stars["flux_error"] = np.hypot(stars["flux_error"], relative_error * stars["flux"])
+    # Stars of a list keep its numbers and flags.
+    stars["flags"] = np.zeros(len(stars), np.uint16) if is_detected else observation.stars.flags
+    if not is_detected:
+        stars["id"] = observation.stars.id
+    # Noise has some peaks below 5 σ in an image of a million pixels: a source may be no star.
+    faint = is_faint(np.array(stars["flux"]), np.array(stars["flux_error"]), 5.0)
+    raise_flag(stars["flags"], StarFlag.FAINT, faint & is_detected)
+    # Farther from where it was expected than noise explains, a star may be another one.
+    distance_px = np.hypot(*(fit.place - origin).T)
+    sigma_px = np.hypot(stars["x_error"], stars["y_error"])
+    is_far = distance_px > np.maximum(0.5 * fwhm, 3.0 * sigma_px)
+    raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
     return stars
 
 
@@ -281,26 +318,6 @@ def star_flags(
 def _box(fwhm: float) -> int:
     """Return the side of the pixels that are fitted to a star, odd, about 1.6 FWHM."""
     return 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
-
-
-def with_hidden_stars(
-    sky: Sky, error: np.ndarray, place: np.ndarray, flux: np.ndarray, threshold: float, fwhm: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return places and fluxes with those of stars in what is left of an image with this error."""
-    from scipy.spatial import cKDTree
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of photutils, if there is none
-        residual_stars = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
-    if not len(residual_stars["id"]):
-        return place, flux
-    # X_IMAGE counts from 1. Those at a star that was fitted are its residuals.
-    candidates = np.stack([residual_stars["X_IMAGE"], residual_stars["Y_IMAGE"]], axis=1) - 1.0
-    located = place[np.isfinite(place).all(axis=1)]
-    is_alone = cKDTree(located).query(candidates)[0] > 0.5 * fwhm
-    return np.concatenate([place, candidates[is_alone]]), np.append(
-        flux, residual_stars["FLUX_ISO"][is_alone]
-    )
 
 
 def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:

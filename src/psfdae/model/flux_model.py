@@ -129,9 +129,9 @@ class FluxModel:
         return replace(self, basis=basis, variance=np.maximum(variance, 0.0))
 
 
-def is_faint(flux: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return True for stars whose flux is below 3 times its standard error: the flag FAINT."""
-    return flux < 3.0 * error
+def is_faint(flux: np.ndarray, error: np.ndarray, snr_min: float = 3.0) -> np.ndarray:
+    """Return True for stars whose flux is below `snr_min` times its standard error: FAINT."""
+    return flux < snr_min * error
 
 
 def signal_to_noise(noise: float, area: float) -> float:

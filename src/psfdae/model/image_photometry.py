@@ -214,9 +214,7 @@ def photometry_of_image(
 
     # All stars of the image, and the zero point by those that the reference has.
     observation = with_measured_gain(model, observation)
-    measured, list_note = measure_stars(
-        model, observation, source.detection_sigma or source.threshold
-    )
+    measured, list_note = measure_stars(model, observation, source.given_threshold)
     zero_point_note = None
     if magnitudes is not None:
         zero_point, scatter, zero_point_note = measure_zero_point(measured, *magnitudes)
@@ -240,7 +238,7 @@ def photometry_of_image(
 
 
 def measure_stars(
-    model: FieldPsfs, observation: Observation, threshold: float
+    model: FieldPsfs, observation: Observation, threshold: float | None = None
 ) -> tuple[CrowdedPhotometry, str | None]:
     """Measure the stars that can be measured, and return a row for every star of the list.
 
@@ -251,13 +249,14 @@ def measure_stars(
     list_note : str or None
         A sentence on how far the stars are off the positions of their list, if there is one.
     """
+    from psfdae.model.crowded import RESIDUAL_SNR
     from psfdae.model.crowded import photometry as crowded_photometry
 
     # A row without a position cannot be fitted, and one of a star that is listed twice has no
     # light of its own: measure the others, and add flagged rows for these.
     unusable = observation.without_position() | observation.listed_again()
     usable = observation.select(~unusable) if unusable.any() else observation
-    measured = crowded_photometry(model, usable, threshold)
+    measured = crowded_photometry(model, usable, threshold or RESIDUAL_SNR)
     if unusable.any():
         measured = replace(
             measured, stars=with_unmeasured_rows(measured.stars, observation, unusable)

@@ -36,6 +36,8 @@ class JointFit:
         Centres, x and y, 0-based pixels, and their standard errors.
     flux, flux_error : ndarray, shape (n,)
         Light in the stamp of the PSF, counts, and its standard errors.
+    flux_bias : ndarray, shape (n,)
+        Mean excess of the fluxes because centres are free, counts.
     chi2 : ndarray, shape (n,)
         Reduced χ² of the pixels of the box.
     flags : ndarray of int, shape (n,)
@@ -48,6 +50,7 @@ class JointFit:
     place_error: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
+    flux_bias: np.ndarray
     chi2: np.ndarray
     flags: np.ndarray
     light: np.ndarray
@@ -303,7 +306,12 @@ class _Fit:
         `moving` stars (m,) were not at rest; x or y at the end of its range is in `bound` (m, 2).
         """
         # Standard errors, and the reduced χ² of the pixels of each box.
-        error = standard_errors(*_normal_matrix(self.design(), self._rows, prior))
+        matrix, unit = _normal_matrix(self.design(), self._rows, prior)
+        error = standard_errors(matrix, unit)
+        # The centre is fitted where noise makes the flux largest: with two free coordinates, it is
+        # too large by F/S² in the mean, where S is the signal-to-noise ratio of the star alone
+        # (Portillo et al. 2020, AJ 159, 165). Below S = 2, the range of the centre limits that.
+        bias = self.flux / np.fmax(np.square(self.flux * unit[:, 0]), 4.0)
         chi2 = self.squares() / np.maximum(self.pixels - self.parameters, 1)
         # Flags as photutils has them: 1 not all pixels, 2 off the image, 4 no flux above 0, 8 not
         # at rest, 32 at the bound of its range.
@@ -327,6 +335,7 @@ class _Fit:
             of_all(error[:, 1:]),
             of_all(self.flux),
             of_all(error[:, 0]),
+            of_all(bias),
             of_all(chi2),
             of_all(flags, 64),  # no overlap with usable pixels
             light,

@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 
 from psfdae.base.errors import Error
-from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut_image
 from psfdae.methods.field import FieldMixture
@@ -94,7 +93,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
         # bright stars in the cleaned image.
         field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
         try:
-            photometry = crowded.photometry(field, observation, ImageInput.threshold)
+            photometry = crowded.photometry(field, observation)
             # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
             isolation_px = 1.25 * field.fwhm_px()
             light = light_of_others(photometry, observation.positions)

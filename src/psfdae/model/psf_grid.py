@@ -69,7 +69,7 @@ class PsfGrid:
 
     def times(self, factor: float) -> PsfGrid:
         """Return the grid for fluxes in a unit in which all fluxes are larger by a factor."""
-        return replace(self, magnitudes=self.magnitudes + magnitude(np.float64(factor)))
+        return replace(self, magnitudes=self.magnitudes + magnitude(np.array(factor)))
 
     @cached_property
     def splines(self) -> np.ndarray:

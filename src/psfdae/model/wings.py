@@ -457,9 +457,15 @@ def wings_of(
     return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
 
 
-def error_beside_models(error: np.ndarray, star_light: np.ndarray) -> np.ndarray:
-    """Return σ (h, w) of an image without its stars: its noise, and 3 % of their models' light."""
-    return np.asarray(np.hypot(error, 0.03 * star_light))
+def error_without_models(
+    error: np.ndarray, star_light: np.ndarray, wing_light: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Return σ (h, w) of an image without its stars: its noise, and the errors of their models.
+
+    These are 3 % of the models' light and 30 % of the wings': wings are round here; those of a
+    telescope may differ from that by as much in a pixel.
+    """
+    return np.asarray(np.hypot(np.hypot(error, 0.03 * star_light), 0.3 * wing_light))
 
 
 def block_sums(values: np.ndarray, side: int) -> np.ndarray:
@@ -481,7 +487,7 @@ def around_stars(
     stamp_px: int,
     earlier: Wings | None = None,
     tolerance: float = 0.1,
-) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
+) -> tuple[Sky, np.ndarray, Wings | None]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
     A sky map takes wide wings for sky until the wings are known.
@@ -505,11 +511,9 @@ def around_stars(
         Sky without wings; its `flat` is what is left without sky, stars and wings.
     light_of_wings : ndarray, shape (h, w)
     wings : Wings or None
-    sigma : ndarray, shape (h, w)
-        σ of every pixel without models and wings, with what these may be off by.
     """
     # What is left beside the models has their errors, too.
-    sigma = error_beside_models(error, star_light)
+    sigma = error_without_models(error, star_light)
     without_stars = image - star_light
     wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
     light_of_wings = wing_light(image.shape, stars, wings)
@@ -528,8 +532,7 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
-    # Wings are round here; those of a telescope may differ from that by 30 % in a pixel.
-    return sky, light_of_wings, wings, np.hypot(sigma, 0.3 * light_of_wings)
+    return sky, light_of_wings, wings
 
 
 def _wings_beside(

@@ -1,0 +1,158 @@
+"""Stars that the PSF as a filter finds where the models of other stars are subtracted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import psfdae
+from psfdae.image.image_input import ImageInput
+from psfdae.model.matched_filter import filtered, find_stars
+from psfdae.model.psf_grid import PsfGrid
+from simulated_fields import CAMERA, TrueField, compare, false_share, simulate_field
+
+SIZE = 200
+NOBODY = np.array([[-99.0, -99.0]])  # no known star
+
+
+def gaussian_grid(fwhm, oversampling=4, side=16):
+    """A field with one Gaussian PSF."""
+    axis = (np.arange(side * oversampling + 1) - side * oversampling // 2) / oversampling
+    psf = np.exp(-4 * np.log(2) * (axis**2 + axis[:, None] ** 2) / fwhm**2)
+    psf *= oversampling**2 / psf.sum()
+    return PsfGrid(np.zeros(1), np.zeros(1), psf[None, None], oversampling)
+
+
+def lit(grid, place, flux, shape=(SIZE, SIZE)):
+    """Light of stars at places (n, 2)."""
+    light = np.zeros((shape[0] + 40, shape[1] + 40))
+    corner = np.rint(place).astype(int) - 10
+    for (column, row), f, star in zip(corner, flux, grid.stamps(place, corner, 21), strict=True):
+        light[row + 20 : row + 41, column + 20 : column + 41] += f * star[0]
+    return light[20:-20, 20:-20]
+
+
+@pytest.fixture(scope="module")
+def scattered():
+    """Positions of 100 stars on a grid, at all phases within a pixel."""
+    cells = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2)
+    return 10.0 + 19.0 * cells + np.random.default_rng(3).uniform(-4, 4, cells.shape)
+
+
+@pytest.mark.parametrize("fwhm", [1.6, 3.2, 5.0])
+@pytest.mark.parametrize("phase", [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5)])
+def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
+    """F = Σ P r/σ² / Σ P²/σ² and S = F √(Σ P²/σ²), also where the noise differs."""
+    rng, grid = np.random.default_rng(1), gaussian_grid(fwhm)
+    sigma = rng.uniform(1.0, 3.0, (31, 31))
+    residual = rng.normal(0, sigma) + lit(grid, np.array([phase]) + 15, [50.0], (31, 31))
+    corner = np.array([[9, 9]])
+    phases = 15 + 0.5 * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+    psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)[:, 0]
+    # Most of the scatter is below 1 by a factor: the noise is that of σ.
+    snr, flux = filtered(residual, sigma, psf)
+    star = grid.stamps(np.array([phase]) + 15, corner, 13)[0, 0]
+    weight = sigma[9:22, 9:22] ** -2.0
+    information = (star**2 * weight).sum()
+    expected = (star * residual[9:22, 9:22] * weight).sum() / information
+    at = 2 * 15 + int(2 * phase[1]), 2 * 15 + int(2 * phase[0])
+    assert flux[at] == pytest.approx(expected, rel=1e-4)
+    assert snr[at] <= 1.0001 * expected * np.sqrt(information)
+    assert snr[at] == pytest.approx(expected * np.sqrt(information), rel=0.3)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
+@pytest.mark.parametrize("fwhm", [1.6, 3.2, 8.0])
+def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):
+    """Of stars of S/N 7 nearly all, with their positions and fluxes, in any unit of the image."""
+    rng, grid = np.random.default_rng(2), gaussian_grid(fwhm, side=32 if fwhm > 5 else 16)
+    flux = 7.0 / np.sqrt(
+        np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0, 0]).sum()
+    )
+    scattered = scattered[:: 1 if fwhm < 5 else 7]  # far enough from each other
+    light = lit(grid, scattered, np.full(len(scattered), flux))
+    image = rng.normal(0, 1, (SIZE, SIZE)) + light
+    sigma = np.full(image.shape, unit)
+    place, fluxes = find_stars(grid, unit * image, sigma, NOBODY, 4.0, fwhm)
+    off, row = cKDTree(place).query(scattered)
+    is_found = off < max(1.0, 0.4 * fwhm)
+    assert is_found.mean() >= 0.96
+    # 4 σ has some 25 peaks in a million pixels for 3.2 px, and four times as many for half of that.
+    assert len(place) - is_found.sum() <= 8
+    assert np.median(fluxes[row[is_found]]) / unit == pytest.approx(flux, rel=0.08)
+    # A star that is known is not found again.
+    again, _ = find_stars(grid, unit * image, sigma, place, 4.0, fwhm)
+    assert len(again) == 0
+
+
+def test_a_residual_within_the_error_of_a_model_is_no_star():
+    """Beside a bright star, light within 3 % of its model is none; as much beside no star is."""
+    grid = gaussian_grid(3.2)
+    residual = lit(grid, np.array([[50.2, 50.1], [150.2, 150.4]]), [300.0, 300.0])
+    model = lit(grid, np.array([[50.0, 50.0]]), [2e4])
+    place, flux = find_stars(grid, residual, np.hypot(1.0, 0.03 * model), NOBODY, 4.0, 3.2)
+    assert place == pytest.approx(np.array([[150.0, 150.5]]), abs=0.3)
+    assert flux == pytest.approx(300.0, rel=0.05)
+
+
+@pytest.mark.parametrize("scatter", [2.0, 5.0])
+def test_where_the_noise_is_larger_than_sigma_says_fewer_are_found(scatter):
+    """Structure in a part of the image makes no stars there: S is over its own scatter."""
+    rng, grid = np.random.default_rng(4), gaussian_grid(3.2)
+    residual = rng.normal(0, 1, (256, 256))
+    residual[:, 128:] *= scatter
+    place, _ = find_stars(grid, residual, np.ones(residual.shape), NOBODY, 4.0, 3.2)
+    assert len(place) <= 6
+
+
+def test_stars_on_bad_pixels_and_edges():
+    """A star with one bad pixel is found, and one of which most is bad or off the image is not."""
+    grid = gaussian_grid(3.2)
+    places = np.array([[40.2, 40.0], [100.0, 100.0], [-2.6, 60.0], [1.0, 120.0]])
+    residual, sigma = lit(grid, places, np.full(4, 40.0)), np.ones((SIZE, SIZE))
+    sigma[40, 41] = sigma[97:104, 97:104] = np.inf
+    residual[~np.isfinite(sigma)] = 1e4
+    place, _ = find_stars(grid, residual, sigma, NOBODY, 4.0, 3.2)
+    assert place == pytest.approx(places[[0, 3]], abs=0.5)
+    # Without a single good pixel there is none.
+    assert len(find_stars(grid, residual, np.full(sigma.shape, np.inf), NOBODY, 4.0, 3.2)[0]) == 0
+
+
+def test_the_threshold_has_a_default_for_each_search(tmp_path):
+    """5 σ above the sky and 4 σ in residuals; one that is given is the limit of both."""
+    image = np.zeros((9, 9))
+    for given, both in (({"detect": True}, None), ({"detect": True, "threshold": 6.0}, 6.0)):
+        source = ImageInput(image, **given)
+        assert source.given_threshold == both and source.detection_sigma == (both or 5.0)
+    assert ImageInput(image, detect=7.0).given_threshold == 7.0
+    assert ImageInput(image, threshold=7.0).detection_sigma is None
+
+
+FWHM_PX = 3.0, 3.65
+
+
+def test_faint_stars_of_a_crowded_field_are_found():
+    """With few false ones, which have the flag FAINT; a search of pixels found 4 and 65 %."""
+    field = simulate_field(300, 180, FWHM_PX, slope=0.5, seed=5)
+    table = TrueField(300, FWHM_PX).photometry(field.image, detect=True, **CAMERA)
+    faint, middle, *_ = compare(table, field.stars, (4.0, 7.0, 14.0))
+    assert faint["found"] >= 0.7 and middle["found"] >= 0.9
+    assert abs(middle["bias"]) < 0.06
+    assert false_share(table, field.stars) <= 0.025
+    clean = table[table["flags"] == 0]
+    assert false_share(clean, field.stars) <= 0.01
+
+
+@pytest.mark.slow
+def test_photometry_of_a_crowded_field_with_a_model_of_its_stars():
+    """2000 stars on 1000 × 1000 px, all that is found, in ranges of the S/N of an ideal fit."""
+    field = simulate_field(1000, 2000, FWHM_PX, seed=1)
+    model = psfdae.fit(psfdae.Stars.from_image(field.image, detect=True, **CAMERA), method="field")
+    table = model.photometry(field.image, detect=True, **CAMERA)
+    bins = compare(table, field.stars)
+    assert bins["found"][0] >= 0.7 and bins["found"][1] >= 0.95 and min(bins["found"][2:]) > 0.99
+    assert false_share(table, field.stars) <= 0.025
+    assert np.abs(bins["bias"][3:]).max() <= 0.003
+    assert bins["scatter"][-1] <= 1.2
+    assert min(bins["within"][2:]) >= 0.62 and max(bins["within"][2:]) <= 0.74
