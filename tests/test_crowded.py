@@ -320,6 +320,26 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
+def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighbours(sky):
+    folder, model, true = sky
+    middle = np.array([165.0, 170.0])
+    row, column = np.indices((SIZE, SIZE))
+    radius = np.hypot(column - middle[0], row - middle[1])
+    halo = 2e8 * profile(radius, 0.0)
+    image = fits.getdata(folder / "i.fits") + np.random.default_rng(1).poisson(halo)
+    place = np.stack([true["x"], true["y"]], axis=1)
+    source = ImageInput(np.minimum(image, 6e4), catalogue=place, origin=0, gain=1.0, saturate=6e4)
+    phot = crowded.photometry(load_model(model), source.open(STAMP), 5.0)
+    distance = np.hypot(*(place - middle).T)
+    near = (distance > 12) & (distance < 45) & (phot.stars["flags"] == 0)
+    pull = (phot.stars["flux"] - true["flux"]) / phot.stars["flux_error"]
+    assert near.sum() >= 4 and (np.abs(pull[near]) < 3.0).all()
+    # Where they have 300 and 70 counts in a pixel, less than a tenth is left.
+    for ring_px in (12, 16):
+        ring = np.abs(radius - ring_px) < 1
+        assert abs(np.median(phot.residual[ring])) < 0.1 * np.median(halo[ring])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from astropy.io import fits
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 import psfdae
@@ -14,9 +15,9 @@ from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import Verdict, completed
-from psfdae.image.sky_level import noise_correlation, sky_level, sky_steps
+from psfdae.image.sky_level import SkyStructure, noise_correlation, sky_level, sky_steps
 from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
-from psfdae.image.trails import find_trails
+from psfdae.image.trails import find_trails, with_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.fitting import fitted_to
@@ -137,6 +138,94 @@ def test_an_image_that_was_cut_off_says_its_saturation(clean):
     assert "exactly the largest value, 3000 counts: taken as saturated" in observation.summary()
 
 
+# Areas that receive no light.
+
+
+def illumination(kind):
+    """Part of the light that each pixel receives, (SIDE, SIDE)."""
+    row, column = np.indices((SIDE, SIDE)) - SIDE / 2.0
+    turned = np.maximum(np.abs(0.8 * row + 0.6 * column), np.abs(0.8 * column - 0.6 * row))
+    inside_px, softness_px = {
+        "circle": (135 - np.hypot(row, column), 3),
+        "circle cut by two edges": (200 - np.hypot(row + 70, column + 100), 3),
+        "small circle off the centre": (100 - np.hypot(row + 30, column - 20), 1),
+        "corner": (260 - np.hypot(row + 100, column + 100), 6),
+        "square field stop": (105 - np.maximum(np.abs(row), np.abs(column - 20)), 0.1),
+        "turned square": (100 - turned, 1),
+        "strip": (row + 90, 3),
+    }[kind]
+    return 1.0 / (1.0 + np.exp(-np.clip(inside_px / softness_px, -50, 50)))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "circle",
+        "circle cut by two edges",
+        "small circle off the centre",
+        "corner",
+        "square field stop",
+        "turned square",
+        "strip",
+    ],
+)
+@pytest.mark.parametrize("sky", [60.0, 1000.0])
+def test_outside_of_an_image_circle_nothing_is_exposed(clean, kind, sky):
+    """The sky inside is as without the circle."""
+    rng, part, bias = np.random.default_rng(4), illumination(kind), 300.0
+    stars = drawn(moffat(2.8), clean[1], clean[2], SIDE)
+    electrons = rng.poisson(1.5 * part * (stars + sky)) + rng.normal(0, 5, part.shape)
+    image = np.rint(electrons / 1.5 + bias).astype(np.float32)
+    found = bad_pixels.find_bad_pixels(image, np.zeros(image.shape, bool), [], None)
+    assert "not exposed (level 300" in "\n".join(found.notes)
+    # All that is dark is left out, and a soft edge; little of what is bright.
+    is_bright = part > 0.98
+    assert (part[~found.mask] > 0.5).mean() > 0.99
+    assert found.mask[is_bright].mean() < 0.2
+    # Level and noise of the sky are right up to the edge.
+    measured = sky_of(image, found.mask)
+    at = is_bright & ~found.mask
+    sigma = np.sqrt(1.5 * sky + 25) / 1.5
+    assert np.abs(measured.level - bias - sky)[at].mean() < 0.25 * sigma
+    assert 0.9 < np.median(measured.noise[at]) / sigma < 1.15
+    # Stars are found, and nothing else; those at the edge, of which a part is cut off, are flagged.
+    sources, whole = measured.stars(5.0), ~ndimage.binary_dilation(found.mask, iterations=4)
+    place = np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1) - 1.0
+    true, seen = (p[whole[tuple(np.rint(p).astype(int).T[::-1])]] for p in (clean[1], place))
+    assert (cKDTree(place).query(true)[0] < 1.5).mean() > 0.95
+    assert (cKDTree(clean[1]).query(seen)[0] > 2.0).sum() <= 1
+
+
+def test_an_exposed_image_has_no_unexposed_area(clean):
+    image, none = clean[0], np.zeros(clean[0].shape, bool)
+    row, column = np.indices(image.shape)
+    rng = np.random.default_rng(3)
+    halo = 1e5 / (1 + np.hypot(row - 150, column - 150) ** 2 / 100)
+    skies = {
+        "even": 0.0,
+        "gradient": 3.0 * column,
+        "galaxy on an empty sky": rng.poisson(halo) - 0.0,
+        "amplifiers": np.where(column < 160, 0.0, 60.0 + rng.normal(0, 20, image.shape)),
+        "four times as long exposed": np.where(row < 160, 0.0, rng.normal(0, 40, image.shape)),
+    }
+    found = {name: bad_pixels.unexposed_area(image + sky, none) for name, sky in skies.items()}
+    assert found == dict.fromkeys(skies)
+
+
+def test_a_known_structure_of_the_sky_is_used_again():
+    """A wave of 64 px in 3 % of an image is too little to be seen, but followed if it is known."""
+    row, column = np.indices((704, 704))
+    wave = 100.0 * np.sin(2 * np.pi * row / 64)
+    wave[(np.maximum(np.abs(row - 256), np.abs(column - 256)) > 64)] = 0.0
+    image = SKY + wave + np.random.default_rng(2).normal(0, 15, wave.shape)
+    none, middle = np.zeros(wave.shape, bool), np.s_[220:290, 220:290]
+    unknown, known = (sky_of(image, none, structure=s) for s in (None, SkyStructure(is_fine=True)))
+    assert not unknown.structure.is_fine and known.structure.is_fine
+    assert (
+        np.std((unknown.level - wave)[middle]) > 50.0 > 20.0 > np.std((known.level - wave)[middle])
+    )
+
+
 # Skies with steps, structure, trails, and shared noise.
 
 
@@ -180,15 +269,66 @@ def test_noise_of_neighbours_that_is_shared_is_that_of_their_sum(clean):
     assert sky_level(clean[0], np.zeros(clean[0].shape, bool)).notes == ()
 
 
-def test_trails_are_found_and_stars_are_none(clean):
+UNEVEN = {
+    "even": lambda s: 1.0 + 0.0 * s,
+    "tumbling": lambda s: 1.0 + 0.7 * np.sin(2 * np.pi * s / 60),
+    "slowly tumbling": lambda s: 1.0 + 0.9 * np.sin(2 * np.pi * s / 150),
+    "steps": lambda s: np.where(s // 30 % 2 == 0, 1.0, 0.3),
+    "flashing": lambda s: 1.0 + 8.0 * (s % 45 < 3),
+}
+
+
+@pytest.mark.parametrize("kind", UNEVEN)
+@pytest.mark.parametrize("angle_deg", [22, 90, 140])
+def test_trails_are_found_however_uneven(clean, kind, angle_deg):
     image, none = clean[0], np.zeros(clean[0].shape, bool)
-    row, column = np.indices(image.shape)
-    assert find_trails(image, none, sky_level(image, none))[1] == 0
-    across = (row - 100 - 0.4 * column) / np.hypot(1, 0.4)
-    image = image + 150 * np.exp(-0.5 * (across / 1.2) ** 2)
+    row, column = np.indices(image.shape) - SIDE / 2.0
+    sine, cosine = np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))
+    across, along = row * cosine - column * sine + 7.0, column * cosine + row * sine
+    is_on = np.abs(along) < 130
+    image = image + 200 * is_on * UNEVEN[kind](along) * np.exp(-0.5 * (across / 1.2) ** 2)
     mask, count = find_trails(image, none, sky_level(image, none))
-    assert count == 1 and mask[np.abs(across) < 2].mean() > 0.95
-    assert not mask[np.abs(across) > 12].any()
+    assert count == 1 and mask[(np.abs(across) < 2) & is_on].mean() > 0.95
+    # A star at its end may make it longer.
+    assert not mask[(np.abs(across) > 12) | (np.abs(along) > 170)].any()
+
+
+@pytest.mark.parametrize("spacing_px", [9, 12, 20])
+@pytest.mark.parametrize("flux", [2e3, 2e5])
+def test_stars_in_a_row_are_no_trail(clean, spacing_px, flux):
+    """Between them it is dark."""
+    along = np.arange(-130, 130, spacing_px)
+    place = SIDE / 2 + np.stack([0.9 * along, 0.44 * along], axis=1)
+    row = drawn(moffat(2.8), place, np.full(len(along), flux), SIDE)
+    for image in (clean[0], clean[0] + row):
+        none = np.zeros(image.shape, bool)
+        assert find_trails(image, none, sky_level(image, none))[1] == 0
+
+
+@pytest.mark.parametrize("arms", [4, 6])
+def test_spikes_of_saturated_stars_are_left_out_and_their_cores_are_not(clean, arms):
+    """At any angle; and charge that has run along a column, up to a part of the full well."""
+    row, column = np.indices(clean[0].shape) - SIDE / 2.0
+    spikes = np.zeros(clean[0].shape)
+    for angle in 0.3 + 2 * np.pi * np.arange(arms) / arms:
+        along, across = (
+            column * np.cos(angle) + row * np.sin(angle),
+            row * np.cos(angle) - column * np.sin(angle),
+        )
+        height = 2e3 / (1 + (along / 10) ** 2)
+        spikes += (along > 0) * height * np.exp(-0.5 * (across / 0.8) ** 2)
+    star = drawn(moffat(2.8), [[SIDE / 2, SIDE / 2]], [2e7], SIDE, half=60)
+    light = np.minimum(clean[0] + star + spikes, 6e4)
+    light[(np.abs(column) < 1.5) & (np.abs(row) < 70)] = 5e4
+    none = np.zeros(light.shape, bool)
+    found = with_trails(light, bad_pixels.BadPixels(none, none, ()), 6e4)
+    assert "pixels of spikes of saturated stars" in found.notes[0] and len(found.notes) == 1
+    radius = np.hypot(row, column)
+    is_column = (np.abs(column) < 1.5) & (np.abs(row) < 65) & (radius > 30)
+    is_spike = (spikes > 60) & (radius > 30)
+    assert found.mask[is_spike].mean() > 0.85 and found.mask[is_column].mean() > 0.85
+    assert found.mask[(spikes < 5) & (np.abs(column) > 6)].mean() < 0.05
+    assert not found.mask[light == 6e4].any()
 
 
 # Bad pixels.

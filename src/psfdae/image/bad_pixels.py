@@ -89,6 +89,9 @@ def find_bad_pixels(
     leave_out(dead_pixels(image, mask, noise), "dead pixels")
     cosmic = cosmic_rays(image, mask, noise, saturate)
     leave_out(cosmic, "pixels of cosmic rays and hot pixels")
+    # Without these, what remains below the sky and shows no star received no light.
+    if (unexposed := unexposed_area(image, mask)) is not None:
+        leave_out(unexposed[1], f"pixels that are not exposed (level {unexposed[0]:.4g})")
     return BadPixels(mask, cosmic, tuple(notes))
 
 
@@ -294,6 +297,79 @@ def overscan(
             areas.append((key, area))
             excluded |= area
     return areas
+
+
+# Areas that receive no light.
+
+
+def unexposed_area(
+    image: np.ndarray, bad: np.ndarray, side: int = 8
+) -> tuple[float, np.ndarray] | None:
+    """Find the area outside of the image circle or a field stop, of any shape, and its soft edge.
+
+    In squares of `side` pixels, such an area has one level, no stars, and less noise than the
+    sky. The other squares are far above it and have about one level, too: those of stars,
+    galaxies and nebulae on an empty sky do not.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    side : int
+        Side of the squares in px.
+
+    Returns
+    -------
+    level : float
+        Level of the area, in counts.
+    area : ndarray of bool, shape (h, w)
+        Its pixels. Instead of the two, None if there is no such area.
+    """
+    from scipy import ndimage
+
+    # Mean of each square, and σ from the differences of neighbours: σ² = ⟨(x₁ − x₂)²⟩/2.
+    rows, columns = (n // side for n in image.shape)
+    inner = np.s_[: rows * side, : columns * side]
+    squares = np.ma.array(image, mask=bad)[inner].reshape(rows, side, columns, side)
+    mean = squares.mean(axis=(1, 3)).filled(np.inf)
+    noise = np.sqrt(np.square(np.diff(squares, axis=3)).mean(axis=(1, 3)).filled(np.inf) / 2.0)
+    has_values = np.isfinite(mean + noise)
+    if np.count_nonzero(has_values) < 64:
+        return None
+    # Level and σ of the darkest squares, of which 16 may be damaged, and all squares within σ.
+    is_dark = has_values & (mean <= np.partition(mean, 16, axis=None)[16])
+    for _ in range(3):
+        level, sigma = (float(np.median(values[is_dark])) for values in (mean, noise))
+        is_dark = has_values & (np.abs(mean - level) < sigma)
+    # The area of these squares, with holes where it has stars; the part of it that is away from its
+    # border; and the exposed squares, away from the border, too.
+    around = np.ones((5, 5), dtype=bool)
+    area = ndimage.binary_closing(np.pad(is_dark | ~has_values, 5, mode="edge"), around)
+    area = ndimage.binary_opening(area, around[:3, :3])[5:-5, 5:-5] & has_values
+    inside = ndimage.binary_erosion(area, around[:3, :3], border_value=1)
+    exposed = has_values & ~ndimage.binary_dilation(area, around)
+    if min(np.count_nonzero(area), np.count_nonzero(exposed)) < 16 or not inside.any():
+        return None
+    sky, sky_noise = (float(np.median(values[exposed])) for values in (mean, noise))
+    spread, sky_spread = (float(robust_scatter(mean[part])) for part in (area, exposed))
+    has_one_level = spread < 0.5 * sigma and sky_spread < 0.25 * (sky - level)
+    is_darker = sigma < 0.7 * sky_noise and sky - level > 3.0 * sigma
+    if not (has_one_level and is_darker and is_dark[inside].mean() > 0.98):
+        return None
+    # From squares to pixels: connected means of 5 × 5 px below half of the darkest sky.
+    half_level = 0.5 * (level + float(np.percentile(mean[exposed], 10)))
+    core = np.zeros(image.shape, dtype=bool)
+    core[inner] = np.kron(area | is_dark, np.ones((side, side), dtype=bool))
+    smooth = ndimage.uniform_filter(interpolated(image, bad)[0], 5)
+    core = ndimage.binary_propagation(core, mask=core | (smooth < half_level))
+    # Level at each distance from these, in steps of 2 px. The edge ends where it is straight within
+    # half the noise of a pixel over 32 px, as meshes of the sky follow it.
+    step = np.ceil(ndimage.distance_transform_edt(~core) / 2.0)
+    profile = ndimage.median(image, np.where(bad, -1.0, step), np.arange(1, 81))
+    bend = np.abs(profile[16:] - 2.0 * profile[8:-8] + profile[:-16])
+    edge_steps = np.append(bend < 0.5 * sky_noise, True).argmax() + 1
+    return level, ~bad & (step <= edge_steps)
 
 
 # Single pixels.

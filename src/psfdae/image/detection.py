@@ -8,7 +8,6 @@ photutils finds them: sources are connected pixels above the sky (Bertin & Arnou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -16,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from psfdae.image.interpolation import interpolated
-from psfdae.image.sky_level import SkyLevel, sky_level
+from psfdae.image.sky_level import NO_STRUCTURE, SkyLevel, SkyStructure, sky_level
 from psfdae.image.source_size import measure_size
 from psfdae.stars.moments import FWHM_OF_SIGMA, count_step
 
@@ -35,8 +34,7 @@ class Sky:
         Pixels that do not count.
     noise_scale : float
         Factor of the map of σ, NaN without one.
-    steps : tuple of two sequences of int
-        Rows and columns at which the level has a step.
+    structure : SkyStructure
     notes : tuple of str
         Sentences on what is unusual in the sky.
     count : float
@@ -48,7 +46,7 @@ class Sky:
     noise: np.ndarray
     bad: np.ndarray
     noise_scale: float
-    steps: tuple[Sequence[int], Sequence[int]] = ((), ())
+    structure: SkyStructure = NO_STRUCTURE
     notes: tuple[str, ...] = ()
     count: float = 0.0
     least_px: ClassVar[int] = 5
@@ -184,6 +182,7 @@ def sky_of(
     sigma: np.ndarray | None = None,
     least_noise: float = 0.0,
     measured: SkyLevel | None = None,
+    structure: SkyStructure | None = None,
     count: float | None = None,
 ) -> Sky:
     """Return an image without its sky, and what was subtracted.
@@ -199,6 +198,8 @@ def sky_of(
         The noise is nowhere below this.
     measured : SkyLevel, optional
         Sky of the image, if it was measured before.
+    structure : SkyStructure, optional
+        Structure of the sky, if it is known from the image with its stars.
     count : float, optional
         Step of the pixels if they are whole counts; by default the pixels show it.
 
@@ -210,8 +211,8 @@ def sky_of(
     # Level and noise by the pixels that count.
     count = count_step(np.where(bad, np.nan, image)) if count is None else count
     image = np.where(bad, 0.0, image)
-    sky = sky_level(image, bad, count=count) if measured is None else measured
-    level, noise, steps, notes = sky
+    sky = sky_level(image, bad, structure, count=count) if measured is None else measured
+    level, noise, structure, notes = sky
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
     noise = np.maximum(noise, least_noise, out=noise)
@@ -222,4 +223,4 @@ def sky_of(
         # Bad pixels, of which the map may have no σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
     flat = interpolated((image - level).astype(np.float32), bad)[0]
-    return Sky(flat, level, noise, bad, scale, steps, notes, count)
+    return Sky(flat, level, noise, bad, scale, structure, notes, count)

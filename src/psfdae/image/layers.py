@@ -194,7 +194,7 @@ class Layers:
                     # In the unit of the file, which messages have.
                     counts = image / self.image.unit_factor
                     bad_pixels = find_bad_pixels(counts, masked, self.image.headers, self.saturate)
-                    self._bad_pixels.append(with_trails(image, bad_pixels))
+                    self._bad_pixels.append(with_trails(counts, bad_pixels, self.saturate))
             except ClippedSkyError as error:
                 raise ObservationError(self.image.path, str(error)) from None
         return self._bad_pixels[0]

@@ -21,6 +21,25 @@ from psfdae.image.interpolation import interpolated
 from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
 
 
+class SkyStructure(NamedTuple):
+    """Places at which the level of a sky changes within few pixels.
+
+    Attributes
+    ----------
+    rows, columns : sequence of int
+        Rows and columns at which the level has a step.
+    is_fine : bool
+        True if the level changes within a mesh: where it does, it is a median of the pixels around.
+    """
+
+    rows: Sequence[int] = ()
+    columns: Sequence[int] = ()
+    is_fine: bool = False
+
+
+NO_STRUCTURE = SkyStructure()
+
+
 class SkyLevel(NamedTuple):
     """Sky of an image.
 
@@ -28,22 +47,21 @@ class SkyLevel(NamedTuple):
     ----------
     level, noise : ndarray, shape (h, w), float32
         Level and σ of the sky at each pixel.
-    steps : tuple of two sequences of int
-        Rows and columns at which the level has a step.
+    structure : SkyStructure
     notes : tuple of str
         Sentences on what is unusual in the sky.
     """
 
     level: np.ndarray
     noise: np.ndarray
-    steps: tuple[Sequence[int], Sequence[int]]
+    structure: SkyStructure
     notes: tuple[str, ...]
 
 
 def sky_level(
     image: np.ndarray,
     bad: np.ndarray,
-    steps: tuple[Sequence[int], Sequence[int]] | None = None,
+    structure: SkyStructure | None = None,
     mesh_px: int = 64,
     count: float | None = None,
 ) -> SkyLevel:
@@ -55,8 +73,8 @@ def sky_level(
         Finite.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
-    steps : tuple of two sequences of int, optional
-        Rows and columns at which the sky has steps, if they were found before.
+    structure : SkyStructure, optional
+        Structure of the sky, if it was found before: in the same image with its stars.
     mesh_px : int
         Side of the squares in which the sky is measured.
     count : float, optional
@@ -70,14 +88,14 @@ def sky_level(
     # Medians of whole counts are those of the counts before rounding.
     count = count_step(np.where(bad, np.nan, image)) if count is None else count
     image, dither_variance = dither(image, count)
-    if steps is None:
-        steps = sky_steps(image, bad, axis=0), sky_steps(image, bad, axis=1)
+    if structure is None:
+        structure = SkyStructure(sky_steps(image, bad, axis=0), sky_steps(image, bad, axis=1))
     notes = []
-    for name, lines in zip(("row", "column"), steps, strict=True):
+    for name, lines in zip(("row", "column"), structure[:2], strict=True):
         if lines:
             lines_text = ", ".join(map(str, lines))
             notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
-    level, noise, share = level_and_noise(image, bad, steps, mesh_px)
+    level, noise, share = level_and_noise(image, bad, structure, mesh_px)
     if share:
         notes.append(
             f"the sky has structure within {mesh_px} px in {100 * share:.0f} % of the image: "
@@ -94,30 +112,30 @@ def sky_level(
             f"with offsets: that of sums of pixels is {correlation:.2f} times as large, and errors "
             "are of sums"
         )
-    return SkyLevel(level, noise, steps, tuple(notes))
+    return SkyLevel(level, noise, structure._replace(is_fine=share > 0), tuple(notes))
 
 
 def level_and_noise(
     image: np.ndarray,
     bad: np.ndarray,
-    steps: tuple[Sequence[int], Sequence[int]],
+    structure: SkyStructure,
     mesh_px: int = 64,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return level and σ (h, w) of the sky at known steps, and the part of it that has structure.
+    """Return level and σ (h, w) of a sky of known steps, and the part of it with fine structure.
 
     The noise is that of single pixels; parameters are those of `sky_level`.
     """
     # Each part between steps has meshes of its own. Single precision: of a large image, each map
     # takes much memory.
     level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
-    rows, columns = steps
+    rows, columns, is_fine = structure
     for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
-            if not bad[part].all() or not any(steps):
+            if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
     # Structure that is finer than the meshes.
-    return _with_structure(image, bad, level, noise, mesh_px)
+    return _with_structure(image, bad, level, noise, mesh_px, is_fine)
 
 
 # Noise of pixels and of sums of pixels.
@@ -336,12 +354,17 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
 
 
 def _with_structure(
-    image: np.ndarray, bad: np.ndarray, level: np.ndarray, noise: np.ndarray, mesh_px: int
+    image: np.ndarray,
+    bad: np.ndarray,
+    level: np.ndarray,
+    noise: np.ndarray,
+    mesh_px: int,
+    is_known: bool,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return level and noise (h, w) of a sky with its structure, and the part of it that has some.
 
-    They are those of the meshes, and the part is 0, unless over 5 % of the image has structure that
-    is not that of the sources.
+    They are those of the meshes, and the part is 0, unless the sky is known to have structure, or
+    over 5 % of the image has structure that is not that of the sources.
 
     Parameters
     ----------
@@ -351,6 +374,8 @@ def _with_structure(
         Level and σ in meshes; the level is changed in place.
     mesh_px : int
         Side of these meshes.
+    is_known : bool
+        True if the sky is known to have structure.
     """
     # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
     # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
@@ -361,8 +386,10 @@ def _with_structure(
     ratio = ratio[~bad[sample] & (ratio > 0)]
     typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
     share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
-    structure = median_level(image - level, bad) if share > 0.05 else None
-    if structure is None or not sources_stay(image - level, structure, bad, pixel_sigma):
+    structure = median_level(image - level, bad) if is_known or share > 0.05 else None
+    if structure is None or not (
+        is_known or sources_stay(image - level, structure, bad, pixel_sigma)
+    ):
         return level, noise, 0.0
     weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad, mesh_px)
     level += weight * structure

@@ -1,6 +1,6 @@
-"""Trails of satellites and aeroplanes: long, straight, narrow, and about as bright all along.
+"""Trails of satellites and aeroplanes, and spikes of saturated stars: straight and narrow light.
 
-In: an image and its bad pixels. Out: bad pixels with those of trails.
+In: an image and its bad pixels. Out: bad pixels with those of trails and spikes.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from psfdae.image.bad_pixels import BadPixels
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, sky_level
+from psfdae.stars.moments import SIGMA_OF_MAD
 
 
 class Line(NamedTuple):
@@ -31,8 +32,10 @@ class Line(NamedTuple):
         return np.asarray(x * np.cos(self.angle_rad) + y * np.sin(self.angle_rad))
 
 
-def with_trails(image: np.ndarray, bad_pixels: BadPixels) -> BadPixels:
-    """Return the bad pixels of an image (h, w) with those of trails.
+def with_trails(
+    image: np.ndarray, bad_pixels: BadPixels, saturate: float | None = None
+) -> BadPixels:
+    """Return the bad pixels of an image (h, w) with those of trails and spikes.
 
     Without a trail, they are returned with the sky of the image, which was measured to find one,
     unless the image is so large that its means over squares were searched. They are returned as
@@ -43,36 +46,124 @@ def with_trails(image: np.ndarray, bad_pixels: BadPixels) -> BadPixels:
     image : ndarray, shape (h, w)
     bad_pixels : BadPixels
         Bad pixels of other kinds, which are left out of the search.
+    saturate : float, optional
+        Counts from which a pixel is saturated; without it, no spikes are searched.
     """
+    from astropy.nddata import block_reduce, block_replicate
+    from scipy import ndimage
+
     if min(image.shape) < 100:
         return bad_pixels
-    # Of large images, means of squares are enough: a side has 1000 to 2000 of them.
-    size = min(image.shape) // 1000
+    # Of large images, means of the good pixels in squares are enough: a side has 1000 to 2000.
+    size = max(min(image.shape) // 1000, 1)
     values, hidden = image, bad_pixels.mask
     if size > 1:
-        rows, columns = (n // size for n in image.shape)
-        # Mean of the good pixels of each square; a square without any is bad.
-        squares = rows, size, columns, size
-        good = np.where(hidden, 0.0, image)[: rows * size, : columns * size]
-        count = (~hidden[: rows * size, : columns * size]).reshape(squares).sum(axis=(1, 3))
-        values = good.reshape(squares).sum(axis=(1, 3)) / np.maximum(count, 1)
-        hidden = count == 0
+        values = block_reduce(np.where(hidden, np.nan, image), size, np.nanmean)
+        hidden = np.isnan(values)
+    # Saturated cores stay as they are, so that these stars are known to be saturated.
+    is_saturated = (values >= saturate) & ~hidden if saturate else np.zeros_like(hidden)
+    is_core = ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
     values = np.where(hidden, 0.0, values)
     try:
         sky = sky_level(values, hidden)
     except ValueError:  # no mesh has enough good pixels
         return bad_pixels
-    trails, number = find_trails(values, hidden, sky)
-    if not number:
+    spikes = find_spikes(values, hidden, sky, is_saturated) & ~is_core
+    trails, number = find_trails(values, hidden | spikes | is_core, sky)
+    if not (number or spikes.any()):
         return bad_pixels if size > 1 else replace(bad_pixels, sky=sky)
-    # From squares back to pixels; those of the last rows and columns are in none.
-    mask = np.zeros(image.shape, dtype=bool)
-    large = np.kron(trails, np.ones((max(size, 1), max(size, 1)), dtype=bool))
-    mask[: large.shape[0], : large.shape[1]] = large
-    mask &= ~bad_pixels.mask
+    mask, notes = bad_pixels.mask.copy(), list(bad_pixels.notes)
     words = "a trail" if number == 1 else f"{number} trails"
-    note = f"{np.count_nonzero(mask)} pixels of {words} of satellites"
-    return replace(bad_pixels, mask=bad_pixels.mask | mask, notes=(*bad_pixels.notes, note))
+    for squares, kind in (spikes, "spikes of saturated stars"), (trails, f"{words} of satellites"):
+        # From squares back to pixels; those of the last rows and columns are in none.
+        large = block_replicate(squares, size, conserve_sum=False)
+        new = np.pad(large, [(0, n - m) for n, m in zip(mask.shape, large.shape, strict=True)])
+        new &= ~mask
+        mask |= new
+        if new.any():
+            notes.append(f"{np.count_nonzero(new)} pixels of {kind}")
+    return replace(bad_pixels, mask=mask, notes=tuple(notes))
+
+
+def find_spikes(
+    image: np.ndarray, bad: np.ndarray, sky: SkyLevel, is_saturated: np.ndarray
+) -> np.ndarray:
+    """Find light that runs straight outwards from the cores of saturated stars.
+
+    These are the spikes of diffraction, of any number and direction, and the charge that runs
+    along columns: along a ray from the core, they are brighter than the halo for at least 24 px.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    sky : SkyLevel
+        Sky of the image.
+    is_saturated : ndarray of bool, shape (h, w)
+
+    Returns
+    -------
+    ndarray of bool, shape (h, w)
+    """
+    from scipy import ndimage
+    from skimage.transform import warp_polar
+
+    spikes = np.zeros(image.shape, dtype=bool)
+    snr = smooth_light(image, bad, sky) / sky.noise
+    part_px, angles, parts = 8, 720, 32
+    for x, y, core_px in saturated_cores(is_saturated):
+        middle = y, x
+        first = int(2.0 * core_px / part_px) + 1
+        # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
+        rays = warp_polar(
+            snr, middle, radius=part_px * parts, output_shape=(angles, part_px * parts), cval=np.nan
+        )
+        light = np.ma.masked_invalid(rays.reshape(angles, parts, part_px).mean(axis=2))
+        light -= np.ma.median(light, axis=0)
+        # Parts with light: 0.6 σ is three times the noise of a part; halos are uneven.
+        scatter = SIGMA_OF_MAD * np.ma.median(np.abs(light), axis=0)
+        is_light = (light > np.maximum(4.0 * scatter, 0.6)).filled(False)
+        # A ray ends at the last part with light, of which three of four from the core on have some.
+        is_light = is_light[:, first:]
+        share = np.cumsum(is_light, axis=1) / np.arange(1, parts - first + 1)
+        length = ((is_light & (share >= 0.75)) * np.arange(1, parts - first + 1)).max(axis=1)
+        end_px = np.where(length >= 3, first + length, 0) * part_px
+        # Pixels of these rays outside of the core.
+        row, column = np.indices(image.shape) - np.array(middle)[:, None, None]
+        ray = (np.arctan2(row, column) % (2.0 * np.pi) * angles / (2.0 * np.pi)).astype(
+            int
+        ) % angles
+        radius = np.hypot(row, column)
+        spikes |= (radius < end_px[ray]) & (radius > first * part_px)
+    return np.asarray(ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
+
+
+def saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
+    """Return middles and radii of the cores of saturated stars: x, y and r in px, (k, 3).
+
+    A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The middle
+    is where it is widest, wherever its charge runs.
+    """
+    from scipy import ndimage
+
+    label, _ = ndimage.label(is_saturated, np.ones((3, 3)))
+    boxes, area = ndimage.find_objects(label), np.bincount(label.ravel())[1:]
+    largest = np.argsort(-area, kind="stable")[: min(50, np.count_nonzero(area >= 4))]
+    cores = np.empty((len(largest), 3))
+    for core, index in zip(cores, largest, strict=True):
+        # Distance of each pixel from the edge of the core; those as far as the farthest.
+        depth = ndimage.distance_transform_edt(np.pad(label[boxes[index]] == index + 1, 1))[1:, 1:]
+        row, column = np.argwhere(depth == depth.max()).mean(axis=0)
+        core[:] = column + boxes[index][1].start, row + boxes[index][0].start, depth.max()
+    return cores
+
+
+def smooth_light(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> np.ndarray:
+    """Return an image (h, w) above its sky, smoothed by 3 × 3 px: its noise is σ/3."""
+    from scipy import ndimage
+
+    return np.asarray(ndimage.uniform_filter(interpolated(image - sky.level, bad)[0], 3))
 
 
 def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.ndarray, int]:
@@ -96,20 +187,21 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
 
     mask, count = np.zeros(image.shape, dtype=bool), 0
     shortest_px = max(100, min(image.shape) // 6)
-    # The image above its sky, smoothed by 3 × 3 pixels: noise σ/3.
-    flat = ndimage.uniform_filter(interpolated(image - sky.level, bad)[0], 3)
-    noise = sky.noise / 3.0
-    bright = (flat > 4.0 * noise) & ~bad
-    # Connected pixels that reach as far as a trail; a line is searched in each until none is left.
-    label, _ = ndimage.label(bright, np.ones((3, 3)))
-    for number, box in enumerate(ndimage.find_objects(label), 1):
-        if np.hypot(*(part.stop - part.start for part in box)) < shortest_px:
-            continue
+    flat, noise = np.where(bad, 0.0, smooth_light(image, bad, sky)), sky.noise / 3.0
+    # Connected pixels that may be a part of a trail, the longest 20 of them; a line is searched in
+    # each, off the trails so far, until none is left.
+    label, _ = ndimage.label(flat > 4.0 * noise, np.ones((3, 3)))
+    boxes = ndimage.find_objects(label)
+    length = np.array([np.hypot(*(part.stop - part.start for part in box)) for box in boxes])
+    for index in np.argsort(-length, kind="stable")[:20]:
         # Pixels of this source, counted from the corner of the image.
-        row, column = np.nonzero(label[box] == number)
+        box = boxes[index]
+        row, column = np.nonzero((label[box] == index + 1) & ~mask[box])
         row, column = row + box[0].start, column + box[1].start
         for _ in range(4):
-            trail = trail_on_line(line_through(column, row), flat, noise, bright, shortest_px)
+            if min(length[index], len(row)) < shortest_px / 4:
+                break
+            trail = trail_on_line(line_through(column, row), flat, noise, shortest_px)
             if trail is None:
                 break
             mask |= trail
@@ -117,8 +209,6 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
             # Another trail may cross it: the pixels off this one are searched again.
             is_left = ~trail[row, column]
             row, column = row[is_left], column[is_left]
-            if len(row) < shortest_px:
-                break
     return mask, count
 
 
@@ -158,7 +248,7 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
 
 
 def trail_on_line(
-    line: Line, flat: np.ndarray, noise: np.ndarray, bright: np.ndarray, shortest_px: int
+    line: Line, flat: np.ndarray, noise: np.ndarray, shortest_px: int
 ) -> np.ndarray | None:
     """Return the pixels (h, w) of the trail on a line; None if there is none.
 
@@ -167,21 +257,22 @@ def trail_on_line(
     line : Line
     flat, noise : ndarray, shape (h, w)
         Smoothed image without its sky, and its σ.
-    bright : ndarray of bool, shape (h, w)
-        Pixels far above the noise.
     shortest_px : int
         Least length of a trail.
     """
-    # Parts of the line, 8 px long, of which three of four pixels are bright.
+    # Pixels within 21 px of the line, and those in the middle of it.
+    height, width = flat.shape
+    row, column = np.nonzero(np.abs(line.across(np.arange(width), np.arange(height)[:, None])) < 21)
+    light, ring = flat[row, column], np.abs(line.across(column, row))
+    along = line.along(column, row)
+    middle = ring < 1.0
+    # Parts of the line, 8 px long, with a mean S/N of 2 in the middle: it is that of smoothed
+    # pixels, of which a mean has half the noise.
     part_px = 8
-    row, column = (np.asarray(places, np.float64) for places in np.indices(flat.shape))
-    across, along = line.across(column, row), line.along(column, row)
-    part = ((along - float(along.min())) / part_px).astype(int)
-    middle = np.abs(across) < 1.0
-    # Pixels of each part within 1 px of the line, and those of them that are bright.
-    pixels = np.bincount(part[middle], minlength=part.max() + 1)
-    is_bright = np.bincount(part[middle], bright[middle], minlength=len(pixels)) > 0.75 * pixels
-    is_bright &= pixels > 0
+    part = ((along - along.min()) / part_px).astype(int)
+    pixels = np.bincount(part[middle])
+    snr = light[middle] / noise[row, column][middle]
+    is_bright = (np.bincount(part[middle], snr) > 2.0 * pixels) & (pixels > 0)
     # The longest run of these, gaps of two parts closed.
     closed = (np.convolve(np.pad(is_bright, 2), np.ones(3), "same") > 0)[2:-2]
     edges = np.flatnonzero(np.diff(np.pad(closed.astype(np.int8), 1)))
@@ -191,20 +282,26 @@ def trail_on_line(
     start, end = int(edges[2 * longest]), int(edges[2 * longest + 1])
     if (end - start) * part_px < shortest_px or is_bright[start:end].mean() < 0.85:
         return None
-    # Stars in a row have bright and dark parts; a trail is as bright all along.
-    heights = [np.median(flat[middle & (part == k)]) for k in range(start, end) if pixels[k]]
-    low, median_height = np.percentile(heights, [15, 50])
-    if low < 0.7 * median_height:
+    # Between stars in a row it is dark; a trail may be uneven, but has light all along: the lowest
+    # of the heights over 2 px in a part and the next one are a third of the highest, or more.
+    short_part = ((along - along.min())[middle] / 2.0).astype(int)
+    means = np.bincount(short_part, light[middle]) / np.maximum(np.bincount(short_part), 1)
+    heights = means[4 * start : 4 * (end - 1)].reshape(-1, 4)
+    low, high = np.percentile(np.hstack([heights[:-1], heights[1:]]), [15, 85], axis=1)
+    if np.median(low / high) < 0.3:
         return None
     # Half width: to where the median height is no more than half the noise of a pixel, σ/2 = 1.5
     # σ/3; a trail is narrower than 40 px, and than a tenth of its length, or it is a filament of a
     # nebula.
     inside = (part >= start) & (part < end)
-    ring = np.abs(across)
     for half_px in range(2, 20):
         # A strip of 1 px on either side at this distance.
         edge = inside & (ring >= half_px) & (ring < half_px + 1)
-        if edge.any() and np.median(flat[edge]) < 1.5 * np.median(noise[edge]):
-            is_narrow = (end - start) * part_px > 20 * half_px
-            return np.asarray(inside & (ring < half_px + 1)) if is_narrow else None
+        if edge.any() and np.median(light[edge]) < 1.5 * np.median(noise[row, column][edge]):
+            if (end - start) * part_px <= 20 * half_px:
+                return None
+            trail = np.zeros(flat.shape, dtype=bool)
+            is_trail = inside & (ring < half_px + 1)
+            trail[row[is_trail], column[is_trail]] = True
+            return trail
     return None

@@ -158,7 +158,7 @@ def photometry(
         fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux / unit))
         # At first, stars are no better known than to the error of the wings.
         sky, wing_light, wings = around_stars(
-            image, sky, error, fit.light, fluxes, side, wings, tolerance=0.1 if turn else 1.0
+            image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, saturated
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)

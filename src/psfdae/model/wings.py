@@ -26,6 +26,7 @@ from psfdae.base.errors import keyword
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import level_and_noise
+from psfdae.image.trails import saturated_cores
 from psfdae.stars.bright_stars import magnitude
 from psfdae.stars.moments import dither
 
@@ -487,6 +488,7 @@ def around_stars(
     stamp_px: int,
     earlier: Wings | None = None,
     tolerance: float = 0.1,
+    saturated: np.ndarray | None = None,
 ) -> tuple[Sky, np.ndarray, Wings | None]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
@@ -504,12 +506,15 @@ def around_stars(
         Wings with which the turns begin.
     tolerance : float
         Turns end when the light of the wings changes by less than this part of its error.
+    saturated : ndarray of bool, shape (h, w), optional
+        Saturated pixels.
 
     Returns
     -------
     sky : Sky
         Sky without wings; its `flat` is what is left without sky, stars and wings.
     light_of_wings : ndarray, shape (h, w)
+        With the halos of saturated cores without a fitted star.
     wings : Wings or None
     """
     # What is left beside the models has their errors, too.
@@ -517,10 +522,11 @@ def around_stars(
     without_stars = image - star_light
     wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
     light_of_wings = wing_light(image.shape, stars, wings)
-    # The sky without them, with its noise map if it has one.
-    has_noise_map = np.isfinite(sky.noise_scale)
-    noise_map = sky.noise if has_noise_map else None
-    sky = sky_of(without_stars - light_of_wings, sky.bad, noise_map, count=sky.count)
+    # The sky without them, of the same structure, and with its noise map if it has one.
+    sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
+    without_light = without_stars - light_of_wings
+    sky = sky_of(without_light, sky.bad, sigma_map, structure=sky.structure, count=sky.count)
+    del without_light
     # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
@@ -532,7 +538,57 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
+    # Saturated stars that are not fitted have halos, too.
+    middles = stars.place[stars.flux > 0]
+    for core in [] if saturated is None else saturated_cores(saturated):
+        if np.hypot(*(middles - core[:2]).T).min(initial=np.inf) > 2.0:
+            halo = halo_light(sky.flat, sky.bad, sigma, core)
+            light_of_wings += halo
+            sky = replace(sky, flat=sky.flat - halo)
     return sky, light_of_wings, wings
+
+
+def halo_light(
+    residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
+) -> np.ndarray:
+    """Return the light (h, w) around a saturated core: at each distance, the median.
+
+    It ends at the first ring of which the median is below five times its error, or at 256 px.
+
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (h, w)
+        Image without sky and stars, and σ of its pixels.
+    bad : ndarray of bool, shape (h, w)
+    core : ndarray, shape (3,)
+        Middle x, y and radius in px.
+    """
+    from scipy import ndimage
+
+    halo, (height, width) = np.zeros_like(residual), residual.shape
+    column, row = np.rint(core[:2]).astype(int)
+    rows = slice(max(row - 256, 0), min(row + 257, height))
+    window = rows, slice(max(column - 256, 0), min(column + 257, width))
+    y, x = np.mgrid[window]
+    radius = np.hypot(x - core[0], y - core[1])
+    # Rings wider by a tenth each; bad pixels are in none.
+    edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
+    ring = np.where(bad[window], 0, np.digitize(radius, edges))
+    numbers = np.unique(ring)[1:-1]
+    level, middle = (
+        ndimage.median(residual[window], ring, numbers),
+        ndimage.mean(radius, ring, numbers),
+    )
+    # The error of a median of n values is 1.25 σ/√n.
+    error = 1.25 * ndimage.mean(sigma[window], ring, numbers)
+    error /= np.sqrt(np.bincount(ring.ravel())[numbers])
+    # Between the rings it is a power of the distance.
+    count = int(np.logical_and.accumulate(level > 5.0 * error).sum())
+    if count:
+        log_level = np.log(level[:count])
+        power = np.interp(np.log(np.maximum(radius, 1.0)), np.log(middle[:count]), log_level)
+        halo[window] = np.where(radius <= middle[count - 1], np.exp(power), 0.0)
+    return halo
 
 
 def _wings_beside(
@@ -570,7 +626,7 @@ def _wings_beside(
             without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
             without_wings, _ = dither(without_wings, sky.count)
-            residual = without_stars - level_and_noise(without_wings, bad, sky.steps)[0]
+            residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
             # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
             # small.
             residual -= wing_light(bad.shape, unlike_psf, previous)
