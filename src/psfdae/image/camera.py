@@ -244,12 +244,12 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     if not levels:
         return None
     # Bands begin at even rows. Stars count as 3 σ; medians would be the same for most whole counts.
-    joined = np.concatenate(deviations)
-    is_white = np.indices(joined.shape).sum(axis=0) % 2 == 0
-    white, black = (np.clip(joined[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
+    bands = np.concatenate(deviations)
+    is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
+    white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
     checker = float(np.nanmean(white) - np.nanmean(black))
     # Resampled pixels share noise: sums of them scatter by more than independent ones.
-    noise = noise_correlation(joined) * float(np.median(noises))
+    noise = noise_correlation(bands) * float(np.median(noises))
     return SkySample(float(np.median(levels)), noise, highest, checker)
 
 
