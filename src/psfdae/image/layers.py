@@ -192,9 +192,10 @@ class Layers:
             try:
                 with silent():
                     # In the unit of the file, which messages have.
-                    counts = image / self.image.unit_factor
-                    bad_pixels = find_bad_pixels(counts, masked, self.image.headers, self.saturate)
-                    self._bad_pixels.append(with_trails(counts, bad_pixels, self.saturate))
+                    unit, saturate = self.image.unit_factor, self.saturate
+                    bad_pixels = find_bad_pixels(image / unit, masked, self.image.headers, saturate)
+                    limit = None if saturate is None else saturate * unit
+                    self._bad_pixels.append(with_trails(image, bad_pixels, limit))
             except ClippedSkyError as error:
                 raise ObservationError(self.image.path, str(error)) from None
         return self._bad_pixels[0]
