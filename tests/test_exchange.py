@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import pickle
 
 import numpy as np
@@ -14,6 +15,7 @@ from photutils.psf import GriddedPSFModel
 from command_line import printed, psfdae, refused
 from psfdae import Error, load_model
 from psfdae.model import exchange
+from psfdae.model.bundle import name_foreign_format
 from psfdae.model.exchange import PsfexField, load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 
@@ -284,3 +286,12 @@ def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
 def test_files_that_others_cannot_read_are_refused(psfex, tmp_path, name, words, message):
     assert message in refused("psf", psfex, *words, "--out", tmp_path / name)
     assert list(tmp_path.iterdir()) == [psfex]
+
+
+@pytest.mark.parametrize("length", range(8, 1024, 8))
+def test_no_model_of_psfdae_is_taken_for_another_format(tmp_path, length):
+    """A safetensors file begins with the length of its header, a multiple of 8."""
+    header = json.dumps({"__metadata__": {}}).encode()[:length].ljust(length)
+    path = tmp_path / "model.psf.safetensors"
+    path.write_bytes(length.to_bytes(8, "little") + header)
+    assert name_foreign_format(path) == ""

@@ -247,8 +247,8 @@ def test_a_model_is_replaced_on_request_only(training, tmp_path):
     assert set(out.rglob("*")) == bytes_before.keys()
 
 
-def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp_path, monkeypatch):
-    """The bundle comes last, after the page, and says that all is there."""
+def test_a_killed_command_leaves_no_output_and_is_repeated(training, tmp_path, monkeypatch):
+    """All outputs get their names at the end, the bundle last."""
     out, page = tmp_path / "model", tmp_path / "page.html"
     shutil.copytree(training.out, out)
     bundle_file = out / training.bundle.name
@@ -269,9 +269,8 @@ def test_a_killed_command_leaves_no_bundle_and_overwrites_the_rest(training, tmp
         run(*words)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    assert not bundle_file.exists() and page.exists()
-    assert f"{page}: exists already" in refused("from-stars", *words)
-    process = run(*words, "--overwrite")
+    assert not bundle_file.exists() and not page.exists()
+    process = run(*words)
     assert process.exit_code == 0, process.output
     assert bundle_file.read_bytes() == training.bundle.read_bytes()
 

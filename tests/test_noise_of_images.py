@@ -203,7 +203,7 @@ def test_offsets_of_rows_or_columns_are_in_the_noise_of_stars(axis, offset):
     noise = rng.normal(0, 10.0, (300, 300)) + rng.normal(0, 10.0 * offset, shape)
     sky = sky_of(200.0 + noise, np.zeros(noise.shape, bool))
     assert any("rows or columns" in note for note in sky.notes)
-    assert sky.steps == ([], [])
+    assert sky.structure[:2] == ([], [])
     # A PSF with a FWHM of 3 px on many noises: Σ p n over Σ p² is the flux of a star.
     kernel = np.exp(-0.5 * (np.arange(-8, 9) / (3.0 / 2.355)) ** 2)
     psf = np.outer(kernel, kernel) / kernel.sum() ** 2

@@ -81,6 +81,9 @@ OTHER_FORMATS = {
 
 def name_other_format(start: bytes) -> str:
     """Return ", but " and the name of a format by the first bytes of its files, or ""."""
+    # The first number of a safetensors file, the length of its header, may be any byte.
+    if start[8:9] == b"{":
+        return ""
     start = b"".join(start.split())
     names = (name for magic, name in OTHER_FORMATS.items() if start.startswith(magic))
     return next((f", but {name}" for name in names), "")

@@ -119,7 +119,9 @@ def find_spikes(
         rays = warp_polar(
             snr, middle, radius=part_px * parts, output_shape=(angles, part_px * parts), cval=np.nan
         )
-        light = np.ma.masked_invalid(rays.reshape(angles, parts, part_px).mean(axis=2))
+        # The lower quartile of a part: it is dark between stars in a row, and not along a spike.
+        quartile = np.percentile(rays.reshape(angles, parts, part_px), 25, axis=2)
+        light = np.ma.masked_invalid(quartile)
         light -= np.ma.median(light, axis=0)
         # Parts with light: 0.6 σ is three times the noise of a part; halos are uneven.
         scatter = SIGMA_OF_MAD * np.ma.median(np.abs(light), axis=0)
@@ -129,13 +131,15 @@ def find_spikes(
         share = np.cumsum(is_light, axis=1) / np.arange(1, parts - first + 1)
         length = ((is_light & (share >= 0.75)) * np.arange(1, parts - first + 1)).max(axis=1)
         end_px = np.where(length >= 3, first + length, 0) * part_px
-        # Pixels of these rays outside of the core.
-        row, column = np.indices(image.shape) - np.array(middle)[:, None, None]
-        ray = (np.arctan2(row, column) % (2.0 * np.pi) * angles / (2.0 * np.pi)).astype(
-            int
-        ) % angles
+        # Pixels of these rays outside of the core, in a window about it.
+        reach, (height, width) = part_px * parts, image.shape
+        rows = slice(max(int(y) - reach, 0), min(int(y) + reach + 1, height))
+        window = rows, slice(max(int(x) - reach, 0), min(int(x) + reach + 1, width))
+        row, column = np.mgrid[window] - np.array(middle)[:, None, None]
+        turns = np.arctan2(row, column) / (2.0 * np.pi) % 1.0
+        ray = (turns * angles).astype(int) % angles
         radius = np.hypot(row, column)
-        spikes |= (radius < end_px[ray]) & (radius > first * part_px)
+        spikes[window] |= (radius < end_px[ray]) & (radius > first * part_px)
     return np.asarray(ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
 
 
@@ -288,7 +292,7 @@ def trail_on_line(
     means = np.bincount(short_part, light[middle]) / np.maximum(np.bincount(short_part), 1)
     heights = means[4 * start : 4 * (end - 1)].reshape(-1, 4)
     low, high = np.percentile(np.hstack([heights[:-1], heights[1:]]), [15, 85], axis=1)
-    if np.median(low / high) < 0.3:
+    if np.median(low / np.maximum(high, 1e-30)) < 0.3:
         return None
     # Half width: to where the median height is no more than half the noise of a pixel, σ/2 = 1.5
     # σ/3; a trail is narrower than 40 px, and than a tenth of its length, or it is a filament of a
