@@ -27,7 +27,7 @@ from psfdae.model.bundle import BundleError
 from psfdae.model.neighbours import light_of_others
 from psfdae.model.photon_noise import measure_gain, with_measured_gain
 from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import StarFluxes, Wings, tented_light, wings_of
+from psfdae.model.wings import StarFluxes, Wings, draw_tents, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, FRAME = 330, 200.0, 10, 61
@@ -186,7 +186,7 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     outer_part = np.full(30, 0.03)
     true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
     stars = StarFluxes(place, flux, outer_part)
-    bands = tented_light((300, 300), stars, true)
+    bands = draw_tents((300, 300), stars, true)
     tented = np.concatenate([light for _, light in bands], axis=1)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
@@ -210,7 +210,7 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
 def test_the_light_of_wings_is_the_sum_over_pixels():
     wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
     star = StarFluxes(np.array([[40.3, 40.1]]), np.ones(1), np.ones(1))
-    bands = tented_light((81, 81), star, wings)
+    bands = draw_tents((81, 81), star, wings)
     total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in bands)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]

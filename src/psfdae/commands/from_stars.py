@@ -41,13 +41,7 @@ from psfdae.model.fitting import (
     pack_model,
     worth_trying,
 )
-from psfdae.model.settings import (
-    DATASET_CHOICE,
-    Settings,
-    SettingsReader,
-    of_config,
-    with_keywords,
-)
+from psfdae.model.settings import DATASET_CHOICE, Settings, SettingsReader, of_config, with_keywords
 from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
 
@@ -391,9 +385,8 @@ def write_model(
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]
             exposure_model.save(files.bundle_of(exposure.name))
-            change = (
-                "get the model of all" if exposure_model is model else "change the field of all"
-            )
+            is_adapted = exposure_model is not model
+            change = "change the field of all" if is_adapted else "get the model of all"
             print(f"{exposure.name}: {len(exposure)} stars {change}")
         # Stars that no fit has seen, degraded to low S/N, test the model.
         print("testing on the stars held out")

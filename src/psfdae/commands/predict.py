@@ -124,8 +124,8 @@ def predict_command(
         name = error.filename or out
         raise PredictionError(f"{name}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
-    unlike = int(flag_counts[[*StarFlag].index(StarFlag.UNLIKE_TRAINING)])
-    lines = [observation.summary(), list_note, *notes_on_model(loaded, observation, unlike)]
+    unlike_count = int(flag_counts[[*StarFlag].index(StarFlag.UNLIKE_TRAINING)])
+    lines = [observation.summary(), list_note, *notes_on_model(loaded, observation, unlike_count)]
     lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
     flagged = zip(StarFlag, flag_counts, strict=True)
     lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]

@@ -22,10 +22,10 @@ from psfdae.base.progress import Advance
 from psfdae.methods.field_spline import (
     FieldModel,
     adjust_stars,
+    compute_relative_light,
     deform_splines,
     draw_splines,
     field_terms,
-    light_by_phase,
     solve_splines,
     spacing_of,
 )
@@ -301,7 +301,7 @@ class FieldFitter:
             # Each star has the sum 1 in the middle of its stamp, and as much light at every phase:
             # fluxes and splines could change with position and phase against each other (eq. 1a).
             in_middle = draw_splines(splines, sides, np.zeros((1, 2)), spacing)
-            light = light_by_phase(splines, np.zeros(1), centre, spacing)
+            light = compute_relative_light(splines, np.zeros(1), centre, spacing)
             light *= in_middle.sum(axis=(1, 2), keepdims=True)
             flux, star_images = flux * light[:, 0, 0], star_images / light
             residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)

@@ -79,7 +79,7 @@ class FieldModel:
         axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
         splines = np.tensordot(terms, self.coefficients, 1)
         # Pixels that are whole pixels apart have the same phase, and the same factor (eq. 1a).
-        light = light_by_phase(splines, axis[:oversampling], centre, self.spacing)
+        light = compute_relative_light(splines, axis[:oversampling], centre, self.spacing)
         phase = np.arange(count) % oversampling
         images = draw_splines(splines, axis, centre, self.spacing)
         return np.asarray(images / light[:, phase[:, None], phase])
@@ -173,7 +173,7 @@ def draw_splines(
     return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
 
 
-def light_by_phase(
+def compute_relative_light(
     splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
 ) -> np.ndarray:
     """Return the light of a star that has whole pixels at some phases, over that in the middle.

@@ -74,7 +74,7 @@ class Bundle:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle and copy what a file has."""
-        return bundle_from_arrays, (self.info, bundle_arrays(self))
+        return build_bundle, (self.info, bundle_arrays(self))
 
     @cached_property
     def sha256(self) -> str:
@@ -295,10 +295,10 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, arrays, path)
-    return bundle_from_arrays(info, arrays)
+    return build_bundle(info, arrays)
 
 
-def bundle_from_arrays(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> Bundle:
+def build_bundle(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> Bundle:
     """Return a bundle from its description and the arrays of its file (`bundle_arrays`)."""
     # Groups of arrays, without their prefix, make the parts of the bundle.
     flux, errors, weights = (

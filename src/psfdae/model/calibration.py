@@ -384,9 +384,7 @@ def with_misfit(
     return replace(bundle, info=info.model_copy(update={"misfit": best_misfit}))
 
 
-def crossed_coverage(
-    errors: StarErrors,
-) -> Callable[[np.ndarray, float], dict[str, float]]:
+def crossed_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[str, float]]:
     """Return a function that tells how many errors are within half-widths of other stars.
 
     Parameters

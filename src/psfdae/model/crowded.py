@@ -18,7 +18,7 @@ from psfdae.base.progress import steps
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.flux_model import is_faint
-from psfdae.model.joint_fit import JointFit, fit_stars, pairs_within
+from psfdae.model.joint_fit import JointFit, chains, fit_stars, pairs_within
 from psfdae.model.matched_filter import find_stars
 from psfdae.model.photon_noise import pixel_error
 from psfdae.model.psf_grid import PsfGrid
@@ -26,9 +26,9 @@ from psfdae.model.restoration import MAX_CHI2
 from psfdae.model.wings import (
     StarFluxes,
     Wings,
+    add_model_errors,
     aperture_correction,
     around_stars,
-    error_without_models,
     outer_shares,
 )
 
@@ -130,6 +130,8 @@ def photometry(
     # PSFs of the field, and lengths that follow from the PSF in its middle.
     psfs = PsfGrid.of(model, by_magnitude=True).times(unit)
     fwhm, side = model.fwhm_px(), model.stamp_px
+    # Side of the pixels that are fitted to a star, odd, about 1.6 FWHM.
+    box_px = 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
     x, y = np.rint(np.mean(model.field_range(), axis=0))
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
@@ -146,11 +148,11 @@ def photometry(
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.flat, observation.gain)
     # Positions of all stars that were found in residuals: each is tried once.
-    tried = np.empty((0, 2))
+    peaks = np.empty((0, 2))
     for turn in steps("photometry", range(MAX_TURNS)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
-        fit = fit_stars(psfs, without_wings, error, bad, place, flux, _box(fwhm), fwhm, origin)
+        fit = fit_stars(psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin)
         del without_wings, wing_light  # of a large image, each map takes much memory
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
@@ -164,7 +166,7 @@ def photometry(
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
         if turn == MAX_TURNS - 1 or (turn > 0 and observation.detections is None):
             break
-        # A star found in residuals is none if it is faint, if it may be what the PSF of another
+        # A star found in residuals is dropped if it is faint, if it may be what the PSF of another
         # star lacks, or if it has moved to another star.
         sigma = np.hypot(fit.flux_error, _psf_doubt(place, flux, side, area_px))
         real = flux > min(threshold, 3.0) * sigma
@@ -174,19 +176,19 @@ def photometry(
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
         # stars and find none.
         if observation.detections is not None and turn < MAX_TURNS - 2:
-            sigma = np.where(bad, np.inf, error_without_models(error, fit.light, wing_light))
-            known = np.concatenate([place, tried])
-            found, light = find_stars(psfs, sky.flat, sigma, known, threshold, fwhm)
-            place, origin, tried = (np.concatenate([p, found]) for p in (place, origin, tried))
-            flux = np.append(flux, light)
+            sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
+            positions = np.concatenate([place, peaks])
+            new, new_flux = find_stars(psfs, sky.flat, sigma, positions, threshold, fwhm)
+            place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
+            flux = np.append(flux, new_flux)
         if turn > 0 and real.all() and len(place) == len(real):
             break
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
     stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm)
-    stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
+    stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, box_px, fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
-    chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(_box(fwhm)))
+    chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
     light = fit.light + wing_light
     result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
     return result.times(1.0 / unit)  # in the unit of the image
@@ -217,24 +219,33 @@ def tabulate_stars(
     fwhm : float
         FWHM of the PSF in pixels, which groups stars.
     """
+    from astropy.table import Table
+
     total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
         flux = fit.flux / observation.unit_factor
         total, total_error = wings.total_over_flux(outer_shares(model.on_pixels, fit.place, flux))
     is_detected = observation.detections is not None
     # With a list, the errors of stars that overlap are larger than this bias, and of either sign.
-    if is_detected:
-        fit = replace(fit, flux=fit.flux - fit.flux_bias)
-    stars = fit.table(total, 2.4 * fwhm)
+    flux = fit.flux - fit.flux_bias if is_detected else fit.flux
+    # Light that no model explains, of the PSF's own errors or of undetected stars, is as much
+    # in the fluxes as in the residuals.
+    excess = np.sqrt(np.fmax(fit.chi2, 1.0))
     # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
-    # whatever its χ²: σ² = σ_noise² + (σ_model F)² + (σ_wings F)².
-    model_error = model.flux_error(np.stack([stars["x"], stars["y"]], axis=1))
-    relative_error = np.hypot(model_error, total_error / total)
-    stars["flux_error"] = np.hypot(stars["flux_error"], relative_error * stars["flux"])
+    # whatever its χ²: σ² = χ² σ_noise² + (σ_model F)² + (σ_wings F)².
+    relative_error = np.hypot(model.flux_error(fit.place), total_error / total)
     # Stars of a list keep its numbers and flags.
+    stars = Table({"id": np.arange(1, len(flux) + 1) if is_detected else observation.stars.id})
+    stars["x"], stars["y"] = fit.place.T
+    stars["x_error"], stars["y_error"] = excess * fit.place_error.T
+    stars["flux"] = total * flux
+    stars["flux_error"] = np.hypot(total * excess * fit.flux_error, relative_error * total * flux)
+    stars["flux_model"] = flux
+    # Chains of neighbours, numbered from 1.
+    group = chains(fit.place, 2.4 * fwhm)
+    stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
+    stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
     stars["flags"] = np.zeros(len(stars), np.uint16) if is_detected else observation.stars.flags
-    if not is_detected:
-        stars["id"] = observation.stars.id
     # Noise has some peaks below 5 σ in an image of a million pixels: a source may be no star.
     faint = is_faint(np.array(stars["flux"]), np.array(stars["flux_error"]), 5.0)
     raise_flag(stars["flags"], StarFlag.FAINT, faint & is_detected)
@@ -246,7 +257,7 @@ def tabulate_stars(
     return stars
 
 
-def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float, min_stars: int = 3) -> float:
+def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
     """Return the median of bright stars' χ² over the χ² that the training stars would have.
 
     All stars are flagged UNLIKE_TRAINING if it is above `MAX_CHI2_RATIO`.
@@ -254,23 +265,22 @@ def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float, min_stars: in
     Parameters
     ----------
     fit : JointFit
+        All stars of the image, with their χ².
     flags : ndarray, shape (n,)
         Changed here; bright stars are those without another flag than POOR_FIT.
     variance : float
         Variance v of the training stars about their PSF, summed over the noise-equivalent area.
-    min_stars : int
-        Fewer bright stars are not compared.
 
     Returns
     -------
     float
-        NaN if the variance is not known or stars are too few.
+        NaN if the variance is not known, or with fewer than three bright stars.
     """
     # χ² = 1 + (F/σ_F)² v: noise, and residuals of variance v F².
     snr = fit.flux / fit.flux_error
     is_bright = (flags & ~np.uint16(StarFlag.POOR_FIT) == 0) & (snr > 20.0)
     ratio = (fit.chi2 / (1.0 + snr**2 * variance))[is_bright]
-    median_ratio = float(np.median(ratio)) if len(ratio) >= min_stars else np.nan
+    median_ratio = float(np.median(ratio)) if len(ratio) >= 3 else np.nan
     raise_flag(flags, StarFlag.UNLIKE_TRAINING, np.full(len(flags), median_ratio > MAX_CHI2_RATIO))
     return median_ratio
 
@@ -313,11 +323,6 @@ def star_flags(
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
     raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
     return flags
-
-
-def _box(fwhm: float) -> int:
-    """Return the side of the pixels that are fitted to a star, odd, about 1.6 FWHM."""
-    return 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
 
 
 def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:

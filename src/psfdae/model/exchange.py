@@ -22,14 +22,7 @@ from psfdae.base.errors import keyword
 from psfdae.base.files import atomic_path, sha256_of, write_fits
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line, reading
-from psfdae.image.fits_file import (
-    BLOCK_BYTES,
-    Card,
-    find_image,
-    open_hdus,
-    open_pixels,
-    plain_file,
-)
+from psfdae.image.fits_file import BLOCK_BYTES, Card, find_image, open_hdus, open_pixels, plain_file
 from psfdae.model.bundle import name_foreign_format
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model

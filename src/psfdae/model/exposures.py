@@ -81,7 +81,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
-    model, frame_notes = model.moved_to(observation)
+    model, frame_notes = model.to_image_frame(observation)
     difference = other_instrument(model, observation)
     bright = collect(observation, calibration, settings.framing).bright
     if not np.isfinite(bright.position).all():
@@ -112,12 +112,12 @@ def note_empty_quarters(low: np.ndarray, high: np.ndarray, position: np.ndarray)
         Positions of the stars, x and y.
     """
     # A quarter is a half along x and a half along y; a 16th of the stars is too few for one.
-    middle, few, empty = 0.5 * (low + high), len(position) // 16, []
+    middle, limit, empty = 0.5 * (low + high), len(position) // 16, []
     for quarter in product((False, True), repeat=2):
-        if ((position > middle) == quarter).all(axis=1).sum() <= few:
+        if ((position > middle) == quarter).all(axis=1).sum() <= limit:
             (x0, y0), (x1, y1) = np.where(quarter, (middle, high), (low, middle))
             empty.append(f"x {x0:.0f} … {x1:.0f}, y {y0:.0f} … {y1:.0f}")
-    note = f"{few} bright stars or fewer in {len(empty)} of the 4 quarters ({'; '.join(empty)})"
+    note = f"{limit} bright stars or fewer in {len(empty)} of the 4 quarters ({'; '.join(empty)})"
     return [f"{note}: the change of the PSF is not measured there"] if empty else []
 
 
@@ -157,7 +157,7 @@ def adapted_to_stars(model: PsfModel, stars: Stars) -> PsfModel:
     stars : Stars
         Bright stars of the other image.
     """
-    model, train = model.moved_to(stars.observation)[0], stars.split.train
+    model, train = model.to_image_frame(stars.observation)[0], stars.split.train
     bright = stars.candidates.bright.of(np.flatnonzero(~stars.held_out))
     adapted = _adapt(model, stars.observation, bright, stars.name)
     # The checksum of the stars that were learnt from shows a test that it saw no other.

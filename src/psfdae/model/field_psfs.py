@@ -117,7 +117,7 @@ class FieldPsfs(ImageFluxes, ABC):
         `source` names the image in the message.
         """
 
-    def moved_to(self, observation: Observation) -> tuple[Self, list[str]]:
+    def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
         """Return the model in the pixel coordinates of an image of a part of the detector.
 
         Returns
@@ -306,10 +306,10 @@ def grid_class(name: str) -> type[GriddedPSFModel]:
     from photutils.psf import GriddedPSFModel
 
     # A class that is made at run time is pickled as its name.
-    return type(name, (GriddedPSFModel,), {"__reduce__": pickled_grid})
+    return type(name, (GriddedPSFModel,), {"__reduce__": reduce_grid})
 
 
-def pickled_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
+def reduce_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
     """Return what pickle stores of a grid: how to make one without values, and its values."""
     return blank_grid, (type(grid).__name__,), vars(grid)
 

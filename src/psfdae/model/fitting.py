@@ -203,15 +203,12 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
             return model
         # Light outside the stamps, as the photometry of each image with this model measures it:
         # `flux_total` of a star and its flux by photometry are the same.
-        measured = (
-            measure_stars(
-                model,
-                with_measured_gain(model, image.observation.assuming()),
-                image.source.detection_sigma or image.source.threshold,
-            )[0].image_wings
-            for image in stars.images
-        )
-        wings = [image_wings for image_wings in measured if image_wings is not None]
+        wings = []
+        for image in stars.images:
+            observation = with_measured_gain(model, image.observation.assuming())
+            threshold = image.source.detection_sigma or image.source.threshold
+            photometry, _ = measure_stars(model, observation, threshold)
+            wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model
     return PsfModel(with_wings(model.bundle, Wings.joined(wings)), model.method)

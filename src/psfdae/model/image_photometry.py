@@ -21,6 +21,9 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.image.tables import star_table
+from psfdae.model import crowded
+from psfdae.model.crowded import CrowdedPhotometry
+from psfdae.model.photon_noise import with_measured_gain
 
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
@@ -30,11 +33,10 @@ if TYPE_CHECKING:
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
     from psfdae.image.observation import Observation
-    from psfdae.model.crowded import CrowdedPhotometry
     from psfdae.model.field_psfs import FieldPsfs
 
 
-TURNED = "an image that is turned, of another part of the detector, or of another PSF?"
+CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
 """What stars that are all unlike the training's may mean."""
 
 
@@ -194,23 +196,16 @@ def photometry_of_image(
     if observation.shape is None:
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
-    # The image may show another part of the detector than that of the training.
-    model, frame_notes = model.moved_to(observation)
+    # The image may show another part of the detector than the training.
+    model, frame_notes = model.to_image_frame(observation)
     # Read the stars of the reference before the long work, in case they cannot be used.
     magnitudes = scatter = None
     if reference is not None:
-        listed = replace(source, catalogue=reference, origin=origin, detect=False)
-        positions = replace(listed, on_image=False).open(model.stamp_px).positions
+        stars = replace(source, catalogue=reference, origin=origin, detect=False, on_image=False)
+        positions = stars.open(model.stamp_px).positions
         assert positions is not None  # of an image
-        table_of_reference = as_catalogue(reference)
-        magnitudes = (
-            positions,
-            table_of_reference.numbers(magnitude_column),
-            str(table_of_reference.path),
-        )
-
-    from psfdae.model.crowded import MAX_CHI2_RATIO
-    from psfdae.model.photon_noise import with_measured_gain
+        star_list = as_catalogue(reference)
+        magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
 
     # All stars of the image, and the zero point by those that the reference has.
     observation = with_measured_gain(model, observation)
@@ -228,9 +223,9 @@ def photometry_of_image(
         **({} if zero_point is None else {"ZEROPT": zero_point}),
         **({} if scatter is None else {"ZEROPTSD": scatter}),
     }
-    if measured.chi2_ratio > MAX_CHI2_RATIO:
+    if measured.chi2_ratio > crowded.MAX_CHI2_RATIO:
         misfit = f"χ² of bright stars is {measured.chi2_ratio:.3g} times the training's (median)"
-        frame_notes.append(f"{source.path}: {misfit}, all are flagged UNLIKE_TRAINING: {TURNED}")
+        frame_notes.append(f"{source.path}: {misfit}, all are flagged UNLIKE_TRAINING: {CAUSES}")
     warn(frame_notes)
     notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
     notes = (*notes, *frame_notes)
@@ -249,18 +244,14 @@ def measure_stars(
     list_note : str or None
         A sentence on how far the stars are off the positions of their list, if there is one.
     """
-    from psfdae.model.crowded import RESIDUAL_SNR
-    from psfdae.model.crowded import photometry as crowded_photometry
-
     # A row without a position cannot be fitted, and one of a star that is listed twice has no
     # light of its own: measure the others, and add flagged rows for these.
     unusable = observation.without_position() | observation.listed_again()
     usable = observation.select(~unusable) if unusable.any() else observation
-    measured = crowded_photometry(model, usable, threshold or RESIDUAL_SNR)
+    measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR)
     if unusable.any():
-        measured = replace(
-            measured, stars=with_unmeasured_rows(measured.stars, observation, unusable)
-        )
+        stars = with_unmeasured_rows(measured.stars, observation, unusable)
+        measured = replace(measured, stars=stars)
     if observation.catalogue is None or len(measured.stars) != observation.count:
         return measured, None
     # The stars are fitted where they are, whatever the list says.
@@ -313,11 +304,9 @@ def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.nd
     rows = Table()
     for name in stars.colnames:
         measured = np.array(stars[name])
-        column = np.zeros(len(unusable), measured.dtype)
-        if measured.dtype.kind == "f":
-            column[:] = np.nan
-        column[~unusable] = measured
-        rows[name] = column
+        missing = np.nan if measured.dtype.kind == "f" else 0
+        rows[name] = np.full(len(unusable), missing, measured.dtype)
+        rows[name][~unusable] = measured
     # What the list says of these stars.
     rows["id"] = observation.stars.id
     rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
@@ -327,10 +316,7 @@ def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.nd
 
 
 def measure_zero_point(
-    measured: CrowdedPhotometry,
-    positions: np.ndarray,
-    magnitude: np.ndarray,
-    reference: str,
+    measured: CrowdedPhotometry, positions: np.ndarray, magnitude: np.ndarray, reference: str
 ) -> tuple[float, float, str]:
     """Return the zero point, the scatter of its stars, and a sentence with its standard error.
 

@@ -20,7 +20,7 @@ from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.model.field_psfs import PredictionError
-from psfdae.model.image_photometry import TURNED
+from psfdae.model.image_photometry import CAUSES
 from psfdae.model.prediction import Prediction
 
 if TYPE_CHECKING:
@@ -135,8 +135,8 @@ def predict_stars(
     offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     notes = [observation.summary(), offset_note if observation.shape else None]
     prediction = Prediction.joined(predictions)
-    unlike = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
-    notes += notes_on_model(model, observation, unlike)
+    unlike_count = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
+    notes += notes_on_model(model, observation, unlike_count)
     return replace(prediction, notes=tuple(filter(None, notes)))
 
 
@@ -164,20 +164,20 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
     return observation
 
 
-def notes_on_model(model: PsfModel, observation: Observation, unlike: int) -> list[str]:
+def notes_on_model(model: PsfModel, observation: Observation, unlike_count: int) -> list[str]:
     """Return sentences on what limits the trust in predictions of an image.
 
     They are on another frame or instrument than the training's, on stars unlike the training's
-    (`unlike` is their number), and on light outside of stamps.
+    (`unlike_count` is their number), and on light outside of stamps.
     """
-    notes = model.moved_to(observation)[1]
+    notes = model.to_image_frame(observation)[1]
     # Another telescope, camera or filter, as far as both images name theirs.
     if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
     # Of stars as in the training, 0.1 % have this flag.
-    if unlike >= max(3, 0.1 * observation.count):
-        misfit = f"{unlike} of {observation.count} stars are flagged UNLIKE_TRAINING"
-        notes.append(f"{observation.path}: {misfit}: {TURNED}")
+    if unlike_count >= max(3, 0.1 * observation.count):
+        misfit = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
+        notes.append(f"{observation.path}: {misfit}: {CAUSES}")
     if observation.shape and model.method.knows_field and not model.wings:
         notes.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "

@@ -22,7 +22,6 @@ from psfdae.base.progress import steps
 from psfdae.model.psf_grid import PsfGrid
 
 if TYPE_CHECKING:
-    from astropy.table import Table
     from scipy.sparse import csc_array
 
 
@@ -54,28 +53,6 @@ class JointFit:
     chi2: np.ndarray
     flags: np.ndarray
     light: np.ndarray
-
-    def table(self, flux_factor: np.ndarray | float, group_px: float) -> Table:
-        """Return a row for each star, with its chain of stars nearer to each other than `group_px`.
-
-        Fluxes have the factor (n,) by which a star has more light than its model.
-        """
-        from astropy.table import Table
-
-        # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as
-        # much in the fluxes as in the residuals.
-        excess = np.sqrt(np.fmax(self.chi2, 1.0))
-        stars = Table({"id": np.arange(1, len(self.flux) + 1)})
-        stars["x"], stars["y"] = self.place.T
-        stars["x_error"], stars["y_error"] = excess * self.place_error.T
-        stars["flux"] = flux_factor * self.flux
-        stars["flux_error"] = flux_factor * excess * self.flux_error
-        stars["flux_model"] = self.flux
-        # Chains of neighbours, numbered from 1.
-        group = chains(self.place, group_px)
-        stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
-        stars["chi2"], stars["photutils_flags"] = self.chi2, self.flags
-        return stars
 
 
 def fit_stars(

@@ -45,9 +45,7 @@ def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observatio
     if observation.gain is not None or observation.positions is None:
         return observation
     sky, limit = observation.sky(), observation.to_sky_unit().saturate
-    bad = sky.bad
-    if limit is not None:
-        bad = bad | (sky.flat + sky.level >= limit)
+    bad = sky.bad if limit is None else sky.bad | (sky.flat + sky.level >= limit)
     measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
     if measured is None:
         return observation

@@ -103,9 +103,7 @@ def map_of_file(path: Path) -> Figure:
 
 @styled
 def psf_map(
-    stars: Mapping[str, np.ndarray],
-    psfs_of: Callable[[np.ndarray], np.ndarray],
-    image_name: str,
+    stars: Mapping[str, np.ndarray], psfs_of: Callable[[np.ndarray], np.ndarray], image_name: str
 ) -> Figure:
     """Draw stamps at the positions of their stars, and beside them a whisker for every star.
 

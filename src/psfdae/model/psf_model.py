@@ -228,7 +228,7 @@ class PsfModel(WholeImages, FieldPsfs):
         taken.
         """
         # Stamps are read in chunks, each of which is restored in blocks by a thread of its own.
-        restorer = self.moved_to(observation)[0].restorer
+        restorer = self.to_image_frame(observation)[0].restorer
         size = restorer.block_size
 
         def predicted(stamps: Stamps) -> Prediction:
@@ -327,7 +327,7 @@ class PsfModel(WholeImages, FieldPsfs):
     def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         return self._field().psf_at(place, oversampling)
 
-    def moved_to(self, observation: Observation) -> tuple[Self, list[str]]:
+    def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
         size = self.image_px
         if not self.method.knows_field or size is None or observation.shape is None:
             return self, []
@@ -350,12 +350,12 @@ class PsfModel(WholeImages, FieldPsfs):
         for name in ("low", "high"):
             weights[name] = weights[name] - np.pad(offset, (0, len(weights[name]) - 2))
         measured = bundle.errors.measured
-        measured = measured._replace(middle=measured.middle - offset)
-        moved = replace(bundle, weights=weights, errors=replace(bundle.errors, measured=measured))
+        errors = replace(bundle.errors, measured=measured._replace(middle=measured.middle - offset))
+        shifted_bundle = replace(bundle, weights=weights, errors=errors)
         # Results name the file of the model.
-        vars(moved)["sha256"] = bundle.sha256
+        vars(shifted_bundle)["sha256"] = bundle.sha256
         place = "by the headers, its first pixel is x {:g}, y {:g} there".format(*offset)
-        return type(self)(moved), [f"{observation.path}: {words}; {place}"]
+        return type(self)(shifted_bundle), [f"{observation.path}: {words}; {place}"]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Refuse stars whose pixels are not those of the training.

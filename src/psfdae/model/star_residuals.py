@@ -1,8 +1,8 @@
-"""Stars that are unlike the PSF at their position, by what a fit of the field leaves of them.
+"""Rejection of bright stars that differ from the PSF at their position, by a fit of the field.
 
-The criteria of `psfdae.image.star_criteria` compare stars with their neighbours, whose noise hides
-what a bright star lacks: a core that is cut off and resampled, a galaxy in an image of few stars.
-A model of the field has the noise of none of them.
+The criteria of `psfdae.image.star_criteria` compare stars with their neighbours. The noise of these
+hides small differences: a core that is cut off and resampled, a galaxy in an image of few stars. A
+fitted field has hardly any noise.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
         Measured stars of one image. All stay if there are fewer than five, or if positions are not
         known, as the PSF of a star cannot be predicted then.
     settings : Settings
+        Settings by which the stars were chosen.
     gain : float, optional
         Electrons per count.
 
@@ -67,11 +68,11 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
     error = np.sqrt(2.0 * np.square(light * variance).sum(axis=(1, 2))) / norm
     # The brighter half shows how well the field can be known: d of a star may be four times the
     # upper quartile of theirs, or 2 %, beyond noise.
-    usual = np.percentile(square[stars.snr >= np.median(stars.snr)], 75)
-    is_misfit = square > max(16.0 * usual, 0.02**2) + 10.0 * error
+    typical_square = np.percentile(square[stars.snr >= np.median(stars.snr)], 75)
+    is_misfit = square > max(16.0 * typical_square, 0.02**2) + 10.0 * error
     if not is_misfit.any():
         return candidates
     verdict = candidates.verdict.copy()
     verdict[stars.row[is_misfit]] = Verdict.MISFIT
-    others = bright.of(np.delete(np.arange(len(bright)), rows[is_misfit]))
-    return reject_misfits(replace(candidates, verdict=verdict, bright=others), settings, gain)
+    kept_stars = bright.of(np.delete(np.arange(len(bright)), rows[is_misfit]))
+    return reject_misfits(replace(candidates, verdict=verdict, bright=kept_stars), settings, gain)

@@ -92,10 +92,7 @@ class Stars:
 
     @classmethod
     def from_image(
-        cls,
-        image: Image | Sequence[Image],
-        catalogue: StarList | None = None,
-        **statements: Any,
+        cls, image: Image | Sequence[Image], catalogue: StarList | None = None, **statements: Any
     ) -> Stars:
         """Choose the bright stars of an image and make training data of them.
 
@@ -151,13 +148,13 @@ class Stars:
         opened, candidates, relaxed, notes = choose_bright_stars(opened, settings)
         # Bright stars of each image; those of a crowded image again without their neighbours.
         exposures = []
-        for source, observation, compared in zip(sources, opened, candidates, strict=True):
-            measured = reject_misfits(compared, relaxed, observation.gain)
+        for source, observation, measured in zip(sources, opened, candidates, strict=True):
+            image_candidates = reject_misfits(measured, relaxed, observation.gain)
             # Of several images, one may have few stars or none.
             if len(sources) == 1:
                 min_stars = relaxed.calibration_stars.stars_min
-                measured.require(observation.path, min_stars, observation.remarks)
-            stars = stars_of_candidates(source, observation, measured, relaxed)
+                image_candidates.require(observation.path, min_stars, observation.remarks)
+            stars = stars_of_candidates(source, observation, image_candidates, relaxed)
             if is_crowded(stars):
                 from psfdae.model.neighbours import without_neighbours
 

@@ -39,12 +39,7 @@ from psfdae.model.report_checks import (
     nearest_snr,
 )
 from psfdae.model.report_figures import residual_strip
-from psfdae.model.star_sets import (
-    field_positions,
-    noisy_test_images,
-    own_noise,
-    star_area,
-)
+from psfdae.model.star_sets import field_positions, noisy_test_images, own_noise, star_area
 from psfdae.model.stars import Stars
 
 if TYPE_CHECKING:
@@ -83,7 +78,7 @@ def validate(
     True
     """
     _require_unseen(model, stars)
-    model, notes = model.moved_to(stars.observation)
+    model, notes = model.to_image_frame(stars.observation)
     warn(notes)
     settings = stars.settings
     # The fits that exist already, that of the model included.
@@ -158,15 +153,14 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
         row = {**key, "method": MEAN_PSF, "noise_level": level}
         mean_rows += summarised(row, all_metrics(by_mean_psf, truth, data_range), star)
         for name, method in methods.items():
-            is_model = name == model.info.method
-            scale = _level_scale(model, stars) if is_model else 1.0
+            scale = _level_scale(model, stars, name)
             estimate = method.estimate(noisy, scale * level, position)
             # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
             rows += summarised(row, metrics, star)
             per_star.append({**row, "star": test, "field": star, **metrics})
-            if is_model:
+            if name == model.info.method:
                 images = {"noisy": noisy, "truth": truth, "model": estimate.psf}
                 restored[level] = images | {MEAN_PSF: by_mean_psf}
     return Report(
@@ -181,12 +175,14 @@ def _measure(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Re
     )
 
 
-def _level_scale(model: PsfModel, stars: Stars) -> float:
-    """Return the factor from noise levels λ of stars to those of a model.
+def _level_scale(model: PsfModel, stars: Stars, method_name: str) -> float:
+    """Return the factor from noise levels λ of stars to those of a method.
 
-    The model may be of another image, whose noise level λ has another κ.
+    It is 1 for all methods but the model's: the model may be of another image, whose noise level λ
+    has another κ.
     """
-    return stars.settings.noise.kappa / model.info.kappa
+    is_model = method_name == model.info.method
+    return stars.settings.noise.kappa / model.info.kappa if is_model else 1.0
 
 
 def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
@@ -377,8 +373,7 @@ class Report:
         for name, method in self.methods.items():
             look = method.look
             if look.drawn:
-                is_model = name == self.model.info.method
-                scale = _level_scale(self.model, self.stars) if is_model else 1.0
+                scale = _level_scale(self.model, self.stars, name)
                 stamps = method.estimate(noisy, scale * levels[snr], place[shown], False).psf
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.title, stamps, error, own_scale=not look.restores))

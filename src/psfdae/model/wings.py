@@ -264,10 +264,7 @@ class StarFluxes(NamedTuple):
 
 
 def star_tents(
-    rows: slice,
-    width: int,
-    stars: StarFluxes,
-    wings: Wings,
+    rows: slice, width: int, stars: StarFluxes, wings: Wings
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
     """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
 
@@ -286,32 +283,24 @@ def star_tents(
     middle = np.rint(stars.place[brightest]).astype(int)
     first = np.maximum(middle - reach, [0, rows.start])
     end = np.minimum(middle + reach + 1, [width, rows.stop])
-    for index in np.flatnonzero((first < end).all(axis=1)):
-        star = brightest[index]
+    windows = zip(brightest.tolist(), first.tolist(), end.tolist(), strict=True)
+    for star, (column, row), (column_end, row_end) in windows:
+        if column >= column_end or row >= row_end:
+            continue
         # Distances of the pixels from the star along either axis, and from its centre.
-        across, down = (
-            (np.arange(first[index, axis], end[index, axis]) - stars.place[star, axis]).astype(
-                np.float32
-            )
-            for axis in (0, 1)
-        )
+        x, y = stars.place[star]
+        across = (np.arange(column, column_end) - x).astype(np.float32)
+        down = (np.arange(row, row_end) - y).astype(np.float32)
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
         # h_0 is 1 in the stamp, and the tents are 0 there.
         in_stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
         tents_outside = np.where(in_stamp, 0.0, tents(distance, radius))
-        (first_column, first_row), (end_column, end_row) = first[index], end[index]
-        window = (
-            slice(first_row - rows.start, end_row - rows.start),
-            slice(first_column, end_column),
-        )
-        star_flux = float(scaled_flux[star])
-        yield window, star_flux * np.concatenate([in_stamp[None], tents_outside])
+        window = np.s_[row - rows.start : row_end - rows.start, column:column_end]
+        yield window, float(scaled_flux[star]) * np.concatenate([in_stamp[None], tents_outside])
 
 
-def tented_light(
-    shape: tuple[int, ...],
-    stars: StarFluxes,
-    wings: Wings,
+def draw_tents(
+    shape: tuple[int, ...], stars: StarFluxes, wings: Wings
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
     height, width = shape
@@ -324,11 +313,7 @@ def tented_light(
         yield rows, tented
 
 
-def wing_light(
-    shape: tuple[int, ...],
-    stars: StarFluxes,
-    wings: Wings | None,
-) -> np.ndarray:
+def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
     """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
     # One map, to which each star adds the light in its window.
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
@@ -406,7 +391,6 @@ def wings_of(
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
     # So σ² is averaged over a stamp.
-    unit_sigma = float(sigma.mean(dtype=np.float64))
     variance = np.square(sigma)
     smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
     # A mean is not below the least value, but for the rounding of running sums.
@@ -414,23 +398,25 @@ def wings_of(
     smooth_sigma = np.sqrt(smooth_variance, out=smooth_variance)
     del variance, smooth_variance
     # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
-    # of A is (F s h_k, mean σ)/σ of a pixel, so that the even light is in units of the mean σ, and
-    # d its residual over σ; the same in blocks of a stamp.
+    # of A is (F s h_k, 1)/σ of a pixel, and d its residual over σ; the same in blocks of a stamp.
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
     square, pixels, blocks = 0.0, 0, []
-    for band, tented in tented_light(residual.shape, stars, unfitted):
+    for band, tented in draw_tents(residual.shape, stars, unfitted):
         is_used = ~bad[band]
         if earlier is not None:
             deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
             # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
             is_used &= np.abs(deviation) < 4.0 * sigma[band]
         weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
-        design = np.concatenate([tented, np.full((1, *weight.shape), unit_sigma)]) * weight
+        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
         normal, projection = normal + flat @ flat.T, projection + flat @ data
         square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
-        summands = np.concatenate([design, [residual[band] * weight, weight > 0]])
-        blocks.append(block_sums(summands, stamp_px).reshape(len(summands), -1))
+        # Blocks at the lower and right edges may be smaller.
+        sums = np.concatenate([design, [residual[band] * weight, weight > 0]])
+        for axis in (1, 2):
+            sums = np.add.reduceat(sums, range(0, sums.shape[axis], stamp_px), axis=axis)
+        blocks.append(sums.reshape(len(sums), -1))
     if not normal[-1, -1] > 0:
         return None
     *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
@@ -458,25 +444,15 @@ def wings_of(
     return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
 
 
-def error_without_models(
+def add_model_errors(
     error: np.ndarray, star_light: np.ndarray, wing_light: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Return σ (h, w) of an image without its stars: its noise, and the errors of their models.
 
-    These are 3 % of the models' light and 30 % of the wings': wings are round here; those of a
-    telescope may differ from that by as much in a pixel.
+    These are 3 % of the models' light and 30 % of the wings': wings are round here; a telescope's
+    may differ from that by as much in a pixel.
     """
     return np.asarray(np.hypot(np.hypot(error, 0.03 * star_light), 0.3 * wing_light))
-
-
-def block_sums(values: np.ndarray, side: int) -> np.ndarray:
-    """Return sums over blocks of side × side pixels of the last two axes of an array.
-
-    Blocks at the lower and right edges may be smaller.
-    """
-    for axis in (-2, -1):
-        values = np.add.reduceat(values, range(0, values.shape[axis], side), axis=axis)
-    return values
 
 
 def around_stars(
@@ -486,9 +462,9 @@ def around_stars(
     star_light: np.ndarray,
     stars: StarFluxes,
     stamp_px: int,
-    earlier: Wings | None = None,
-    tolerance: float = 0.1,
-    saturated: np.ndarray | None = None,
+    earlier: Wings | None,
+    tolerance: float,
+    is_saturated: np.ndarray,
 ) -> tuple[Sky, np.ndarray, Wings | None]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
@@ -501,12 +477,14 @@ def around_stars(
     sky : Sky
         As it is known so far; its `bad` pixels do not count.
     stars : StarFluxes
+        Positions and fluxes of the stars.
     stamp_px : int
-    earlier : Wings, optional
+        Side of the stamps in which the model has the light of a star.
+    earlier : Wings or None
         Wings with which the turns begin.
     tolerance : float
         Turns end when the light of the wings changes by less than this part of its error.
-    saturated : ndarray of bool, shape (h, w), optional
+    is_saturated : ndarray of bool, shape (h, w)
         Saturated pixels.
 
     Returns
@@ -518,10 +496,10 @@ def around_stars(
     wings : Wings or None
     """
     # What is left beside the models has their errors, too.
-    sigma = error_without_models(error, star_light)
+    sigma = add_model_errors(error, star_light)
     without_stars = image - star_light
     wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
-    light_of_wings = wing_light(image.shape, stars, wings)
+    light_of_wings = draw_wings(image.shape, stars, wings)
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
     without_light = without_stars - light_of_wings
@@ -540,15 +518,15 @@ def around_stars(
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
     # Saturated stars that are not fitted have halos, too.
     middles = stars.place[stars.flux > 0]
-    for core in [] if saturated is None else saturated_cores(saturated):
+    for core in saturated_cores(is_saturated):
         if np.hypot(*(middles - core[:2]).T).min(initial=np.inf) > 2.0:
-            halo = halo_light(sky.flat, sky.bad, sigma, core)
+            halo = measure_halo(sky.flat, sky.bad, sigma, core)
             light_of_wings += halo
             sky = replace(sky, flat=sky.flat - halo)
     return sky, light_of_wings, wings
 
 
-def halo_light(
+def measure_halo(
     residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
 ) -> np.ndarray:
     """Return the light (h, w) around a saturated core: at each distance, the median.
@@ -560,6 +538,7 @@ def halo_light(
     residual, sigma : ndarray, shape (h, w)
         Image without sky and stars, and σ of its pixels.
     bad : ndarray of bool, shape (h, w)
+        Pixels that are in no ring.
     core : ndarray, shape (3,)
         Middle x, y and radius in px.
     """
@@ -575,10 +554,8 @@ def halo_light(
     edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
     ring = np.where(bad[window], 0, np.digitize(radius, edges))
     numbers = np.unique(ring)[1:-1]
-    level, middle = (
-        ndimage.median(residual[window], ring, numbers),
-        ndimage.mean(radius, ring, numbers),
-    )
+    level = ndimage.median(residual[window], ring, numbers)
+    middle = ndimage.mean(radius, ring, numbers)
     # The error of a median of n values is 1.25 σ/√n.
     error = 1.25 * ndimage.mean(sigma[window], ring, numbers)
     error /= np.sqrt(np.bincount(ring.ravel())[numbers])
@@ -597,8 +574,8 @@ def _wings_beside(
     sigma: np.ndarray,
     stars: StarFluxes,
     stamp_px: int,
-    earlier: Wings | None = None,
-    tolerance: float = 0.1,
+    earlier: Wings | None,
+    tolerance: float,
 ) -> Wings | None:
     """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
     from scipy.ndimage import uniform_filter
@@ -623,13 +600,13 @@ def _wings_beside(
     for _ in steps("light beyond the stamps", range(8)):
         previous = wings
         if previous is not None:
-            without_wings = without_stars - wing_light(bad.shape, all_stars, previous)
+            without_wings = without_stars - draw_wings(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
             without_wings, _ = dither(without_wings, sky.count)
             residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
             # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
             # small.
-            residual -= wing_light(bad.shape, unlike_psf, previous)
+            residual -= draw_wings(bad.shape, unlike_psf, previous)
         wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break

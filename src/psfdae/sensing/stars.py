@@ -467,11 +467,7 @@ class WavefrontSearch:
         return np.asarray((parameters[:, :k] ** 2).sum(axis=1) + (place**2).sum(axis=1))
 
     def expected_counts(
-        self,
-        star: np.ndarray,
-        stamps: np.ndarray,
-        slopes: np.ndarray,
-        star_parameters: np.ndarray,
+        self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, star_parameters: np.ndarray
     ) -> StampsAndSlopes:
         """Return expected counts (m, P), and their derivatives (m, k + 2, P).
 
