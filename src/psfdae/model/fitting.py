@@ -206,8 +206,7 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
         wings = []
         for image in stars.images:
             observation = with_measured_gain(model, image.observation.assuming())
-            threshold = image.source.detection_sigma or image.source.threshold
-            photometry, _ = measure_stars(model, observation, threshold)
+            photometry, _ = measure_stars(model, observation, image.source.given_threshold)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model
