@@ -17,7 +17,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import Verdict, completed
 from psfdae.image.sky_level import SkyStructure, noise_correlation, sky_level, sky_steps
 from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
-from psfdae.image.trails import find_trails, with_trails
+from psfdae.image.trails import add_trails, find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.fitting import fitted_to
@@ -208,7 +208,7 @@ def test_an_exposed_image_has_no_unexposed_area(clean):
         "amplifiers": np.where(column < 160, 0.0, 60.0 + rng.normal(0, 20, image.shape)),
         "four times as long exposed": np.where(row < 160, 0.0, rng.normal(0, 40, image.shape)),
     }
-    found = {name: bad_pixels.unexposed_area(image + sky, none) for name, sky in skies.items()}
+    found = {name: bad_pixels.find_dark_area(image + sky, none) for name, sky in skies.items()}
     assert found == dict.fromkeys(skies)
 
 
@@ -321,7 +321,7 @@ def test_spikes_of_saturated_stars_are_left_out_and_their_cores_are_not(clean, a
     light = np.minimum(clean[0] + star + spikes, 6e4)
     light[(np.abs(column) < 1.5) & (np.abs(row) < 70)] = 5e4
     none = np.zeros(light.shape, bool)
-    found = with_trails(light, bad_pixels.BadPixels(none, none, ()), 6e4)
+    found = add_trails(light, bad_pixels.BadPixels(none, none, ()), 6e4)
     assert "pixels of spikes of saturated stars" in found.notes[0] and len(found.notes) == 1
     radius = np.hypot(row, column)
     is_column = (np.abs(column) < 1.5) & (np.abs(row) < 65) & (radius > 30)

@@ -30,11 +30,11 @@ def check_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments
     signature = inspect.signature(function)
 
     @wraps(function)
-    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def check_and_call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         check_values(function, signature.bind(*args, **kwargs).arguments)
         return function(*args, **kwargs)
 
-    return checked
+    return check_and_call
 
 
 def check_values(function: Callable[..., Any], values: Mapping[str, Any], **names: Any) -> None:

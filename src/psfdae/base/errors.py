@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import stat
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -162,9 +161,8 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
 def require_file(path: Path) -> None:
     """Raise Error for a pipe or a device, whose opening or reading might never end."""
     # Readers have their own words for a path that is missing.
-    with suppress(OSError, ValueError):
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+    with suppress(OSError):
+        if path.exists() and not (path.is_file() or path.is_dir()):
             raise Error(f"{path}: a pipe or a device, expected a file")
 
 

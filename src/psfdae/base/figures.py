@@ -27,6 +27,9 @@ WIDTH_IN = 8.0
 SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
 """Colours of lines that are not methods."""
 
+Inches = tuple[float, float]
+"""Position (x, y), or width and height, in inches."""
+
 Drawing = Callable[..., "Figure"]
 
 
@@ -230,13 +233,7 @@ def in_inches(figure: Figure) -> Axes:
     return axes
 
 
-def draw_row(
-    axes: Axes,
-    row: StripRow,
-    corner: tuple[float, float],
-    cell: tuple[float, float],
-    peak: np.ndarray,
-) -> None:
+def draw_row(axes: Axes, row: StripRow, corner: Inches, cell: Inches, peak: np.ndarray) -> None:
     """Draw the stamps of a row on a square-root scale, with its label at the left.
 
     Parameters

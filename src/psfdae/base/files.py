@@ -61,15 +61,15 @@ def find_left_over(folder: Path, name: str) -> list[Path]:
     """
     # All but the number of the process and the random digits is the same.
     start = temporary_name(name).rsplit("-", 2)[0]
-    ended = []
+    left_over = []
     for path in folder.glob(f"{escape(start)}-*-????????.tmp"):
         try:
             os.kill(int(path.name.split("-")[-2]), 0)  # signal 0 only asks whether it exists
         except (ProcessLookupError, OverflowError):
-            ended.append(path)
+            left_over.append(path)
         except (PermissionError, ValueError):  # a process of another user, or another name
             continue
-    return ended
+    return left_over
 
 
 def resolve_output(path: Path) -> Path:
@@ -152,8 +152,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = resolve_output(Path(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    for unfinished in find_left_over(path.parent, path.name):
-        unfinished.unlink(missing_ok=True)
+    for left_over in find_left_over(path.parent, path.name):
+        left_over.unlink(missing_ok=True)
     temporary = path.with_name(temporary_name(path.name))
     # Permissions of the file that is replaced; a new one has those of the user's mask.
     mode = path.stat().st_mode if path.exists() else None
@@ -183,8 +183,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, pixel_noise
@@ -90,26 +91,33 @@ def find_bad_pixels(
     cosmic = cosmic_rays(image, mask, noise, saturate)
     leave_out(cosmic, "pixels of cosmic rays and hot pixels")
     # Without these, what remains below the sky and shows no star received no light.
-    if (unexposed := unexposed_area(image, mask)) is not None:
-        leave_out(unexposed[1], f"pixels that are not exposed (level {unexposed[0]:.4g})")
+    if (dark := find_dark_area(image, mask)) is not None:
+        leave_out(dark[1], f"pixels that are not exposed (level {dark[0]:.4g})")
     return BadPixels(mask, cosmic, tuple(notes))
 
 
-def _in_bands(find: Callable[..., np.ndarray], *maps: np.ndarray) -> np.ndarray:
+def find_in_bands(
+    find: Callable[..., np.ndarray], *maps: np.ndarray, side_min: int = 32
+) -> np.ndarray:
     """Return the mask (h, w) that a function finds in bands of 256 rows of maps (h, w).
 
-    The function sees 16 rows more on each side. Bands bound the memory for a large image.
+    The function sees 16 rows more on each side. Bands bound the memory for a large image. In an
+    image of fewer than `side_min` rows or columns, a pixel has no surroundings: it finds nothing.
 
     Parameters
     ----------
     find : callable
         Takes some rows of each map, and returns a mask of these rows.
     *maps : ndarray, shape (h, w)
+        Arguments of the function.
+    side_min : int
+        Side of the smallest image in px.
     """
     mask = np.zeros(maps[0].shape, dtype=bool)
-    for top in range(0, len(mask), 256):
+    height = len(mask) if min(mask.shape) >= side_min else 0
+    for top in range(0, height, 256):
         # Rows beyond the edges of the band, so that filters of a few pixels see the image there.
-        start, end = max(top - 16, 0), min(top + 256, len(mask))
+        start, end = max(top - 16, 0), min(top + 256, height)
         mask[top:end] = find(*(band[start : end + 16] for band in maps))[top - start : end - start]
     return mask
 
@@ -138,13 +146,9 @@ def blank_areas(
     list of (float, ndarray of bool)
         Value and pixels of each kind of area.
     """
-    from scipy import ndimage
-
     # Squares and lines in which the least and the greatest value are the same.
     values = np.where(bad, np.nan, image)
-    solid = np.zeros(values.shape, dtype=bool)
-    if min(values.shape) >= 8:
-        solid = _in_bands(constant_squares, values) & np.isfinite(values)
+    solid = find_in_bands(constant_squares, values, side_min=8) & np.isfinite(values)
     # Whole columns and whole rows of one value; NaN is equal to nothing.
     solid |= (values == values[:1]).all(axis=0)
     solid |= (values == values[:, :1]).all(axis=1, keepdims=True)
@@ -156,7 +160,7 @@ def blank_areas(
     areas = []
     for value, _ in candidates:
         # The whole of each connected area of this value that holds a square or a line of it.
-        area = ndimage.binary_propagation(solid & (values == value), mask=values == value)
+        area = scipy.ndimage.binary_propagation(solid & (values == value), mask=values == value)
         # Whole counts of little noise fill a few squares by chance, and much is connected to them.
         if np.count_nonzero(solid & area) < 0.5 * np.count_nonzero(area):
             continue
@@ -169,12 +173,12 @@ def blank_areas(
         # Above the sky, only what touches the edge of the image: a core of a star does not.
         if value > float(np.median(outside_values)):
             # Parts of the area that touch one of the four edges are kept.
-            label, _ = ndimage.label(area)
+            label, _ = scipy.ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
         # Beside a blank area, the image is as far from its value as anywhere, and few pixels of
         # the image touch it. Beside the even sky of an image without noise, there is faint light.
-        border = ndimage.binary_dilation(area) & ~area & ~bad
+        border = scipy.ndimage.binary_dilation(area) & ~area & ~bad
         if not border.any():
             continue
         height_beside = float(np.median(np.abs(values[border] - value)))
@@ -196,15 +200,13 @@ def constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     side : int
         Side of the squares in px.
     """
-    from scipy import ndimage
-
     # Filters would spread NaN in an order of their own.
     is_finite = np.isfinite(values)
-    low = ndimage.minimum_filter(np.where(is_finite, values, -np.inf), side, mode="nearest")
-    high = ndimage.maximum_filter(np.where(is_finite, values, np.inf), side, mode="nearest")
+    low = scipy.ndimage.minimum_filter(np.where(is_finite, values, -np.inf), side, mode="nearest")
+    high = scipy.ndimage.maximum_filter(np.where(is_finite, values, np.inf), side, mode="nearest")
     corner = (low == high) & np.isfinite(low)
     # A filter of even size covers the pixels from −s/2 to s/2 − 1 about its own.
-    return np.asarray(ndimage.maximum_filter(corner, side, origin=-1))
+    return np.asarray(scipy.ndimage.maximum_filter(corner, side, origin=-1))
 
 
 def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.3) -> None:
@@ -302,7 +304,7 @@ def overscan(
 # Areas that receive no light.
 
 
-def unexposed_area(
+def find_dark_area(
     image: np.ndarray, bad: np.ndarray, side: int = 8
 ) -> tuple[float, np.ndarray] | None:
     """Find the area outside of the image circle or a field stop, of any shape, and its soft edge.
@@ -314,6 +316,7 @@ def unexposed_area(
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        In any unit.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
     side : int
@@ -326,12 +329,10 @@ def unexposed_area(
     area : ndarray of bool, shape (h, w)
         Its pixels. Instead of the two, None if there is no such area.
     """
-    from scipy import ndimage
-
     # Mean of each square, and σ from the differences of neighbours: σ² = ⟨(x₁ − x₂)²⟩/2.
     rows, columns = (n // side for n in image.shape)
-    inner = np.s_[: rows * side, : columns * side]
-    squares = np.ma.array(image, mask=bad)[inner].reshape(rows, side, columns, side)
+    in_squares = np.s_[: rows * side, : columns * side]
+    squares = np.ma.array(image, mask=bad)[in_squares].reshape(rows, side, columns, side)
     mean = squares.mean(axis=(1, 3)).filled(np.inf)
     noise = np.sqrt(np.square(np.diff(squares, axis=3)).mean(axis=(1, 3)).filled(np.inf) / 2.0)
     has_values = np.isfinite(mean + noise)
@@ -345,28 +346,28 @@ def unexposed_area(
     # The area of these squares, with holes where it has stars; the part of it that is away from its
     # border; and the exposed squares, away from the border, too.
     around = np.ones((5, 5), dtype=bool)
-    area = ndimage.binary_closing(np.pad(is_dark | ~has_values, 5, mode="edge"), around)
-    area = ndimage.binary_opening(area, around[:3, :3])[5:-5, 5:-5] & has_values
-    inside = ndimage.binary_erosion(area, around[:3, :3], border_value=1)
-    exposed = has_values & ~ndimage.binary_dilation(area, around)
-    if min(np.count_nonzero(area), np.count_nonzero(exposed)) < 16 or not inside.any():
+    area = scipy.ndimage.binary_closing(np.pad(is_dark | ~has_values, 5, mode="edge"), around)
+    area = scipy.ndimage.binary_opening(area, around[:3, :3])[5:-5, 5:-5] & has_values
+    inside = scipy.ndimage.binary_erosion(area, around[:3, :3], border_value=1)
+    is_sky = has_values & ~scipy.ndimage.binary_dilation(area, around)
+    if min(np.count_nonzero(area), np.count_nonzero(is_sky)) < 16 or not inside.any():
         return None
-    sky, sky_noise = (float(np.median(values[exposed])) for values in (mean, noise))
-    spread, sky_spread = (float(robust_scatter(mean[part])) for part in (area, exposed))
+    sky, sky_noise = (float(np.median(values[is_sky])) for values in (mean, noise))
+    spread, sky_spread = (float(robust_scatter(mean[part])) for part in (area, is_sky))
     has_one_level = spread < 0.5 * sigma and sky_spread < 0.25 * (sky - level)
     is_darker = sigma < 0.7 * sky_noise and sky - level > 3.0 * sigma
     if not (has_one_level and is_darker and is_dark[inside].mean() > 0.98):
         return None
     # From squares to pixels: connected means of 5 × 5 px below half of the darkest sky.
-    half_level = 0.5 * (level + float(np.percentile(mean[exposed], 10)))
+    half_level = 0.5 * (level + float(np.percentile(mean[is_sky], 10)))
     core = np.zeros(image.shape, dtype=bool)
-    core[inner] = np.kron(area | is_dark, np.ones((side, side), dtype=bool))
-    smooth = ndimage.uniform_filter(interpolated(image, bad)[0], 5)
-    core = ndimage.binary_propagation(core, mask=core | (smooth < half_level))
+    core[in_squares] = np.kron(area | is_dark, np.ones((side, side), dtype=bool))
+    smooth = scipy.ndimage.uniform_filter(interpolated(image, bad)[0], 5)
+    core = scipy.ndimage.binary_propagation(core, mask=core | (smooth < half_level))
     # Level at each distance from these, in steps of 2 px. The edge ends where it is straight within
     # half the noise of a pixel over 32 px, as meshes of the sky follow it.
-    step = np.ceil(ndimage.distance_transform_edt(~core) / 2.0)
-    profile = ndimage.median(image, np.where(bad, -1.0, step), np.arange(1, 81))
+    step = np.ceil(scipy.ndimage.distance_transform_edt(~core) / 2.0)
+    profile = scipy.ndimage.median(image, np.where(bad, -1.0, step), np.arange(1, 81))
     bend = np.abs(profile[16:] - 2.0 * profile[8:-8] + profile[:-16])
     edge_steps = np.append(bend < 0.5 * sky_noise, True).argmax() + 1
     return level, ~bad & (step <= edge_steps)
@@ -394,25 +395,20 @@ def dead_pixels(
     ndarray of bool, shape (h, w)
         All False for an image of less than 32 px, in which a pixel has no surroundings.
     """
-    from scipy import ndimage
-
     around = np.ones((3, 3), dtype=bool)
     around[1, 1] = False
 
     def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
         # First against the noise of the square, then against that of the pixels around.
         clean = interpolated(band, bad)[0]
-        depth = ndimage.minimum_filter(clean, footprint=around) - clean
+        depth = scipy.ndimage.minimum_filter(clean, footprint=around) - clean
         row, column = np.nonzero((depth > least_sigma * noise) & ~bad)
         deep = depth[row, column] > least_sigma * _noise_around(clean, noise, row, column)
         dead = np.zeros(clean.shape, dtype=bool)
         dead[row[deep], column[deep]] = True
         return dead
 
-    # An image of less than 32 px has no surroundings to compare with.
-    if min(image.shape) < 32:
-        return np.zeros(image.shape, dtype=bool)
-    return _in_bands(find, image, bad, noise)
+    return find_in_bands(find, image, bad, noise)
 
 
 def cosmic_rays(
@@ -440,28 +436,21 @@ def cosmic_rays(
     -------
     ndarray of bool, shape (h, w)
     """
-    if min(image.shape) < 32:
-        return np.zeros(image.shape, dtype=bool)
     # How sharp the stars of this image are decides how sharp a cosmic ray must be.
     sharpness = sharpness_of_sources(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
         return np.zeros(image.shape, dtype=bool)
     ratio = max(5.0, 4.0 * sharpness)
     find = partial(cosmic_rays_of_band, saturate=saturate, ratio=ratio)
-    return np.asarray(_in_bands(find, image, bad, noise) & ~bad)
+    return np.asarray(find_in_bands(find, image, bad, noise) & ~bad)
 
 
 def cosmic_rays_of_band(
-    band: np.ndarray,
-    bad: np.ndarray,
-    noise: np.ndarray,
-    saturate: float | None,
-    ratio: float,
-    least_sigma: float = 6.0,
+    band: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None, ratio: float
 ) -> np.ndarray:
     """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio.
 
-    They are `least_sigma` times as high as the noise, or half of it beside a higher one.
+    They are 6 times as high as the noise, or half of it beside a higher one.
 
     Parameters
     ----------
@@ -473,39 +462,35 @@ def cosmic_rays_of_band(
         Counts from which a pixel is saturated.
     ratio : float
         Least L⁺ over fine structure F of a cosmic ray.
-    least_sigma : float
-        Least L⁺ of a cosmic ray, in σ.
     """
-    from scipy import ndimage
-
     # No cosmic ray is beside a bad pixel, or at the edge of a saturated star.
     clean = interpolated(band, bad)[0]
-    forbidden = ndimage.binary_dilation(bad)
+    forbidden = scipy.ndimage.binary_dilation(bad)
     if saturate is not None:
         # Pixels in and around areas of four saturated pixels or more.
-        label, _ = ndimage.label(band >= saturate, np.ones((3, 3)))
+        label, _ = scipy.ndimage.label(band >= saturate, np.ones((3, 3)))
         large = np.bincount(label.ravel()) >= 4
         large[0] = False
-        forbidden |= ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
+        forbidden |= scipy.ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
     cosmic = np.zeros(band.shape, dtype=bool)
     # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
     for _ in range(8):
         # L⁺ of all pixels; half of the limit on a cosmic ray picks out those that are worth a
         # closer look.
         edge = edges(clean)
-        row, column = np.nonzero((edge > 0.5 * least_sigma * noise) & ~forbidden & ~cosmic)
+        row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden & ~cosmic)
         if not row.size:
             break
         sigma = _noise_around(clean, noise, row, column)
         height, structure = _contrast(clean, edge, row, column)
         # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
-        limit = ratio * (np.maximum(structure, 0.0) + sigma)
-        sharp = (height > least_sigma * sigma) & (height > limit)
+        limit = np.maximum(6.0 * sigma, ratio * (np.maximum(structure, 0.0) + sigma))
+        sharp = height > limit
         new = np.zeros_like(cosmic)
         new[row[sharp], column[sharp]] = True
         # Beside a cosmic ray, half the height is enough for both.
-        is_beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
-        is_beside &= (height > 0.5 * least_sigma * sigma) & (height > 0.5 * limit)
+        is_beside = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
+        is_beside &= height > 0.5 * limit
         new[row[is_beside], column[is_beside]] = True
         if not new.any():
             break
@@ -531,8 +516,6 @@ def sharpness_of_sources(
     saturate : float, optional
         Counts from which a pixel is saturated; such sources are left out.
     """
-    from scipy import ndimage
-
     full = np.inf if saturate is None else saturate
     ratios = []
     # A band of rows at a time, which bounds the memory.
@@ -543,8 +526,8 @@ def sharpness_of_sources(
         edge = edges(clean)
         # Local maxima, so bright that noise does not matter, and not saturated.
         above = clean - np.median(clean)
-        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
-        top &= (ndimage.maximum_filter(clean, 5) < full) & ~hidden
+        top = (clean == scipy.ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
+        top &= (scipy.ndimage.maximum_filter(clean, 5) < full) & ~hidden
         row, column = np.nonzero(top)
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         row, column = row[brightest], column[brightest]

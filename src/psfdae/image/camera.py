@@ -19,7 +19,7 @@ from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.header_units import count_powers, parse_number, parse_unit
 from psfdae.image.sky_level import noise_correlation
-from psfdae.stars.moments import count_step, dither, remove_dither
+from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
 
 LARGEST_STAMP_PX = 256
 """Side of the largest stamps; planes of a cube that are larger are images."""
@@ -53,6 +53,10 @@ class CameraValue(NamedTuple):
 
     value: float | None
     origin: str
+
+    def times(self, factor: float) -> CameraValue:
+        """Return the number in a unit that is smaller by a factor."""
+        return self if self.value is None else self._replace(value=self.value * factor)
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,7 @@ def header_number(image: ImageFile, name: str) -> CameraValue:
     Parameters
     ----------
     image : ImageFile
+        Image with its headers.
     name : str
         A key of `HEADER_KEYS`. Cards may have other units than `HEADER_UNITS`, such as "10 mas".
 
@@ -177,16 +182,13 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     """
     # By the unit of the pixels: electrons and photons, counts, a rate of these, or another one.
     unit = parse_unit(image.unit)
-    if unit is None:
-        is_counts = not re.search("/|jy|erg|mag", image.unit, re.IGNORECASE)
-    else:
-        powers = count_powers(unit)
-        if powers in ({"electron": 1.0}, {"ph": 1.0}):
-            return CameraValue(float(unit.scale), "BUNIT")
-        if powers.get("s", 0.0) < 0 and powers.keys() <= {"electron", "ph", "adu", "s"}:
-            return CameraValue(None, "not known, the image is a rate")
-        is_counts = powers in ({}, {"adu": 1.0})
-    if not is_counts:
+    powers = {} if unit is None else count_powers(unit)
+    if unit is not None and powers in ({"electron": 1.0}, {"ph": 1.0}):
+        return CameraValue(float(unit.scale), "BUNIT")
+    if powers.get("s", 0.0) < 0 and powers.keys() <= {"electron", "ph", "adu", "s"}:
+        return CameraValue(None, "not known, the image is a rate")
+    is_not_counts = unit is None and re.search("/|jy|erg|mag", image.unit, re.IGNORECASE)
+    if is_not_counts or powers not in ({}, {"adu": 1.0}):
         return CameraValue(None, f"not known, the image is in {image.unit}")
     gain = header_number(image, "gain")
     if gain.origin == "GAIN":
@@ -217,26 +219,22 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
     levels, noises, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
-    deviations: list[np.ndarray] = []
+    deviations = np.full((len(starts), square_px + 4, columns), np.nan)
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
-        for start in starts:
+        for start, deviation in zip(starts, deviations, strict=True):
             band = pixels[start : start + square_px]
             band = np.where(np.isfinite(band), band, np.nan)
             highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
             # Medians of whole counts are those of the counts before rounding.
             band, dither_variance = dither(band, count_step(band))
-            deviation = np.full((square_px + 4, columns), np.nan)
-            deviations.append(deviation)
             for column in range(0, columns, square_px):
                 square = band[:, column : column + square_px]
                 values = square[np.isfinite(square)]
                 if values.size < square_px:
                     continue
-                # Stars in a square hardly change its median.
+                # Stars in a square hardly change its median and its median deviation.
                 level = float(np.median(values))
-                # σ of a normal distribution is 1.4826 times its median deviation.
-                noise = 1.4826 * float(np.median(np.abs(values - level)))
-                noise = float(remove_dither(np.array(noise), dither_variance))
+                noise = float(remove_dither(robust_scatter(values), dither_variance))
                 if noise > 0:
                     deviation[: len(band), column : column + square_px] = (square - level) / noise
                     levels.append(level)
@@ -244,7 +242,7 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     if not levels:
         return None
     # Bands begin at even rows. Stars count as 3 σ; medians would be the same for most whole counts.
-    bands = np.concatenate(deviations)
+    bands = deviations.reshape(-1, columns)
     is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
     white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
     checker = float(np.nanmean(white) - np.nanmean(black))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -124,10 +125,8 @@ class Catalogue:
         unit = getattr(self._column(name), "unit", None)
         pixel_unit = units.Unit(unit or "", parse_strict="silent")
         # A unit that astropy does not know may be a word for pixels.
-        if not isinstance(pixel_unit, units.UnrecognizedUnit) and pixel_unit not in (
-            units.pix,
-            units.dimensionless_unscaled,
-        ):
+        is_unit = not isinstance(pixel_unit, units.UnrecognizedUnit)
+        if is_unit and pixel_unit not in (units.pix, units.dimensionless_unscaled):
             raise ObservationError(
                 self.path, f"column {name!r} has the unit {str(unit)!r}, expected pixels"
             )
@@ -186,10 +185,8 @@ class Catalogue:
         texts = _texts(column) if is_text and column.ndim == 1 else []
         if any(re.search(r"[:hd\s]", text, re.IGNORECASE) for text in texts):
             # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
-            whole_parts = [
-                float(number[0]) for number in map(re.compile(r"\d+").match, texts) if number
-            ]
-            if max(whole_parts, default=0) > 24:
+            whole_parts = filter(None, map(re.compile(r"\d+").match, texts))
+            if max((float(number[0]) for number in whole_parts), default=0) > 24:
                 sexagesimal_unit = "deg"
             # Rows without a text stay NaN.
             angles = np.full(len(texts), np.nan)
@@ -257,12 +254,10 @@ class Catalogue:
         # The first that the list has; of two that differ by their case only, none.
         names = ("id", "source_id", "number", "star_id", "objid", "obj_id")
         for alias in (*names, "object_id", "label", "name"):
-            try:
+            with suppress(ColumnError):
                 name = self._resolve(alias)
-            except ColumnError:
-                continue
-            if name is not None and self._column(name).ndim == 1:
-                return name
+                if name is not None and self._column(name).ndim == 1:
+                    return name
         return None
 
     def columns(self, rows: np.ndarray) -> Table:
@@ -321,10 +316,8 @@ def _texts(column: Column) -> list[str]:
     """
     # FITS has text as bytes.
     values = np.where(np.ma.getmaskarray(column), "", np.ma.getdata(column).astype(object))
-    return [
-        (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
-        for value in values.tolist()
-    ]
+    texts = (v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values)
+    return [text.strip() for text in texts]
 
 
 def read_catalogue(path: Path) -> Catalogue:
@@ -358,14 +351,12 @@ def as_catalogue(star_list: StarList) -> Catalogue:
     path = Path("catalogue")
     with reading(path):
         # A table of sky coordinates; an array or a sequence of pairs; else a table.
+        is_pairs = isinstance(star_list, np.ndarray) and star_list.dtype.names is None
+        if isinstance(star_list, Sequence):
+            is_pairs = not any(isinstance(row, Mapping) for row in star_list)
         if isinstance(star_list, SkyCoord):
             star_list = {"sky": star_list.reshape(-1)}
-        elif isinstance(star_list, np.ndarray):
-            if star_list.dtype.names is None:
-                star_list = _pairs(path, star_list)
-        elif isinstance(star_list, Sequence) and not any(
-            isinstance(row, Mapping) for row in star_list
-        ):
+        elif is_pairs:
             star_list = _pairs(path, star_list)
         # pandas has no units; astropy reads its records.
         records = getattr(star_list, "to_records", None)  # of a DataFrame

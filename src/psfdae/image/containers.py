@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -152,10 +153,8 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
         return value
     # Counts, adu and DN are not converted into each other, so the first unit that fits is taken.
     for unit in units.split():
-        try:
+        with suppress(u.UnitConversionError, TypeError):
             return float(value.to_value(u.Unit(unit)))
-        except (u.UnitConversionError, TypeError):
-            continue
     target_unit = " or ".join(units.split())
     raise ObservationError(path, f"{name}={value}: expected a number of {target_unit}")
 
@@ -173,10 +172,8 @@ def _of_nddata(data: NDData) -> fits.HDUList:
     for key, value in data.meta.items():
         # Meta may hold anything; what is no card of FITS is left out.
         if isinstance(value, str | int | float | bool) and not str(key).startswith("NAXIS"):
-            try:
+            with suppress(ValueError):
                 header[str(key)] = value
-            except ValueError:
-                continue
     if unit := fits_unit(data.unit):
         header["BUNIT"] = unit
     hdus = _hdus(np.asarray(data.data), header, data.mask, sigma_of(data))

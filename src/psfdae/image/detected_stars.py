@@ -54,9 +54,7 @@ def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
     stars = observation.detections.table
     # SExtractor's X_IMAGE counts from 1.
     x, y = (np.asarray(stars[name]) - 1.0 for name in ("X_IMAGE", "Y_IMAGE"))
-    sky_position = observation.on_sky(x, y)
-    on_sky = {} if sky_position is None else dict(zip(("ra", "dec"), sky_position, strict=True))
-    columns = {"id": np.asarray(stars["id"]), "x": x, "y": y, **on_sky}
+    columns = {"id": np.asarray(stars["id"]), "x": x, "y": y, **observation.sky_columns(x, y)}
     columns["flux_iso"] = np.asarray(stars["FLUX_ISO"])
     columns["background"] = np.asarray(stars["BACKGROUND"])
     return star_table(columns, observation.unit)

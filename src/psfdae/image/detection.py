@@ -8,16 +8,17 @@ photutils finds them: sources are connected pixels above the sky (Bertin & Arnou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from psfdae.image.interpolation import interpolated
-from psfdae.image.sky_level import NO_STRUCTURE, SkyLevel, SkyStructure, sky_level
+from psfdae.image.sky_level import SkyLevel, SkyStructure, sky_level
 from psfdae.image.source_size import measure_size
-from psfdae.stars.moments import FWHM_OF_SIGMA, count_step
+from psfdae.stars.moments import FWHM_OF_SIGMA
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,6 @@ class Sky:
     structure : SkyStructure
     notes : tuple of str
         Sentences on what is unusual in the sky.
-    count : float
-        Step of the image's pixels if they are whole counts and noise is not much wider, else 0.
     """
 
     flat: np.ndarray
@@ -46,9 +45,8 @@ class Sky:
     noise: np.ndarray
     bad: np.ndarray
     noise_scale: float
-    structure: SkyStructure = NO_STRUCTURE
+    structure: SkyStructure = field(default_factory=SkyStructure)
     notes: tuple[str, ...] = ()
-    count: float = 0.0
     least_px: ClassVar[int] = 5
     """Least number of connected pixels above the threshold that are a source."""
 
@@ -58,12 +56,10 @@ class Sky:
 
         Other bad pixels are interpolated, so that a star with one of these is one source.
         """
-        from scipy import ndimage
-
         if not self.bad.any():
             return self.bad
         # Part of the 5 × 5 pixels that is bad.
-        around = ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
+        around = scipy.ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
         return np.asarray(self.bad & (around > 0.5))
 
     def _above(self, threshold: float, fwhm_px: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -71,16 +67,14 @@ class Sky:
 
         It is smoothed slightly, by [1, 2, 1]/4 along both axes, or by a Gaussian of that FWHM.
         """
-        from scipy import ndimage
-
         if not fwhm_px:
             # Noise of a weighted sum of pixels, σ √(Σ w²).
             kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
             noise_part = float(np.sqrt(np.square(kernel).sum()))
-            return ndimage.convolve(self.flat, kernel), threshold * noise_part * self.noise
+            return scipy.ndimage.convolve(self.flat, kernel), threshold * noise_part * self.noise
         # Noise of a pixel after a Gaussian of σ_g: σ/(2 √π σ_g).
         sigma = fwhm_px / FWHM_OF_SIGMA
-        smooth = ndimage.gaussian_filter(self.flat, sigma)
+        smooth = scipy.ndimage.gaussian_filter(self.flat, sigma)
         return smooth, threshold * self.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
     def stars(self, threshold: float, wide_px: float = 7.0) -> dict[str, np.ndarray]:
@@ -128,18 +122,15 @@ class Sky:
             return {"id": np.empty(0, np.int64)}
         # Centroids and fluxes; a source of negative pixels only has none.
         catalogue = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
-        x, y, flux = (
-            np.atleast_1d(v)
-            for v in (catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux)
-        )
+        columns = catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux
+        x, y, flux = (np.atleast_1d(column) for column in columns)
         # Sources of which the centroid is not a number are left out.
         finite = np.isfinite(x) & np.isfinite(y)
         x, y, flux = x[finite], y[finite], flux[finite]
         # Level of the sky at the pixel of each source.
-        row, column = (
-            np.clip(np.rint(v), 0, n - 1).astype(int)
-            for v, n in zip((y, x), self.level.shape, strict=True)
-        )
+        height, width = self.level.shape
+        row = np.clip(np.rint(y), 0, height - 1).astype(int)
+        column = np.clip(np.rint(x), 0, width - 1).astype(int)
         level = self.level[row, column]
 
         def rounded(values: np.ndarray) -> np.ndarray:
@@ -156,16 +147,14 @@ class Sky:
 
     def covered(self, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:
         """Return True for pixels (n,) on which a source stands; never off the image."""
-        from scipy import ndimage
-
         # As photutils parts an image, which takes a second to be loaded.
         smooth, limit = self._above(threshold)
         above = (smooth > limit) & ~self.holes
         # The middle of a ring, such as a star out of focus, is on the star: of up to 100 px.
-        enclosed, _ = ndimage.label(ndimage.binary_fill_holes(above) & ~above)
-        small = np.bincount(enclosed.ravel()) <= 100
+        hole_label, _ = scipy.ndimage.label(scipy.ndimage.binary_fill_holes(above) & ~above)
+        small = np.bincount(hole_label.ravel()) <= 100
         small[0] = False
-        parts, _ = ndimage.label(above | small[enclosed], np.ones((3, 3)))
+        parts, _ = scipy.ndimage.label(above | small[hole_label], np.ones((3, 3)))
         # Connected pixels that are enough for a source.
         source = np.bincount(parts.ravel()) >= self.least_px
         source[0] = False
@@ -183,7 +172,6 @@ def sky_of(
     least_noise: float = 0.0,
     measured: SkyLevel | None = None,
     structure: SkyStructure | None = None,
-    count: float | None = None,
 ) -> Sky:
     """Return an image without its sky, and what was subtracted.
 
@@ -200,8 +188,6 @@ def sky_of(
         Sky of the image, if it was measured before.
     structure : SkyStructure, optional
         Structure of the sky, if it is known from the image with its stars.
-    count : float, optional
-        Step of the pixels if they are whole counts; by default the pixels show it.
 
     Raises
     ------
@@ -209,9 +195,8 @@ def sky_of(
         If no mesh has enough pixels that count.
     """
     # Level and noise by the pixels that count.
-    count = count_step(np.where(bad, np.nan, image)) if count is None else count
     image = np.where(bad, 0.0, image)
-    sky = sky_level(image, bad, structure, count=count) if measured is None else measured
+    sky = sky_level(image, bad, structure) if measured is None else measured
     level, noise, structure, notes = sky
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
@@ -223,4 +208,4 @@ def sky_of(
         # Bad pixels, of which the map may have no σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
     flat = interpolated((image - level).astype(np.float32), bad)[0]
-    return Sky(flat, level, noise, bad, scale, structure, notes, count)
+    return Sky(flat, level, noise, bad, scale, structure, notes)

@@ -33,6 +33,9 @@ ORIGIN_KEYS = {
 detector; LTV of IRAF counts the other way. The first key that both headers have is used: DETSEC
 differs between the chips of a mosaic."""
 
+Frames = Mapping[str, Sequence[float]]
+"""Numbers along x and y, by the first key of the cards that have them."""
+
 
 def detector_frames(image: ImageFile) -> dict[str, list[float]]:
     """Return the numbers along x and y under the first key of each system in a header.
@@ -63,10 +66,7 @@ def detector_frames(image: ImageFile) -> dict[str, list[float]]:
 
 
 def find_offset(
-    trained: Mapping[str, Sequence[float]],
-    trained_px: np.ndarray,
-    frames: Mapping[str, Sequence[float]],
-    image_px: np.ndarray,
+    training_frames: Frames, training_px: np.ndarray, image_frames: Frames, image_px: np.ndarray
 ) -> np.ndarray | None:
     """Return the position (x, y) of an image's first pixel in another image, of the training.
 
@@ -75,9 +75,9 @@ def find_offset(
 
     Parameters
     ----------
-    trained, frames : mapping
+    training_frames, image_frames : mapping
         Frames of both, from `detector_frames`.
-    trained_px, image_px : ndarray, shape (2,)
+    training_px, image_px : ndarray, shape (2,)
         Columns and rows.
 
     Raises
@@ -86,18 +86,20 @@ def find_offset(
         If the images are binned differently, or one is mirrored.
     """
     origins = {keys[0]: rule for keys, rule in ORIGIN_KEYS.items()}
-    for key in trained.keys() & frames.keys() - origins.keys():
-        if not np.allclose(trained[key], frames[key], rtol=1e-3):
-            steps = ("×".join(f"{step:g}" for step in f[key]) for f in (frames, trained))
+    both_frames = training_frames, image_frames
+    for key in training_frames.keys() & image_frames.keys() - origins.keys():
+        if not np.allclose(training_frames[key], image_frames[key], rtol=1e-3):
+            steps = ("×".join(f"{step:g}" for step in f[key]) for f in reversed(both_frames))
             raise ValueError(f"{key} is {', not '.join(steps)}")
-    known = [[key for key in origins if key in f] for f in (trained, frames)]
-    shared = [key for key in known[0] if key in known[1]]
-    if not shared and bool(known[0]) == bool(known[1]):
+    training_keys, image_keys = ([key for key in origins if key in f] for f in both_frames)
+    common_keys = [key for key in training_keys if key in image_keys]
+    if not common_keys and bool(training_keys) == bool(image_keys):
         return None
-    key = [*shared, *known[0], *known[1]][0]
-    sign, whole = origins[key]
-    offset = sign * np.subtract(frames.get(key, [whole] * 2), trained.get(key, [whole] * 2))
+    key = [*common_keys, *training_keys, *image_keys][0]
+    sign, first_number = origins[key]
+    training_start, image_start = (f.get(key, [first_number] * 2) for f in both_frames)
+    offset = sign * np.subtract(image_start, training_start)
     # The first and the last pixel of the one lie within the other.
-    ends = np.stack([offset, trained_px - offset - image_px])
+    ends = np.stack([offset, training_px - offset - image_px])
     is_contained = (ends >= 0).all() or (ends <= 0).all()
-    return np.asarray(offset) if shared or is_contained else None
+    return np.asarray(offset) if common_keys or is_contained else None

@@ -18,7 +18,7 @@ import tempfile
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -179,8 +179,8 @@ def temporary_file(name: Path, content: IO[bytes], bytes_max: float = math.inf) 
         If there are more bytes than `bytes_max`.
     """
     folder = Path(tempfile.gettempdir())
-    for unfinished in find_left_over(folder, "psfdae"):
-        unfinished.unlink(missing_ok=True)
+    for left_over in find_left_over(folder, "psfdae"):
+        left_over.unlink(missing_ok=True)
     plain, process = PlainFile(name, folder / temporary_name("psfdae"), is_copy=True), os.getpid()
     # Only the user reads it.
     plain.path.touch(0o600, exist_ok=False)
@@ -310,12 +310,8 @@ class ImageFile:
 
     def times(self, factor: float) -> ImageFile:
         """Return the image with all pixels times a factor."""
-        return replace(
-            self,
-            bscale=self.bscale * factor,
-            bzero=self.bzero * factor,
-            unit_factor=self.unit_factor * factor,
-        )
+        names = ("bscale", "bzero", "unit_factor")
+        return replace(self, **{name: getattr(self, name) * factor for name in names})
 
     def to_noise_unit(self) -> ImageFile:
         """Return the image in a unit in which squares of its pixels fit into single precision.
@@ -361,10 +357,9 @@ class ImageFile:
 
 def card_value(header: Header, key: str) -> Any:
     """Return the value of a card; None if it is absent or cannot be parsed."""
-    try:
+    with suppress(Exception):  # astropy parses on access, and raises what the damage brings about
         return header[key]
-    except Exception:  # astropy parses on access, and raises what the damage brings about
-        return None
+    return None
 
 
 def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
@@ -483,15 +478,19 @@ def science_images(path: Path) -> dict[str, int]:
 
 
 def map_kind_by_name(name: str) -> str | None:
-    """Return which map of an image an extension is: "mask", "error", "variance" or "weight".
+    """Return which map of an image an extension is: "mask", "error", "variance", "weight", "other".
 
     By the names that JWST, HST, LCO, LSST, Gemini and ccdproc give them; None for another name.
     """
+    # Others are sky, context and exposure maps, samples up the ramp, distortions of the WCS, and
+    # the pixels whose sum is the flux of a star of Kepler or TESS.
     names_by_kind = {
         "mask": "DQ|MASK|BPM|FLAGS?",
         "error": "(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?",
         "variance": "(VAR|VARIANCE)(_.*)?",  # also VAR_POISSON, a part of the variance
         "weight": "IVAR|WEIGHT|WHT|WGT",
+        "other": "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|"
+        "D2IMARR|APERTURE",
     }
     name = name.strip().upper()
     return next((kind for kind, form in names_by_kind.items() if re.fullmatch(form, name)), None)
@@ -499,14 +498,7 @@ def map_kind_by_name(name: str) -> str | None:
 
 def is_science(name: str) -> bool:
     """Return True unless the name is that of a map which goes with an image, such as DQ."""
-    # Sky, context and exposure maps, samples up the ramp, distortions of the WCS, and the pixels
-    # whose sum is the flux of a star of Kepler or TESS.
-    other_names = (
-        "BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE|WCSDVARR|D2IMARR|"
-        "APERTURE"
-    )
-    is_other = re.fullmatch(other_names, name.strip().upper()) is not None
-    return map_kind_by_name(name) is None and not is_other
+    return map_kind_by_name(name) is None
 
 
 def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
@@ -572,9 +564,8 @@ def has_pixels(hdu: Any) -> bool:
 
     is_image = isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
     # Without axes, or with an axis of length 0, there are no pixels.
-    return (
-        is_image and not isinstance(hdu, fits.GroupsHDU) and bool(hdu.shape) and 0 not in hdu.shape
-    )
+    has_size = is_image and bool(hdu.shape) and 0 not in hdu.shape
+    return has_size and not isinstance(hdu, fits.GroupsHDU)
 
 
 def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
@@ -596,7 +587,8 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     # Without a scale, astropy would take a pixel for 1 degree.
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
         return None
-    try:
+    # wcslib and astropy raise many kinds of errors, all of which mean the same here.
+    with suppress(Exception):
         # Axes beyond the plane of the image, such as a wavelength, do not mix with the sky.
         wcs = WCS(header, fobj=hdus).sub([1, 2])
         # The reference pixel has a place on the sky, in a frame with a way to ICRS, and this place
@@ -604,8 +596,7 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
         pixel_to_sky(wcs, *wcs.wcs.crpix[:, None])
         pixel = wcs.wcs_world2pix(wcs.wcs_pix2world([wcs.wcs.crpix], 1), 1)
         return wcs if np.allclose(pixel, wcs.wcs.crpix, rtol=0.0, atol=1e-3) else None
-    except Exception:  # wcslib and astropy raise many kinds, all of which mean the same here
-        return None
+    return None
 
 
 def sky_frame(wcs: WCS) -> BaseCoordinateFrame:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -31,18 +32,15 @@ def parse_unit(text: str) -> UnitBase | None:
     from astropy import units as u
 
     def replace_word(match: re.Match[str]) -> str:
-        word = match[0]
-        matches = (n for n, form in SPELLINGS.items() if re.fullmatch(form, word, re.IGNORECASE))
-        return next(matches, word)
+        units = (n for n, form in SPELLINGS.items() if re.fullmatch(form, match[0], re.IGNORECASE))
+        return next(units, match[0])
 
     # Words are letters, not those of an exponent as in 1e-20; e- is one, but not in e-1.
     words = re.sub(r"(?<![\d.])(?:e-(?!\d)|[a-z]+)|''|\"", replace_word, text.strip(), flags=re.I)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), suppress(ValueError, TypeError):
         warnings.simplefilter("ignore", u.UnitsWarning)  # several slashes
-        try:
-            return u.Unit(words)
-        except (ValueError, TypeError):
-            return None
+        return u.Unit(words)
+    return None
 
 
 def count_powers(unit: UnitBase) -> dict[str, float]:
@@ -76,7 +74,7 @@ def parse_number(value: object, unit: str) -> float | None:
     if not isinstance(value, str) or match is None or re.search(r",\d{3}(?!\d)", match[1]):
         return None
     unit_of_text: Any = parse_unit(match[2])
-    try:
+    with suppress(ValueError, TypeError, ZeroDivisionError):  # no number, or of another unit
         number = float(re.sub("[dD]", "e", match[1].replace(",", ".")))
         # "1.5" has no unit; ADU/e- is the inverse of the gain.
         if unit_of_text == u.dimensionless_unscaled:
@@ -86,5 +84,4 @@ def parse_number(value: object, unit: str) -> float | None:
             if candidate.unit.is_equivalent(u.Unit(unit)):
                 return float(candidate.to_value(unit))
         return float((1.0 / quantity).to_value(unit))
-    except (ValueError, TypeError, ZeroDivisionError):  # no number, or of another unit
-        return None
+    return None

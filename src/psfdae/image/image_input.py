@@ -198,15 +198,13 @@ class ImageInput(ImageStatements):
             If a value has another unit, or is no number above 0; likewise the threshold.
         """
         # Values with the units that they may have; the first is that of the number.
-        stated: dict[str, tuple[Number | None, str]] = {
-            "pixel_scale_arcsec": (self.pixel_scale_arcsec, "arcsec/pix arcsec"),
-            "gain": (self.gain, "electron/adu electron/ct electron/DN"),
-            "read_noise": (self.read_noise, "electron"),
-            "saturate": (self.saturate, f"adu ct DN {image_unit.replace(' ', '')}"),
+        units = {
+            "pixel_scale_arcsec": "arcsec/pix arcsec",
+            "gain": "electron/adu electron/ct electron/DN",
+            "read_noise": "electron",
+            "saturate": f"adu ct DN {image_unit.replace(' ', '')}",
         }
-        numbers = {
-            name: in_unit(value, units, name, self.path) for name, (value, units) in stated.items()
-        }
+        numbers = {k: in_unit(getattr(self, k), unit, k, self.path) for k, unit in units.items()}
         # A count, a scale or a threshold of 0 has no meaning.
         for name, number in {**numbers, "threshold": self.detection_sigma}.items():
             if number is not None and not (math.isfinite(number) and number > 0):

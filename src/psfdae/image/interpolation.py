@@ -47,10 +47,7 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
             weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
     for axis in (np.array([1, 0]), np.array([0, 1])):
-        places = [
-            (row + reach + step * axis[0], column + reach + step * axis[1])
-            for step in (-2, -1, 1, 2)
-        ]
+        places = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
         values, is_good = [padded[at] for at in places], [good[at] for at in places]
         has_line = is_good[1] & is_good[2]
         has_cubic = has_line & is_good[0] & is_good[3]

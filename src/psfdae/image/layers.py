@@ -35,7 +35,7 @@ from psfdae.image.fits_file import (
     open_hdus,
     open_pixels,
 )
-from psfdae.image.trails import with_trails
+from psfdae.image.trails import add_trails
 
 if TYPE_CHECKING:
     from psfdae.image.image_input import ImageInput
@@ -79,13 +79,9 @@ class NoiseMap:
         light : ndarray or float
             Light of stars in the same pixels, above the sky, in counts.
         """
-        # σ² of the sky and of the light of stars.
+        # σ² of the sky and of the light of stars: of σᵖ, the power 2/p.
         with np.errstate(all="ignore"):
-            if self.kind == "weight":
-                # weight = 1/σ², error = σ, variance = σ².
-                variance = 1.0 / values
-            else:
-                variance = values**2 if self.kind == "error" else values
+            variance = values ** (2 // POWER_OF_SIGMA[self.kind])
             has_value = np.isfinite(variance) & (variance > 0)
             # Light is noisy, too; at least a hundredth of the variance is of the sky.
             variance = np.clip(variance - self.photons * light, 0.01 * variance, 2.0 * variance)
@@ -195,7 +191,7 @@ class Layers:
                     unit, saturate = self.image.unit_factor, self.saturate
                     bad_pixels = find_bad_pixels(image / unit, masked, self.image.headers, saturate)
                     limit = None if saturate is None else saturate * unit
-                    self._bad_pixels.append(with_trails(image, bad_pixels, limit))
+                    self._bad_pixels.append(add_trails(image, bad_pixels, limit))
             except ClippedSkyError as error:
                 raise ObservationError(self.image.path, str(error)) from None
         return self._bad_pixels[0]
@@ -262,13 +258,9 @@ def find_layers(
     layers_of_file = {} if is_cube else layers_beside(image)
     mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
     gain, read_noise = camera["gain"].value, camera["read noise"].value
-    layers = Layers(
-        image,
-        mask,
-        bad_bits,
-        least_noise=factor * read_noise / gain if read_noise and gain else 0.0,
-        saturate=camera["saturation"].value,
-    )
+    least_noise = factor * read_noise / gain if read_noise and gain else 0.0
+    saturate = camera["saturation"].value
+    layers = Layers(image, mask, bad_bits, least_noise=least_noise, saturate=saturate)
     # The map of noise: one that is stated, else that of the file, if nothing is.
     maps = {kind: getattr(source, kind) for kind in NOISE_MAPS}
     stated = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
@@ -319,11 +311,11 @@ def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
     # Part of the pixels that have a σ or σ² above 0.
     with open_pixels(noise, in_pieces=False) as pixels:
         has_value = np.nan_to_num(pixels[:], posinf=0.0) > 0
-    good, without = float(has_value.mean()), int(np.count_nonzero(~has_value))
-    if good < 0.5:
-        return None, f"not {noise.label} ({100 * good:.0f} % of its pixels are above 0)"
+    share, bad_count = float(has_value.mean()), int(np.count_nonzero(~has_value))
+    if share < 0.5:
+        return None, f"not {noise.label} ({100 * share:.0f} % of its pixels are above 0)"
     words = f"{noise.label} as {'σ' if kind == 'error' else 'σ²'}"
-    return NoiseMap(noise, kind), words + (f" (bad pixels: {without})" if without else "")
+    return NoiseMap(noise, kind), words + (f" (bad pixels: {bad_count})" if bad_count else "")
 
 
 def mask_and_bits(
@@ -512,14 +504,9 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
         if not is_science(science_hdu.name) or (science_count > 1 and not of_pipeline):
             return {}
         # Layers of its size and version, whose name is no part of another, such as VAR_POISSON.
-        places = [
-            k
-            for k, hdu in images
-            if not is_science(hdu.name)
-            and "_" not in hdu.name
-            and tuple(hdu.shape)[-2:] == image.shape[-2:]
-            and hdu.ver == science_hdu.ver
-        ]
+        maps = [(k, hdu) for k, hdu in images if not is_science(hdu.name) and "_" not in hdu.name]
+        maps = [(k, hdu) for k, hdu in maps if hdu.ver == science_hdu.ver]
+        places = [k for k, hdu in maps if tuple(hdu.shape)[-2:] == image.shape[-2:]]
     # The first layer of each kind.
     layers: dict[str, ImageFile] = {}
     for place in places:

@@ -68,9 +68,9 @@ def read_list_table(path: Path) -> Table:
         text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = "\x00"
-    other = name_other_format(start)
-    if "\x00" in text or other:
-        raise ObservationError(path, f"neither a FITS table nor text in UTF-8{other}")
+    format_name = name_other_format(start)
+    if "\x00" in text or format_name:
+        raise ObservationError(path, f"neither a FITS table nor text in UTF-8{format_name}")
     lines = [line for line in text.splitlines() if line.strip()]
     if not lines:
         raise ObservationError(path, "the catalogue is empty")
@@ -92,6 +92,7 @@ def fits_table(file: PlainFile) -> Table:
     Parameters
     ----------
     file : PlainFile
+        FITS file, which messages call by its `name`.
 
     Raises
     ------
@@ -104,11 +105,8 @@ def fits_table(file: PlainFile) -> Table:
     path = file.name
     with reading(path), open_hdus(file, memmap=True) as hdus:
         # LDAC_IMHEAD has the header of the image, LDAC_OBJECTS the stars.
-        tables = [
-            hdu
-            for hdu in hdus
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and hdu.name != "LDAC_IMHEAD"
-        ]
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        tables = [hdu for hdu in tables if hdu.name != "LDAC_IMHEAD"]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
         if len(objects) != 1:
             table_names = shorten([hdu.name or "(no name)" for hdu in objects])
@@ -145,8 +143,8 @@ def parquet_table(file: PlainFile) -> Table:
         from pyarrow import parquet
 
         # Rows that are equal take no space in the file.
-        described = parquet.read_metadata(file.path)
-        size = 8 * described.num_rows * described.num_columns
+        metadata = parquet.read_metadata(file.path)
+        size = 8 * metadata.num_rows * metadata.num_columns
         if size > compute_unpacked_max(file.path.stat().st_size):
             raise ObservationError(file.name, f"unpacks to {size} bytes; write it as FITS")
         # Damaged pages are found by their checksums, if the file has them.
@@ -170,7 +168,9 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
     """
     from astropy.io import ascii as text_tables
 
-    options = {"format": find_text_format(lines)}
+    head = "\n".join(lines[:200])
+    names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
+    options = {"format": next(names, "basic")}
     if options["format"] == "basic" and (lines := plain_rows(lines)):
         # The first mark that the line of names has; of tabs, the first name may be blank.
         options["delimiter"] = next((mark for mark in ",;\t" if mark in lines[0]), " ")
@@ -178,7 +178,7 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
             options = {"format": "tab"}
     if not lines:
         raise ObservationError(path, "the catalogue has no stars")
-    if is_row_of_numbers(lines[0]):
+    if has_mostly_numbers(lines[0]):
         problem = f"no names of columns: its first row is {lines[0].strip()[:40]!r}"
         raise ObservationError(path, f"{problem}; write a row such as 'x y' above it")
     if "X(FITS)_T1" in lines[0]:
@@ -201,17 +201,11 @@ TEXT_FORMATS = {
     "ipac": r"[|\\]",
     "cds": r"(?s:.*)^Byte-by-byte Description",
 }
-"""Formats of astropy that describe their columns above the rows, by their beginning."""
+"""Formats of astropy that describe their columns above the rows, by their beginning; any other text
+table is "basic"."""
 
 
-def find_text_format(lines: Sequence[str]) -> str:
-    """Return the format of a text table by its lines that are not blank, "basic" for any other."""
-    head = "\n".join(lines[:200])
-    names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
-    return next(names, "basic")
-
-
-def is_row_of_numbers(row: str) -> bool:
+def has_mostly_numbers(row: str) -> bool:
     """Return whether most words of a row of a text table are numbers, or sexagesimal angles."""
     words = re.split(r"[,;|\s]+", row.strip())
     form = re.compile(r"[-+.:\d]+([eE][-+]?\d+)?")
@@ -234,7 +228,7 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
     if not rows:
         return []
     preamble = lines[: lines.index(rows[0])]
-    if preamble and is_row_of_numbers(rows[0]):
+    if preamble and has_mostly_numbers(rows[0]):
         return [preamble[-1].lstrip("# \t"), *rows]
     has_dashes = len(rows) > 2 and "--" in rows[2] and not rows[2].strip("-\t;|, ")
     return [rows[0], *rows[3:]] if has_dashes else rows
@@ -276,11 +270,8 @@ def votable(path: Path, content: bytes) -> Table:
         if len(widths) > COLUMNS_MAX or rows * sum(widths) > compute_unpacked_max(len(content)):
             raise ObservationError(path, f"damaged: {len(widths)} columns, {rows} rows")
         # Tables of other things than stars may be there without rows.
-        tables = [
-            table.to_table(use_names_over_ids=True)
-            for table in parse(io.BytesIO(content), verify="ignore").iter_tables()
-            if len(table.array)
-        ]
+        all_tables = parse(io.BytesIO(content), verify="ignore").iter_tables()
+        tables = [t.to_table(use_names_over_ids=True) for t in all_tables if len(t.array)]
     if len(tables) != 1:
         raise ObservationError(path, f"{len(tables)} tables with stars in a VOTable, expected one")
     return tables[0]

@@ -46,13 +46,9 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     x, y = (listed - 0.5).T
     crosses_edge = cut_image(sky.bad, shape, x, y, stamp_px=13, margin=0)[2]
     listed = listed[~crosses_edge]
-    if len(listed) < fewest:
-        return None
     x, y = (listed - 0.5).T
-    stamps, noise, bad = (
-        cut_image(layer, shape, x, y, stamp_px=13, margin=0)[0]
-        for layer in (sky.flat, sky.noise, sky.bad)
-    )
+    layers = sky.flat, sky.noise, sky.bad
+    stamps, noise, bad = (cut_image(v, shape, x, y, stamp_px=13, margin=0)[0] for v in layers)
     # Stars whose inner 5 × 5 pixels are good and stand 20 σ above the sky, the brightest 500.
     core = np.s_[:, 4:9, 4:9]
     snr = stamps[core].sum(axis=(1, 2)) / (5 * np.median(noise, axis=(1, 2)))

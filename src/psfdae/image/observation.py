@@ -194,11 +194,8 @@ class Observation:
 
     def to_sky_unit(self) -> Observation:
         """Return the same with gain and saturation for pixels in the unit of `sky`."""
-        gain, saturation = self.camera["gain"], self.camera["saturation"]
-        if gain.value is not None:
-            gain = gain._replace(value=gain.value / self.unit_factor)
-        if saturation.value is not None:
-            saturation = saturation._replace(value=saturation.value * self.unit_factor)
+        gain = self.camera["gain"].times(1.0 / self.unit_factor)
+        saturation = self.camera["saturation"].times(self.unit_factor)
         return replace(self, camera=self.camera | {"gain": gain, "saturation": saturation})
 
     def to_image_unit(self, values: np.ndarray) -> np.ndarray:
@@ -210,10 +207,10 @@ class Observation:
         """Celestial WCS of the image; None without one, and of a cube of stamps."""
         return None if self.shape is None else self._layers.image.wcs
 
-    def on_sky(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def sky_columns(self, x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
         """Return ICRS coordinates in degrees of 0-based pixels (n,).
 
-        None without a celestial WCS, and of a cube of stamps.
+        Empty without a celestial WCS, and for a cube of stamps.
 
         Parameters
         ----------
@@ -222,14 +219,14 @@ class Observation:
 
         Returns
         -------
-        tuple of ndarray, or None
-            Right ascension and declination, shape (n,) each.
+        dict of str to ndarray
+            Right ascension `ra` and declination `dec`, shape (n,) each.
         """
         if (wcs := self.wcs) is None:
-            return None
+            return {}
         with reading(self.path):
             coordinates = pixel_to_sky(wcs, x, y)
-        return coordinates.ra.deg, coordinates.dec.deg
+        return {"ra": coordinates.ra.deg, "dec": coordinates.dec.deg}
 
     def summary(self) -> str:
         """Return lines: camera values with their origins, remarks, pixels and rows left out."""

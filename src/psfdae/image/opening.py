@@ -85,10 +85,9 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observat
                 layers, camera, photon_remarks = with_photons(layers, camera, sky)
                 remarks += photon_remarks
             if threshold is not None:
-                detections = detected_stars(source.path, sky, threshold, image.unit_factor)
-    stars, positions, list_remarks = locate_stars(
-        source, image, detections or table, layers, is_cube
-    )
+                detections = detect_stars(source.path, sky, threshold, image.unit_factor)
+    star_list = detections or table
+    stars, positions, list_remarks = locate_stars(source, image, star_list, layers, is_cube)
     return Observation(
         source.path,
         stamp_px,
@@ -153,8 +152,7 @@ def image_or_cube(
                 f"{keyword('detect', True)}",
             )
         raise ObservationError(
-            image.path,
-            f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger",
+            image.path, f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger"
         )
     if is_searched and (not is_image or table is not None or source.origin is not None):
         raise ObservationError(
@@ -164,7 +162,7 @@ def image_or_cube(
     return image, not is_image
 
 
-def detected_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.0) -> Catalogue:
+def detect_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.0) -> Catalogue:
     """Return the stars of an image that are `threshold` σ above its sky.
 
     Parameters

@@ -83,16 +83,9 @@ CONVENTIONS: tuple[tuple[Positions, ...], ...] = (
     Positions.of_pairs("XCENTER,YCENTER", origin=1, exact=True),
     Positions.of_pairs("XCenter,YCenter"),
     # Names that anybody may have given: each pair is a convention of its own.
-    *(
-        Positions.of_pairs(pair)
-        for pair in (
-            "x,y",
-            "xpos,ypos",
-            "x_pos,y_pos",
-            "xpix,ypix",
-            "x_pix,y_pix",
-            "x_pixel,y_pixel",
-        )
+    *map(
+        Positions.of_pairs,
+        ("x,y", "xpos,ypos", "x_pos,y_pos", "xpix,ypix", "x_pix,y_pix", "x_pixel,y_pixel"),
     ),
     # SExtractor on the sky, by its own and by photometry's names.
     Positions.of_pairs(

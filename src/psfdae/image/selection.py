@@ -20,7 +20,7 @@ from psfdae.base.errors import Error, keyword
 from psfdae.base.progress import task
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
-from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut, sky_around
+from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image, sky_around
 from psfdae.image.star_criteria import (
     brightest_pixels,
     crowded,
@@ -102,15 +102,10 @@ class Candidates:
         """
         # Rows of bright stars count in the joined list.
         starts = accumulate((len(candidates.verdict) for candidates in several), initial=0)
-        bright = [
-            replace(candidates.bright, row=candidates.bright.row + start)
-            for candidates, start in zip(several, starts, strict=False)
-        ]
+        bright = [stars.bright for stars in several]
+        bright = [replace(b, row=b.row + n) for b, n in zip(bright, starts, strict=False)]
         names = [field.name for field in fields(cls) if field.name != "bright"]
-        columns = {
-            name: np.concatenate([getattr(candidates, name) for candidates in several])
-            for name in names
-        }
+        columns = {name: np.concatenate([getattr(c, name) for c in several]) for name in names}
         return cls(**columns, bright=BrightStars.joined(bright))
 
     def require(self, path: Path, stars_min: int, remarks: Sequence[str] = ()) -> None:
@@ -129,9 +124,7 @@ class Candidates:
     def count(self) -> str:
         """Return how many stars there are of every verdict, in words."""
         counts = Counter(self.verdict.tolist())
-        return ", ".join(
-            f"{counts[verdict]} {verdict}" for verdict in map(str, Verdict) if counts[verdict]
-        )
+        return ", ".join(f"{counts[name]} {name}" for name in map(str, Verdict) if counts[name])
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
         """Return columns of every star of the list, and which good ones are held out, (n,) each.
@@ -146,14 +139,8 @@ class Candidates:
         part[self.bright.row[held_out]] = "held out"
         part[self.bright.row[~held_out]] = "training"
         x, y = self.position.T
-        return {
-            "id": self.id,
-            "x": x,
-            "y": y,
-            "snr": self.snr,
-            "verdict": self.verdict,
-            "part": part,
-        }
+        measurements = {"id": self.id, "x": x, "y": y, "snr": self.snr}
+        return measurements | {"verdict": self.verdict, "part": part}
 
 
 def collect(
@@ -188,8 +175,7 @@ def collect(
     parts = []
     with task("stars of the image", observation.count) as advance:
         for stamps in observation.chunks(2048):
-            image = observation.least_noise, observation.shape
-            parts.append(measure_stamps(stamps, settings, framing, *image))
+            parts.append(measure_stamps(stamps, settings, framing, observation))
             advance(len(stamps.data))
     measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
     bright = BrightStars.joined([stars for _, stars in parts])
@@ -203,12 +189,9 @@ def collect(
         verdict[(measured["highest"] >= full) & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     # Neighbours; a star that is listed twice is no neighbour of itself.
     is_repeated = observation.listed_again()[:, None]
-    is_crowded = crowded(
-        np.where(is_repeated, np.nan, position),
-        core if by_core else light,
-        settings.isolation_px if isolation_px is None else isolation_px,
-        settings.neighbour_ratio,
-    )
+    place = np.where(is_repeated, np.nan, position)
+    isolation_px = settings.isolation_px if isolation_px is None else isolation_px
+    is_crowded = crowded(place, core if by_core else light, isolation_px, settings.neighbour_ratio)
     verdict[is_crowded & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     # Without a position, no other reason counts; without light, the star is no star.
     verdict[observation.without_position()] = Verdict.NO_POSITION
@@ -242,11 +225,7 @@ def collect(
 
 
 def measure_stamps(
-    stamps: Stamps,
-    settings: CalibrationStars,
-    framing: Stamp,
-    least_noise: float,
-    shape: tuple[int, ...] | None,
+    stamps: Stamps, settings: CalibrationStars, framing: Stamp, observation: Observation
 ) -> tuple[dict[str, np.ndarray], BrightStars]:
     """Return columns of `Candidates` and the good stars, with neither centres nor rows.
 
@@ -256,19 +235,22 @@ def measure_stamps(
         Some stars of an image, or of a cube of stamps.
     settings : CalibrationStars
     framing : Stamp
-    least_noise : float
-        Noise in counts that no star is below.
-    shape : tuple of int, optional
-        Shape of the image, None for a cube.
+    observation : Observation
+        Image or cube of the stamps.
     """
     # Sky around each star, and the star above it. The noise is that of the observation where it
     # has a map of it.
     side = framing.stamp_px
     level, noise = sky_around(stamps.data, stamps.bad, side)
-    noise = np.where(np.isfinite(stamps.noise), stamps.noise, np.maximum(noise, least_noise))
+    noise = np.maximum(noise, observation.least_noise)
+    noise = np.where(np.isfinite(stamps.noise), stamps.noise, noise)
     light = np.where(stamps.bad, 0.0, stamps.data - level[:, None, None])
     wide_px = light.shape[-1]
-    off_image = pixels_off_image(stamps, wide_px, shape)
+    # Pixels beyond the edges of the image; stamps of a cube have none.
+    off_image = np.zeros(light.shape, dtype=bool)
+    if (shape := observation.shape) is not None:
+        nothing = np.broadcast_to(False, shape)
+        off_image = ~cut_image(nothing, shape, stamps.x, stamps.y, wide_px, margin=0)[1]
     # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
     # These also make the noise around a star seem large.
     depth = -BrightStars.defect_sigma * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
@@ -281,11 +263,7 @@ def measure_stamps(
     flux = cut(light, side, peak).sum(axis=(1, 2))
     snr = stamp_snr(cut(light, side), noise)
     # A star that is smoothed to be centred has its brightest pixel anywhere.
-    if centring:
-        highest_light = cut(light, side).max((1, 2))
-    else:
-        row, column = (peak + wide_px // 2).T
-        highest_light = light[np.arange(len(light)), row, column]
+    highest_light = (cut(light, side) if centring else cut(light, 1, peak)).max(axis=(1, 2))
     # A bad pixel that is saturated tells of a saturated star only in the star's core.
     saturated = cut(stamps.saturated & ~bad, side).any(axis=(1, 2))
     saturated |= cut(stamps.saturated, 5).any(axis=(1, 2))
@@ -337,20 +315,6 @@ def measure_stamps(
     )
 
 
-def pixels_off_image(stamps: Stamps, side: int, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return the pixels of stamps (n, side, side) beyond the edges of an image of a shape.
-
-    None is that of a cube of stamps, which are all on it.
-    """
-    if shape is None:
-        return np.zeros(stamps.data.shape, dtype=bool)
-    axis = np.arange(side) - side // 2
-    row, column = (central_pixel(v)[:, None] + axis for v in (stamps.y, stamps.x))
-    row_inside = (row >= 0) & (row < shape[0])
-    column_inside = (column >= 0) & (column < shape[1])
-    return np.asarray(~(row_inside[:, :, None] & column_inside[:, None, :]))
-
-
 def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     """Return stars with their centroids, within 1.5 px of their brightest pixels per axis.
 
@@ -360,19 +324,14 @@ def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     # σ of the window from the area of each star.
     sigma = np.maximum(np.sqrt(stars.area() / (4.0 * np.pi)), 0.7)
     window_px = np.maximum(sigma, centring_px / FWHM_OF_SIGMA)
-    return replace(
-        stars, centre=windowed_centres(stars.stamps, stars.peak, window_px, rounds=10, reach_px=1.5)
-    )
+    centre = windowed_centres(stars.stamps, stars.peak, window_px, rounds=10, reach_px=1.5)
+    return replace(stars, centre=centre)
 
 
 def completed(
-    stars: BrightStars,
-    stamp_px: int,
-    search_px: int,
-    centring_px: float = 0.0,
-    companions: int = 12,
+    stars: BrightStars, stamp_px: int, search_px: int, centring_px: float = 0.0
 ) -> tuple[BrightStars, np.ndarray]:
-    """Fill the bad pixels of stars with the PSF of the nearest stars, scaled to the good pixels.
+    """Fill the bad pixels of stars with the PSF of the 12 nearest ones, scaled to the good pixels.
 
     Parameters
     ----------
@@ -383,8 +342,6 @@ def completed(
         the middle, at most.
     centring_px : float
         FWHM of the Gaussian that smooths stars before their brightest pixel is searched.
-    companions : int
-        Number of nearest stars.
 
     Returns
     -------
@@ -404,7 +361,7 @@ def completed(
     place = stars.position
     if not np.isfinite(place).all():  # all stars are as near then
         place = np.arange(len(stars))[:, None] * np.ones(2)
-    nearest = cKDTree(place).query(place[incomplete], k=min(companions + 1, len(stars)))[1]
+    nearest = cKDTree(place).query(place[incomplete], k=min(13, len(stars)))[1]
     # The stamp within its margins: only there the scale is measured.
     start = stars.stamps.shape[-1] // 2 - stamp_px // 2
     stamp = np.s_[start : start + stamp_px, start : start + stamp_px]
@@ -429,13 +386,10 @@ def completed(
         snr = stamp_snr(cut(light, stamp_px), stars.noise[incomplete])
         usable = (flux > 0) & (snr > 0)
         missing[incomplete[~usable]] = 1.0
-        row = incomplete[usable]
-        measured = {"stamps": light, "peak": peak, "flux": flux, "snr": snr}
-        measured = {name: values[usable] for name, values in measured.items()}
-        measured["centre"] = _centred(replace(stars.of(row), **measured), centring_px).centre
-        stars = replace(stars, stamps=filled)
-        for name in ("peak", "flux", "snr", "centre"):
-            column = getattr(stars, name).copy()
-            column[row] = measured[name]
-            stars = replace(stars, **{name: column})
+        new = replace(stars.of(incomplete), stamps=light, peak=peak, flux=flux, snr=snr).of(usable)
+        new = _centred(new, centring_px)
+        columns = {name: getattr(stars, name).copy() for name in ("peak", "flux", "snr", "centre")}
+        for name, column in columns.items():
+            column[incomplete[usable]] = getattr(new, name)
+        stars = replace(stars, stamps=filled, **columns)
     return stars, missing

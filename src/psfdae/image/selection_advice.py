@@ -33,12 +33,11 @@ def saturation_advice(candidates: Candidates) -> str:
     level = piled_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
     if not np.isfinite(level):
         return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
-    piled, flagged = (
-        int((pixel >= level).sum()) for pixel in (candidates.brightest, candidates.highest)
-    )
+    star_count = np.count_nonzero(candidates.brightest >= level)
+    stamp_count = np.count_nonzero(candidates.highest >= level)
     return (
-        f"saturation: the brightest pixels of {piled} stars agree from {level:.6g} counts on, as "
-        f"if cut off; {flagged} stamps have such pixels and are not learnt from, "
+        f"saturation: the brightest pixels of {star_count} stars agree from {level:.6g} counts on, "
+        f"as if cut off; {stamp_count} stamps have such pixels and are not learnt from, "
         f"{keyword('saturate', level)} flags these, too"
     )
 

@@ -16,13 +16,14 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from psfdae.image.interpolation import interpolated
 from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
 
 
 class SkyStructure(NamedTuple):
-    """Places at which the level of a sky changes within few pixels.
+    """Where the level of a sky changes within few pixels, and the step of its pixels.
 
     Attributes
     ----------
@@ -30,14 +31,14 @@ class SkyStructure(NamedTuple):
         Rows and columns at which the level has a step.
     is_fine : bool
         True if the level changes within a mesh: where it does, it is a median of the pixels around.
+    pixel_step : float
+        Step of the pixels if they are whole counts and noise is not much wider, else 0.
     """
 
     rows: Sequence[int] = ()
     columns: Sequence[int] = ()
     is_fine: bool = False
-
-
-NO_STRUCTURE = SkyStructure()
+    pixel_step: float = 0.0
 
 
 class SkyLevel(NamedTuple):
@@ -59,11 +60,7 @@ class SkyLevel(NamedTuple):
 
 
 def sky_level(
-    image: np.ndarray,
-    bad: np.ndarray,
-    structure: SkyStructure | None = None,
-    mesh_px: int = 64,
-    count: float | None = None,
+    image: np.ndarray, bad: np.ndarray, structure: SkyStructure | None = None, mesh_px: int = 64
 ) -> SkyLevel:
     """Measure level and noise of the sky of an image.
 
@@ -77,8 +74,6 @@ def sky_level(
         Structure of the sky, if it was found before: in the same image with its stars.
     mesh_px : int
         Side of the squares in which the sky is measured.
-    count : float, optional
-        Step of the pixels if they are whole counts; by default the pixels show it.
 
     Raises
     ------
@@ -86,10 +81,11 @@ def sky_level(
         If no mesh has enough pixels that count.
     """
     # Medians of whole counts are those of the counts before rounding.
-    count = count_step(np.where(bad, np.nan, image)) if count is None else count
-    image, dither_variance = dither(image, count)
+    step = structure.pixel_step if structure else count_step(np.where(bad, np.nan, image))
+    image, dither_variance = dither(image, step)
     if structure is None:
-        structure = SkyStructure(sky_steps(image, bad, axis=0), sky_steps(image, bad, axis=1))
+        rows, columns = (sky_steps(image, bad, axis) for axis in (0, 1))
+        structure = SkyStructure(rows, columns, pixel_step=step)
     notes = []
     for name, lines in zip(("row", "column"), structure[:2], strict=True):
         if lines:
@@ -116,26 +112,44 @@ def sky_level(
 
 
 def level_and_noise(
-    image: np.ndarray,
-    bad: np.ndarray,
-    structure: SkyStructure,
-    mesh_px: int = 64,
+    image: np.ndarray, bad: np.ndarray, structure: SkyStructure, mesh_px: int = 64
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return level and σ (h, w) of a sky of known steps, and the part of it with fine structure.
 
-    The noise is that of single pixels; parameters are those of `sky_level`.
+    The noise is that of single pixels; parameters are those of `sky_level`. Both are those of the
+    meshes, and the part is 0, unless the sky is known to have fine structure, or over 5 % of the
+    image has structure that is not that of the sources.
     """
     # Each part between steps has meshes of its own. Single precision: of a large image, each map
     # takes much memory.
     level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
-    rows, columns, is_fine = structure
+    rows, columns, is_fine, _ = structure
     for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
             if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
-    # Structure that is finer than the meshes.
-    return _with_structure(image, bad, level, noise, mesh_px, is_fine)
+    # Structure that is finer than the meshes: σ of a mesh over σ from differences of neighbouring
+    # pixels is larger there than elsewhere by a factor of 1.5; in resampled images it is larger
+    # everywhere. Both are of meshes: every fourth pixel shows them.
+    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
+    sample = np.s_[::4, ::4]
+    ratio = noise[sample] / pixel_sigma[sample]
+    ratio = ratio[~bad[sample] & (ratio > 0)]
+    typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
+    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
+    if not (is_fine or share > 0.05):
+        return level, noise, 0.0
+    fine_level = median_level(image - level, bad)
+    if not (is_fine or sources_stay(image - level, fine_level, bad, pixel_sigma)):
+        return level, noise, 0.0
+    weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad, mesh_px)
+    level += weight * fine_level
+    # What remains; its noise changes with the light of the structure, from mesh to mesh of 16.
+    remainder, noise = _meshed(image - level, bad, mesh_px)
+    level += remainder
+    noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
+    return level, noise, share
 
 
 # Noise of pixels and of sums of pixels.
@@ -185,32 +199,31 @@ def noise_correlation(deviation: np.ndarray) -> float:
     deviation : ndarray, shape (h, w)
         Pixels without their sky, in σ; NaN where they do not count. Sources are left out here.
     """
-    from scipy import ndimage
-
     # The middle of a large image is enough.
     middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
     values = deviation[middle]
     if min(values.shape) < 16:
         return 1.0
     # Means of 3 × 3 pixels scatter by σ/3, or more if these are correlated: three times this.
-    light = np.abs(ndimage.uniform_filter(np.nan_to_num(values), 3)) > 1.5
-    values = np.where(ndimage.binary_dilation(light, iterations=3), np.nan, values)
+    light = np.abs(scipy.ndimage.uniform_filter(np.nan_to_num(values), 3)) > 1.5
+    values = np.where(scipy.ndimage.binary_dilation(light, iterations=3), np.nan, values)
     values[np.abs(values) > 3.0] = np.nan
     # Faint sources and structure, by pixels 3 and 4 px apart, and offsets of rows or columns.
     along_rows, along_columns = (
-        0.5 * (_correlation(values, *near) + _correlation(values, *far))
-        for near, far in (((0, 3), (0, 4)), ((3, 0), (4, 0)))
+        0.5 * sum(_correlation(values, px * down, px * across) for px in (3, 4))
+        for down, across in ((0, 1), (1, 0))
     )
-    shared = max(min(along_rows, along_columns), 0.0)
-    offsets = max(along_rows, along_columns, 0.0) - shared
+    structure = max(min(along_rows, along_columns), 0.0)
+    offsets = max(along_rows, along_columns, 0.0) - structure
     # Neighbours below and on the right; without correlation, most images end here.
     nearest = 0.5 * (_correlation(values, 0, 1) + _correlation(values, 1, 0))
-    if nearest - shared - 0.5 * offsets < 0.15:
+    if nearest - structure - 0.5 * offsets < 0.15:
         # Offsets alone: pixels of a row up to 2 px apart on both sides.
         return float(np.sqrt(1.0 + 4.0 * offsets)) if offsets > 0.05 else 1.0
     # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
-    excess = sum(_correlation(values, *lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
+    excess = sum(_correlation(values, *lag) - structure for lag in lags)
+    excess /= max(1.0 - structure, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 
 
@@ -227,10 +240,8 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
     is_finite = np.isfinite(a) & np.isfinite(b)
     if np.count_nonzero(is_finite) < 1000:
         return 0.0
-    plus, minus = (
-        float(np.median(np.abs(v - np.median(v)))) ** 2
-        for v in (a[is_finite] + b[is_finite], a[is_finite] - b[is_finite])
-    )
+    a, b = a[is_finite], b[is_finite]
+    plus, minus = (float(np.median(np.abs(v - np.median(v)))) ** 2 for v in (a + b, a - b))
     return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
 
 
@@ -267,10 +278,8 @@ def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarra
     mesh_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
     has_stars = np.abs(deviation) > 4.0 * max(scatter, error)
     smooth = neighbours + np.where(has_stars, 0.0, mesh_weight * deviation)
-    return (
-        _on_pixels(smooth, image.shape, mesh_px, mesh_weight),
-        _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0),
-    )
+    noise = _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0)
+    return _on_pixels(smooth, image.shape, mesh_px, mesh_weight), noise
 
 
 def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
@@ -302,17 +311,10 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     each other: all five are the same where the sky is a plane, up to the edges of the image.
     """
     # Meshes beyond the edges go on along straight lines.
-    rows, columns = mesh.shape
-    continued = _continued(mesh, 1)
-
-    def shifted(rows_apart: int, columns_apart: int) -> np.ndarray:
-        return continued[
-            1 + rows_apart : rows + 1 + rows_apart, 1 + columns_apart : columns + 1 + columns_apart
-        ]
-
+    squares = np.lib.stride_tricks.sliding_window_view(_continued(mesh, 1), (3, 3))
     pairs = [
-        0.5 * (shifted(rows_apart, columns_apart) + shifted(-rows_apart, -columns_apart))
-        for rows_apart, columns_apart in ((0, 1), (1, 0), (1, 1), (1, -1))
+        0.5 * (squares[..., 1 + down, 1 + across] + squares[..., 1 - down, 1 - across])
+        for down, across in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
@@ -332,8 +334,6 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     slope : float
         Part of the slope beyond the outer meshes, as of `_continued`.
     """
-    from scipy import ndimage
-
     continued = _continued(mesh, 2, slope)
     # The spline is a product of splines along rows and columns, and linear in the meshes: a weight
     # is the value at a pixel of the spline through 1 in one mesh and 0 in all others.
@@ -341,7 +341,7 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     for pixels, meshes in zip(shape, continued.shape, strict=True):
         position = (np.arange(pixels) + 0.5) / mesh_px - 0.5 + 2.0
         at = np.meshgrid(position, np.arange(meshes), indexing="ij")
-        weights.append(ndimage.map_coordinates(np.eye(meshes), at, order=3, mode="nearest"))
+        weights.append(scipy.ndimage.map_coordinates(np.eye(meshes), at, order=3, mode="nearest"))
     row_weights, columns = weights[0], continued @ weights[1].T
     # A few rows at a time: products take twice the memory of the values.
     values = np.empty(shape, np.float32)
@@ -353,68 +353,20 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
 # Structure within a mesh.
 
 
-def _with_structure(
-    image: np.ndarray,
-    bad: np.ndarray,
-    level: np.ndarray,
-    noise: np.ndarray,
-    mesh_px: int,
-    is_known: bool,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return level and noise (h, w) of a sky with its structure, and the part of it that has some.
-
-    They are those of the meshes, and the part is 0, unless the sky is known to have structure, or
-    over 5 % of the image has structure that is not that of the sources.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-    bad : ndarray of bool, shape (h, w)
-    level, noise : ndarray, shape (h, w)
-        Level and σ in meshes; the level is changed in place.
-    mesh_px : int
-        Side of these meshes.
-    is_known : bool
-        True if the sky is known to have structure.
-    """
-    # σ of a mesh over that from differences of neighbouring pixels. Where the sky has structure it
-    # is larger than elsewhere by a factor of 1.5; that of resampled images is larger everywhere.
-    # Both are of meshes: every fourth pixel shows them.
-    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
-    sample = np.s_[::4, ::4]
-    ratio = noise[sample] / pixel_sigma[sample]
-    ratio = ratio[~bad[sample] & (ratio > 0)]
-    typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
-    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
-    structure = median_level(image - level, bad) if is_known or share > 0.05 else None
-    if structure is None or not (
-        is_known or sources_stay(image - level, structure, bad, pixel_sigma)
-    ):
-        return level, noise, 0.0
-    weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad, mesh_px)
-    level += weight * structure
-    # What remains; its noise changes with the light of the structure, from mesh to mesh of 16.
-    remainder, noise = _meshed(image - level, bad, mesh_px)
-    level += remainder
-    noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
-    return level, noise, share
-
-
 def median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the median (h, w) of the 14 × 14 px around each pixel, from means of 2 × 2 px."""
-    from scipy import ndimage
-
     # Means of squares of 2 × 2 px, the last row or column repeated where the number is odd.
     height, width = image.shape
     even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
     squares = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2)
     binned = squares.mean(axis=(1, 3))
     # Median of 7 × 7 squares, smoothed by σ = 1 square.
-    smooth = ndimage.gaussian_filter(ndimage.median_filter(binned, 7, mode="nearest"), 1.0)
+    smooth = scipy.ndimage.median_filter(binned, 7, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter(smooth, 1.0)
     # Back to the pixels: linear between the middles of the squares.
     row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
     at = np.meshgrid(row, column, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
 
 
 def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
@@ -433,11 +385,9 @@ def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: n
     noise : ndarray, shape (h, w)
         σ of the pixels.
     """
-    from scipy import ndimage
-
     # Local maxima of 25 px around, and the 30 highest of them.
     height = light - level
-    high = (height == ndimage.maximum_filter(height, 25)) & ~bad
+    high = (height == scipy.ndimage.maximum_filter(height, 25)) & ~bad
     peak = np.flatnonzero(high & (light > 50.0 * noise))
     brightest = peak[np.argsort(-height.ravel()[peak], kind="stable")[:30]]
     height_left = height.ravel()[brightest] / light.ravel()[brightest]
@@ -455,14 +405,12 @@ def structure_weight(noise_excess: np.ndarray, bad: np.ndarray, mesh_px: int) ->
     mesh_px : int
         Side of a mesh.
     """
-    from scipy import ndimage
-
     # From 0 at 1.25 times the usual noise to 1 at 1.75 times.
     weight = np.clip((noise_excess - 1.25) / 0.5, 0.0, 1.0)
     weight[bad] = 0.0
     # Meshes beside those with structure are interpolated from these, and wrong, too.
-    widened = ndimage.maximum_filter(weight, 2 * mesh_px + 1, mode="nearest")
-    return np.asarray(ndimage.uniform_filter(widened, mesh_px, mode="nearest"))
+    wide_weight = scipy.ndimage.maximum_filter(weight, 2 * mesh_px + 1, mode="nearest")
+    return np.asarray(scipy.ndimage.uniform_filter(wide_weight, mesh_px, mode="nearest"))
 
 
 # Steps.
@@ -516,10 +464,8 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     if height < 4 * reach_px or count < 64:
         return []
     # Sums of the good pixels and their numbers up to each row: their differences give means.
-    light, number = (
-        np.pad(np.cumsum(v, axis=0, dtype=np.float64), ((1, 0), (0, 0)))
-        for v in (np.where(good, values, 0.0), good)
-    )
+    sums = (np.cumsum(v, axis=0, dtype=np.float64) for v in (np.where(good, values, 0.0), good))
+    light, number = (np.pad(v, ((1, 0), (0, 0))) for v in sums)
     lines = np.arange(2 * reach_px, height - 2 * reach_px + 1)
     side = reach_px // 2
 
@@ -540,9 +486,8 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
         spread = 1.4826 * _row_medians(np.abs(step_sizes - middle[:, None]))
         # Slope of the level per px: changes within 12 px on both sides, a pixel off the line. Of
         # two signs there is no slope, but bad rows.
-        slope_before, slope_after = (
-            _row_medians(jumps(0, side, lines + sign * (side + 1))) for sign in (-1, 1)
-        )
+        slope_before = _row_medians(jumps(0, side, lines - side - 1))
+        slope_after = _row_medians(jumps(0, side, lines + side + 1))
         smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
         slope = np.where(slope_before * slope_after > 0, np.sign(slope_before) * smaller, 0.0)
         # Less the slope over 3 px. A difference of means of 3 px scatters by √(2/3) σ of a pixel.
@@ -564,9 +509,8 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
                 for part in np.array_split(jumps(start, end, np.array([line]))[0], 8)
             ]
             is_same = np.abs(np.array(eighths) - height_of_step) < 0.5 * abs(height_of_step)
-            if is_same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
-                abs(line - step) > reach_px for step in steps
-            ):
+            is_new = all(abs(line - step) > reach_px for step in steps)
+            if is_new and is_same.reshape(3, 8).mean(axis=1).min() >= 0.75:
                 steps.append(line)
     return steps
 

@@ -65,13 +65,11 @@ class SourceSize:
         The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
         star lies, and 99 % of its light must.
         """
-        if self.hollow:
-            enough = [side for side in self.sides if self.light_within(side - 2) >= 0.99]
-        elif self.light_within(self.sides[0]) >= light_min:
+        if not self.hollow and self.light_within(self.sides[0]) >= light_min:
             return self.sides[0]
-        else:
-            enough = [side for side in self.sides if self.light_within(side) >= 0.98]
-        return enough[0] if enough else self.sides[-1]
+        edge_px, part = (2, 0.99) if self.hollow else (0, 0.98)
+        sides = (side for side in self.sides if self.light_within(side - edge_px) >= part)
+        return next(sides, self.sides[-1])
 
 
 def measure_size(
@@ -144,9 +142,8 @@ def size_of_windows(
     # Light per pixel in the rings of each star, and how far its brightest pixel is off.
     rings = np.empty((len(windows), len(area)))
     offset = np.empty(len(windows))
-    for star, (window, good, (row, column)) in enumerate(
-        zip(windows, measured, centre, strict=True)
-    ):
+    stars = zip(windows, measured, centre, strict=True)
+    for star, (window, good, (row, column)) in enumerate(stars):
         # Distance of each pixel from the centre of the star.
         radius = np.hypot(axis[:, None] - row, axis - column)
         rings[star] = ring_light(window[good], radius[good], edges)
@@ -188,9 +185,8 @@ def size_of_windows(
     light = np.append(light, light[-1] + min(light_beyond, 0.1 * light[-1]))
     # The inner 49 × 49 px of the median star say how fine its structure is.
     middle_px = slice(reach_px - 24, reach_px + 25)
-    stamp = np.median(
-        windows[usable][:, middle_px, middle_px] / flux[usable][:, None, None], axis=0
-    )
+    middles = windows[usable][:, middle_px, middle_px]
+    stamp = np.median(middles / flux[usable][:, None, None], axis=0)
     # σ of a Gaussian is √(Σp² / Σ|∇p|²), as Σ|∇p|² = Σp² / σ² in two dimensions.
     rows, columns = np.gradient(stamp)
     gradient = float(np.square(rows).sum() + np.square(columns).sum())

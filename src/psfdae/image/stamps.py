@@ -285,12 +285,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
         _, level, noise = sigma_clipped_stats(
-            window[:, ring],
-            mask=bad[:, ring],
-            sigma=3.0,
-            cenfunc="median",
-            stdfunc="mad_std",
-            axis=1,
+            window[:, ring], mask=bad[:, ring], sigma=3.0, stdfunc="mad_std", axis=1
         )
     # Where no pixel counts in any stamp, both are one masked value; 0 stands for no pixel.
     statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])

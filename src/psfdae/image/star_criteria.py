@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from itertools import repeat
 
 import numpy as np
+import scipy
 
 from psfdae.image.stamps import cut, peaks, softened
 from psfdae.stars.moments import robust_scatter
@@ -109,12 +110,11 @@ def crowded(
     brightness : ndarray, shape (n,)
     distance_px, ratio : float
     """
-    from scipy.spatial import cKDTree
-
     # Each pair both ways round.
     located = np.flatnonzero(np.isfinite(position).all(axis=1))
     is_crowded = np.zeros(len(position), dtype=bool)
-    pairs = located[cKDTree(position[located]).query_pairs(distance_px, output_type="ndarray")]
+    tree = scipy.spatial.cKDTree(position[located])
+    pairs = located[tree.query_pairs(distance_px, output_type="ndarray")]
     for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
         is_crowded[first[brightness[second] >= ratio * brightness[first]]] = True
     return is_crowded
@@ -122,13 +122,11 @@ def crowded(
 
 def overlapping(position: np.ndarray, side: int) -> float:
     """Return the part of the stars (n, 2) in whose stamps of a side another one stands."""
-    from scipy.spatial import cKDTree
-
     # Distance of the nearest other star along the farther axis, as stamps are squares.
     located = position[np.isfinite(position).all(axis=1)]
     if len(located) < 2:
         return 0.0
-    distance, _ = cKDTree(located).query(located, k=2, p=np.inf)
+    distance, _ = scipy.spatial.cKDTree(located).query(located, k=2, p=np.inf)
     return float((distance[:, 1] < 0.5 * side).mean())
 
 
@@ -165,6 +163,7 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray, size_error: np.ndar
     Parameters
     ----------
     area : ndarray, shape (n,)
+        Noise-equivalent areas in pixels.
     position : ndarray, shape (n, 2)
         In the image; all sources are near where one is not finite.
     size_error : ndarray, shape (n,)
@@ -186,8 +185,8 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray, size_error: np.ndar
         if not (is_wider & ~is_wide).any():
             break
         is_wide |= is_wider
-    rest = ~is_wide
-    if has_many_sizes(size[rest], position[rest], size_error[rest]):
+    is_star = ~is_wide
+    if has_many_sizes(size[is_star], position[is_star], size_error[is_star]):
         middle, scatter = narrowest_group(size[size_error < 0.1])
         limit = middle + max(np.log(1.2), min(5.0 * scatter, np.log(1.5)))
         return np.asarray(size + 2.0 * size_error > limit)
@@ -201,11 +200,9 @@ def size_around(
 
     Usually one of these eight sources is a star.
     """
-    from scipy.spatial import cKDTree
-
     if len(star_size) <= 8 or not np.isfinite(position).all():
         return np.full(len(position), np.percentile(star_size, 25))
-    nearest = cKDTree(star_position).query(position, k=8)[1]
+    nearest = scipy.spatial.cKDTree(star_position).query(position, k=8)[1]
     return np.asarray(np.percentile(star_size[nearest], 25, axis=1))
 
 
@@ -214,10 +211,10 @@ def shortest_interval(values: np.ndarray) -> tuple[float, float]:
 
     A quarter of a normal distribution about its middle has the width 0.637 σ.
     """
-    ordered, count = np.sort(values), -(-len(values) // 4)
-    width = ordered[count:] - ordered[:-count]
+    ascending, count = np.sort(values), -(-len(values) // 4)
+    width = ascending[count:] - ascending[:-count]
     first = int(width.argmin())
-    return float(np.median(ordered[first : first + count + 1])), float(width[first]) / 0.637
+    return float(np.median(ascending[first : first + count + 1])), float(width[first]) / 0.637
 
 
 def has_many_sizes(size: np.ndarray, position: np.ndarray, size_error: np.ndarray) -> bool:
@@ -231,6 +228,7 @@ def has_many_sizes(size: np.ndarray, position: np.ndarray, size_error: np.ndarra
     size, size_error : ndarray, shape (n,)
         ln A and its standard error.
     position : ndarray, shape (n, 2)
+        (x, y) in the image, NaN where unknown.
     """
     # With fewer than ten sources, neighbours and a plane say nothing.
     excess, is_sharp = size - size_around(size, position, position), size_error < 0.1
@@ -255,11 +253,11 @@ def narrowest_group(size: np.ndarray) -> tuple[float, float]:
         ln A of sources of which it is known to a tenth.
     """
     # Four sources or more within 3 % in diameter, or the four that are nearest to this.
-    ordered = np.sort(size)
-    width = ordered[3:] - ordered[:-3]
+    ascending = np.sort(size)
+    width = ascending[3:] - ascending[:-3]
     first = int(np.argmax(width <= max(width.min(), 0.06)))
-    middle = np.median(ordered[first : first + 4])
-    group = ordered[np.abs(ordered - middle) <= max(width[first], 0.1)]
+    middle = np.median(ascending[first : first + 4])
+    group = ascending[np.abs(ascending - middle) <= max(width[first], 0.1)]
     return float(np.median(group)), float(robust_scatter(group))
 
 
@@ -286,9 +284,6 @@ def misfit(
     companions : int
         Number of nearest stars with which a star is compared.
     """
-    from scipy import ndimage
-    from scipy.spatial import cKDTree
-
     count, side = len(aligned), aligned.shape[-1]
     if count < 4:
         return np.ones(count)
@@ -302,10 +297,9 @@ def misfit(
     local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
     # Neighbours of each star; all stars where there are few, or positions are not known.
     if np.isfinite(position).all() and count > companions:
-        neighbours = cKDTree(position).query(position, k=companions + 1)[1]
-        local_medians = (
-            expected(aligned[nearest[nearest != star]]) for star, nearest in enumerate(neighbours)
-        )
+        neighbours = scipy.spatial.cKDTree(position).query(position, k=companions + 1)[1]
+        companion_rows = (rows[rows != star] for star, rows in enumerate(neighbours))
+        local_medians = (expected(aligned[rows]) for rows in companion_rows)
     else:
         local_medians = repeat(expected(aligned), count)
     # Half of the stamp, or 8 px if that is more: farther out is no place for a faint neighbour.
@@ -314,7 +308,7 @@ def misfit(
     for star, (median, variance) in enumerate(local_medians):
         # χ² of each pixel; its mean, and the largest mean of 3 × 3 pixels.
         square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
-        patches = ndimage.uniform_filter(square, 3)[None]
+        patches = scipy.ndimage.uniform_filter(square, 3)[None]
         score[star] = square.mean(), cut(patches, core_px).max()
     score = np.sqrt(score)
     return np.asarray((score / np.median(score, axis=0) / (1.0, 1.2)).max(axis=1))

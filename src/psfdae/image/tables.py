@@ -250,8 +250,7 @@ def write_table(path: Path, table: QTable) -> None:
     with silent():
         if path.suffix.lower() == ".fits":
             # A table is an extension behind an empty primary one.
-            hdus = fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")])
-            hdus.writeto(content)
+            fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")]).writeto(content)
         elif path.suffix.lower() == ".ecsv":
             plain.write(text, format="ascii.ecsv")
         else:
@@ -264,8 +263,7 @@ def write_table(path: Path, table: QTable) -> None:
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
                     plain[column.name] = column.filled(np.nan)
-            empty = [(text_tables.masked, "")]
-            plain.write(text, format="ascii.csv", fill_values=empty)
+            plain.write(text, format="ascii.csv", fill_values=[(text_tables.masked, "")])
     write_bytes(path, content.getvalue() or text.getvalue().encode())
 
 

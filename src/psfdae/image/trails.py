@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from psfdae.image.bad_pixels import BadPixels
 from psfdae.image.interpolation import interpolated
@@ -32,7 +33,7 @@ class Line(NamedTuple):
         return np.asarray(x * np.cos(self.angle_rad) + y * np.sin(self.angle_rad))
 
 
-def with_trails(
+def add_trails(
     image: np.ndarray, bad_pixels: BadPixels, saturate: float | None = None
 ) -> BadPixels:
     """Return the bad pixels of an image (h, w) with those of trails and spikes.
@@ -44,13 +45,13 @@ def with_trails(
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite, in the unit of `saturate`.
     bad_pixels : BadPixels
         Bad pixels of other kinds, which are left out of the search.
     saturate : float, optional
         Counts from which a pixel is saturated; without it, no spikes are searched.
     """
     from astropy.nddata import block_reduce, block_replicate
-    from scipy import ndimage
 
     if min(image.shape) < 100:
         return bad_pixels
@@ -62,7 +63,7 @@ def with_trails(
         hidden = np.isnan(values)
     # Saturated cores stay as they are, so that these stars are known to be saturated.
     is_saturated = (values >= saturate) & ~hidden if saturate else np.zeros_like(hidden)
-    is_core = ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
+    is_core = scipy.ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
     values = np.where(hidden, 0.0, values)
     try:
         sky = sky_level(values, hidden)
@@ -96,29 +97,31 @@ def find_spikes(
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
     sky : SkyLevel
         Sky of the image.
     is_saturated : ndarray of bool, shape (h, w)
+        Saturated pixels.
 
     Returns
     -------
     ndarray of bool, shape (h, w)
     """
-    from scipy import ndimage
+    from astropy.nddata import overlap_slices
     from skimage.transform import warp_polar
 
     spikes = np.zeros(image.shape, dtype=bool)
     snr = smooth_light(image, bad, sky) / sky.noise
     part_px, angles, parts = 8, 720, 32
+    reach_px = part_px * parts
+    shape = angles, reach_px
     for x, y, core_px in saturated_cores(is_saturated):
         middle = y, x
         first = int(2.0 * core_px / part_px) + 1
         # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
-        rays = warp_polar(
-            snr, middle, radius=part_px * parts, output_shape=(angles, part_px * parts), cval=np.nan
-        )
+        rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
         # The lower quartile of a part: it is dark between stars in a row, and not along a spike.
         quartile = np.percentile(rays.reshape(angles, parts, part_px), 25, axis=2)
         light = np.ma.masked_invalid(quartile)
@@ -132,15 +135,13 @@ def find_spikes(
         length = ((is_light & (share >= 0.75)) * np.arange(1, parts - first + 1)).max(axis=1)
         end_px = np.where(length >= 3, first + length, 0) * part_px
         # Pixels of these rays outside of the core, in a window about it.
-        reach, (height, width) = part_px * parts, image.shape
-        rows = slice(max(int(y) - reach, 0), min(int(y) + reach + 1, height))
-        window = rows, slice(max(int(x) - reach, 0), min(int(x) + reach + 1, width))
+        window, _ = overlap_slices(image.shape, (2 * reach_px + 1,) * 2, (int(y), int(x)))
         row, column = np.mgrid[window] - np.array(middle)[:, None, None]
         turns = np.arctan2(row, column) / (2.0 * np.pi) % 1.0
         ray = (turns * angles).astype(int) % angles
         radius = np.hypot(row, column)
         spikes[window] |= (radius < end_px[ray]) & (radius > first * part_px)
-    return np.asarray(ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
+    return np.asarray(scipy.ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
 
 
 def saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
@@ -149,15 +150,14 @@ def saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
     A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The middle
     is where it is widest, wherever its charge runs.
     """
-    from scipy import ndimage
-
-    label, _ = ndimage.label(is_saturated, np.ones((3, 3)))
-    boxes, area = ndimage.find_objects(label), np.bincount(label.ravel())[1:]
+    label, _ = scipy.ndimage.label(is_saturated, np.ones((3, 3)))
+    boxes, area = scipy.ndimage.find_objects(label), np.bincount(label.ravel())[1:]
     largest = np.argsort(-area, kind="stable")[: min(50, np.count_nonzero(area >= 4))]
     cores = np.empty((len(largest), 3))
     for core, index in zip(cores, largest, strict=True):
         # Distance of each pixel from the edge of the core; those as far as the farthest.
-        depth = ndimage.distance_transform_edt(np.pad(label[boxes[index]] == index + 1, 1))[1:, 1:]
+        core_mask = np.pad(label[boxes[index]] == index + 1, 1)
+        depth = scipy.ndimage.distance_transform_edt(core_mask)[1:, 1:]
         row, column = np.argwhere(depth == depth.max()).mean(axis=0)
         core[:] = column + boxes[index][1].start, row + boxes[index][0].start, depth.max()
     return cores
@@ -165,9 +165,7 @@ def saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
 
 def smooth_light(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> np.ndarray:
     """Return an image (h, w) above its sky, smoothed by 3 × 3 px: its noise is σ/3."""
-    from scipy import ndimage
-
-    return np.asarray(ndimage.uniform_filter(interpolated(image - sky.level, bad)[0], 3))
+    return np.asarray(scipy.ndimage.uniform_filter(interpolated(image - sky.level, bad)[0], 3))
 
 
 def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.ndarray, int]:
@@ -187,15 +185,13 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
     count : int
         Number of trails.
     """
-    from scipy import ndimage
-
     mask, count = np.zeros(image.shape, dtype=bool), 0
     shortest_px = max(100, min(image.shape) // 6)
     flat, noise = np.where(bad, 0.0, smooth_light(image, bad, sky)), sky.noise / 3.0
     # Connected pixels that may be a part of a trail, the longest 20 of them; a line is searched in
     # each, off the trails so far, until none is left.
-    label, _ = ndimage.label(flat > 4.0 * noise, np.ones((3, 3)))
-    boxes = ndimage.find_objects(label)
+    label, _ = scipy.ndimage.label(flat > 4.0 * noise, np.ones((3, 3)))
+    boxes = scipy.ndimage.find_objects(label)
     length = np.array([np.hypot(*(part.stop - part.start for part in box)) for box in boxes])
     for index in np.argsort(-length, kind="stable")[:20]:
         # Pixels of this source, counted from the corner of the image.

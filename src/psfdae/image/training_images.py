@@ -67,9 +67,7 @@ def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
     """
     # Stars of each part in turn, until there are enough images.
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
-    return np.concatenate(
-        [np.resize(stars, max(image_count, stars.size)) for stars, image_count in parts]
-    )
+    return np.concatenate([np.resize(stars, max(count, stars.size)) for stars, count in parts])
 
 
 def bins_of(position: np.ndarray, bins: int) -> np.ndarray:

@@ -388,7 +388,5 @@ def photometry_table(
             flux = np.where(columns["flux"] > 0, columns["flux"], np.nan)
             columns["mag"] = zero_point - 2.5 * np.log10(flux)
             columns["mag_error"] = 2.5 / math.log(10.0) * columns["flux_error"] / flux
-        sky_position = observation.on_sky(columns["x"], columns["y"])
-    if sky_position is not None:
-        columns["ra"], columns["dec"] = sky_position
+        columns |= observation.sky_columns(columns["x"], columns["y"])
     return star_table(columns, observation.unit, observation.list_columns)

@@ -245,11 +245,9 @@ class PsfModel(WholeImages, FieldPsfs):
                 # The star on the sky, by its own centre where the model measures one.
                 x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
                 y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
-                sky = observation.on_sky(x, y)
-                columns = {} if sky is None else dict(zip(("ra", "dec"), sky, strict=True))
                 on_sky = replace(
                     prediction,
-                    columns=prediction.columns | columns,
+                    columns=prediction.columns | observation.sky_columns(x, y),
                     list_columns=None if list_columns is None else list_columns[rows],
                     unit=observation.unit,
                 )

@@ -503,7 +503,7 @@ def around_stars(
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
     without_light = without_stars - light_of_wings
-    sky = sky_of(without_light, sky.bad, sigma_map, structure=sky.structure, count=sky.count)
+    sky = sky_of(without_light, sky.bad, sigma_map, structure=sky.structure)
     del without_light
     # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
@@ -602,7 +602,7 @@ def _wings_beside(
         if previous is not None:
             without_wings = without_stars - draw_wings(bad.shape, all_stars, previous)
             without_wings[bad] = 0.0
-            without_wings, _ = dither(without_wings, sky.count)
+            without_wings, _ = dither(without_wings, sky.structure.pixel_step)
             residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
             # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
             # small.

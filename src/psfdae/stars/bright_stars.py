@@ -93,9 +93,8 @@ class BrightStars:
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
         """Return several sets with the same margin as one."""
-        return cls(
-            *(np.concatenate([getattr(stars, f.name) for stars in several]) for f in fields(cls))
-        )
+        columns = ([getattr(stars, f.name) for stars in several] for f in fields(cls))
+        return cls(*map(np.concatenate, columns))
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -129,9 +128,8 @@ class BrightStars:
         # Variance in electrons², N = (σ gain)²: a Poisson variable of mean N has it.
         if gain is None:
             return otherwise
-        return float(
-            np.clip(np.median(self.noise) * gain, self.min_sky**0.5, self.max_sky**0.5) ** 2
-        )
+        limits = self.min_sky**0.5, self.max_sky**0.5
+        return float(np.clip(np.median(self.noise) * gain, *limits) ** 2)
 
     def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return frames (n, side, side) with the brightest pixel at index (side//2, side//2).
