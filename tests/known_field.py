@@ -126,7 +126,7 @@ def stars(seed, faintest=3.9, special=False):
 
 
 def truth(stars, fluxrad, side, box, gain=GAIN):
-    """What is true of stars alone: their light, and the least errors that noise allows.
+    """True light of isolated stars, and the smallest errors that noise allows.
 
     Keys are `total`, the light within `fluxrad`; `stamp`, that in stamps of a `side` about the
     pixels of the list; `snr` of a matched filter; and errors and correlations of flux, sky, row and

@@ -81,7 +81,7 @@ def test_all_statements_are_tested():
 
 @pytest.mark.parametrize("name", STATEMENTS)
 def test_an_option_of_an_image_of_a_wrong_type(image, name):
-    """In all calls that take these options, before the image is read."""
+    """All calls that take these options check them before the image is read."""
     pixels, place = image
     model = psfdae.load_model()
     calls = (model.predict_image, model.photometry, model.residual, model.adapt)

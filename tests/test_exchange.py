@@ -104,7 +104,7 @@ def cube(path, columns, rows, oversampling=4):
 
 
 def even_cube(path, columns, rows):
-    """As STPSF writes it: an even number of values, with the star in the middle of them."""
+    """STPSF writes an even number of values, with the star in the middle of them."""
     positions = np.rint(Moving().grid(columns, rows))
     # Every other of eight values per pixel; the star is midway between two of them.
     psfs = Moving().psf_at(*positions.T, 8)[:, 1::2, 1::2]
@@ -188,7 +188,7 @@ def foreign(tmp_path_factory):
     "name", ["PSFEx", "STDPSF", "STPSF", "merged PSFEx", "Piff", "FITS", "pickle", "JSON"]
 )
 def test_models_of_other_programs_are_named(foreign, tmp_path, name):
-    """By the content, whatever the name of the file; those that cannot be read by any command."""
+    """The content decides, whatever the name of the file."""
     kind = name.removeprefix("merged ")
     path = foreign / name
     message = f"{path}: of the format {kind}, expected a model of psfdae"

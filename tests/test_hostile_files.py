@@ -295,7 +295,7 @@ def test_arrays_of_a_table_that_share_their_bytes_are_refused(tmp_path):
 
 
 def test_what_a_killed_process_has_unpacked_is_removed(good, tmp_path, room):
-    """By the next process that unpacks something; the copy of one that runs stays."""
+    """The next process that unpacks a file removes it; the copy of a running process stays."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     name = temporary_name("psfdae")
@@ -432,7 +432,7 @@ def test_no_address_in_a_votable_is_opened(tmp_path, server, stream):
 
 
 def test_no_address_that_a_file_names_is_opened(good, tmp_path, monkeypatch, server):
-    """Of a list, an image or a model, in texts, headers and names; nor as a path itself."""
+    """Addresses in texts, headers and names of lists, images and models, and as paths."""
     address, requests = server
     monkeypatch.chdir(tmp_path)
     dtd = f'<!DOCTYPE VOTABLE SYSTEM "{address}a.dtd" [<!ENTITY % p SYSTEM "{address}p"> %p;'
@@ -555,7 +555,7 @@ def test_rows_of_parquet_that_are_equal_get_no_more_memory_than_its_size_allows(
 
 
 def test_a_target_pixel_file_is_named(tmp_path):
-    """Of Kepler and TESS: the only image is the aperture; those of the star are in a table."""
+    """The only image of Kepler's and TESS's files is the aperture; the star is in a table."""
     flux = fits.Column("FLUX", "20E", dim="(5, 4)", array=np.zeros((3, 4, 5), "f4"))
     pixels = fits.BinTableHDU.from_columns([flux], name="PIXELS")
     aperture = fits.ImageHDU(np.ones((4, 5), np.int32), name="APERTURE")

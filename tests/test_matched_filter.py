@@ -65,7 +65,7 @@ def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
 @pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
 @pytest.mark.parametrize("fwhm", [1.6, 3.2, 8.0])
 def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):
-    """Of stars of S/N 7 nearly all, with their positions and fluxes, in all units of a sky."""
+    """Nearly all stars of S/N 7 are found, with positions and fluxes, in all units of a sky."""
     rng, grid = np.random.default_rng(2), gaussian_grid(fwhm, side=32 if fwhm > 5 else 16)
     flux = 7.0 / np.sqrt(
         np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0, 0]).sum()
@@ -133,7 +133,7 @@ FWHM_PX = 3.0, 3.65
 
 
 def test_faint_stars_of_a_crowded_field_are_found():
-    """With few false ones, which have the flag FAINT; a search of pixels found 4 and 65 %."""
+    """Few false ones, which have the flag FAINT; a search of pixels found 4 and 65 %."""
     field = simulate_field(300, 180, FWHM_PX, slope=0.5, seed=5)
     table = TrueField(300, FWHM_PX).photometry(field.image, detect=True, **CAMERA)
     faint, middle, *_ = compare(table, field.stars, (4.0, 7.0, 14.0))

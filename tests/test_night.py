@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(folder):
-    """What is wrong with the exposures, and their true shapes."""
+    """Defects of the exposures, and their true shapes."""
     return read_table(folder / "truth.csv", "image", "fault", "true_fwhm_px_centre")
 
 
@@ -243,7 +243,7 @@ NAMES = ["001", "1e5", "NA", "nan", "True", "0x10", "-x", "=2+3", "+1", "@a", "a
 
 
 def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch):
-    """From the table of a part to the page and the tracked runs; no cell is a formula."""
+    """Names from the table of a part to the page and the tracked runs; no cell is a formula."""
     shapes = {f"{quantity}_{p}": 2.0 for p in PLACES for quantity in ("fwhm_px", "ellipticity")}
     measurements = {**shapes, "mag_20th": -9.0, "bright_stars": 9, "time": "", "start": "1e5"}
     of_list = {"filter": "NA", "serial": "007", "chip": "1e2", "@note": "=1+1", "celsius": "-3.5"}

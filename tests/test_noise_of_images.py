@@ -124,7 +124,7 @@ def test_a_map_without_a_value_is_refused_in_one_line(image, options, values):
 
 @pytest.mark.parametrize(("name", "power"), [("ERR", 1), ("VAR", 2)])
 def test_extensions_with_pixels_without_noise(model, image, options, tmp_path, name, power):
-    """Of a file of a pipeline, with NaN, 0 and negative variances in a few pixels."""
+    """A pipeline's file has NaN, 0 and negative variances in a few pixels."""
     noise_map = np.sqrt(image / GAIN + (READ / GAIN) ** 2) ** power
     noise_map[10, 10], noise_map[20, 30], noise_map[200, 40:50] = np.nan, 0.0, -1.0
     quality = np.zeros(image.shape, np.int16)

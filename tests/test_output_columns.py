@@ -80,7 +80,7 @@ def along(truth, where, limit=0.3):
 
 
 def wrong_columns(table, checks, alike=()):
-    """What is wrong with the columns of a table, or with their checks; nothing in the best case.
+    """Columns of a table that are wrong, or whose checks are; none in the best case.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def model(folder):
 
 @pytest.fixture(scope="module")
 def true(folder, stars, model):
-    """What is true of the stars, and which of them are alone and known well, or nearly so."""
+    """True values of the stars, and masks of isolated, bright and fainter ones."""
     radius = float(model.wings.radius_px[-1])
     box = 2 * math.ceil(0.8 * known.gaussian_shape()[0]) + 1
     values = known.truth(stars, radius, STAMP, box)

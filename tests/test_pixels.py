@@ -307,7 +307,7 @@ def test_stars_in_a_row_are_no_trail(clean, spacing_px, flux):
 
 @pytest.mark.parametrize("arms", [4, 6])
 def test_spikes_of_saturated_stars_are_left_out_and_their_cores_are_not(clean, arms):
-    """At any angle; and charge that has run along a column, up to a part of the full well."""
+    """Spikes at any angle, and charge along a column, up to a part of the full well."""
     row, column = np.indices(clean[0].shape) - SIDE / 2.0
     spikes = np.zeros(clean[0].shape)
     for angle in 0.3 + 2 * np.pi * np.arange(arms) / arms:

@@ -1,4 +1,4 @@
-"""What a model is trained on: stars, and neither galaxies nor damaged stars nor other files."""
+"""Models are trained on stars, not on galaxies, damaged stars or other files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def galaxies(place, flux, seed, fwhm):
 
 
 def trained_on(stars, place):
-    """Which of the true stars are trained on, and the number of other sources that are."""
+    """Mask of the true stars that are trained on, and the number of other sources."""
     bright = stars.candidates.bright
     if not len(bright):
         return np.zeros(len(place), bool), 0

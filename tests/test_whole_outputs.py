@@ -81,7 +81,7 @@ WRITERS = {
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.5, 0.99])
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_file_without_space_is_named_and_leaves_nothing(tmp_path, name, part):
-    """At any size at which the space ends; HDF5 2.0 would end the process."""
+    """The space may end at any size; HDF5 2.0 would end the process."""
     WRITERS[name](tmp_path / name)
     size = (tmp_path / name).stat().st_size
     (tmp_path / name).unlink()
@@ -288,7 +288,7 @@ def test_a_full_disk_at_any_output_is_one_line(inputs, expected):
 
 @pytest.mark.parametrize("expected", ["photometry", "predict", "psf"], indirect=True)
 def test_a_command_without_space_writes_nothing(inputs, expected):
-    """At a limit of the kernel, whichever library writes."""
+    """The kernel limits the size, whichever library writes."""
     (words, whole), out = expected, inputs / "out"
     clear(out)
     with largest_file(2900):
@@ -300,7 +300,7 @@ def test_a_command_without_space_writes_nothing(inputs, expected):
 
 @pytest.mark.parametrize("expected", ["photometry"], indirect=True)
 def test_outputs_of_another_are_kept(inputs, expected):
-    """Without a cut-off run, a file with the name of a second output is the user's."""
+    """A file with the name of a second output is the user's if no run was cut off."""
     (words, _), out = expected, inputs / "out"
     (out / "a.csv").unlink()
     assert "r.fits: exists already; --overwrite replaces it" in refused(*words)

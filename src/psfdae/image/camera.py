@@ -85,7 +85,7 @@ ONE_COLOUR = (
     "neighbouring pixels are of different colours: debayer it, or take the pixels of one colour, "
     "such as data[0::2, 0::2]"
 )
-"""What is wrong with an undebayered frame, and what to do."""
+"""Problem of an undebayered frame, and advice."""
 
 
 def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[str, CameraValue]:

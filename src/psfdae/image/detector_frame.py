@@ -1,4 +1,4 @@
-"""Where the pixels of an image lie on the detector, by the header, and how two images differ.
+"""Position of an image's pixels on the detector by the header, and the offset of two images.
 
 In: the headers of two images. Out: the position of the one in the other, in pixels. Programs write
 the place under different keys, which count from different zeros, so that the numbers under a key of

@@ -177,7 +177,7 @@ class Observation:
 
     @property
     def detector_frames(self) -> dict[str, list[float]]:
-        """Where its pixels lie on the detector, as far as the header gives it."""
+        """Positions of its pixels on the detector, as far as the header gives them."""
         return detector_frames(self._layers.image)
 
     def sky(self) -> Sky:

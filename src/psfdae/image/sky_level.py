@@ -23,7 +23,7 @@ from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatt
 
 
 class SkyStructure(NamedTuple):
-    """Where the level of a sky changes within few pixels, and the step of its pixels.
+    """Lines at which the level of a sky changes within few pixels, and the step of its pixels.
 
     Attributes
     ----------

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
-"""What stars that are all unlike the training's may mean."""
+"""Possible causes if all stars are unlike the training stars."""
 
 
 class PhotometryError(Error, ValueError):
