@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.base.errors import keyword
+from psfdae.base.errors import keyword, warn
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.header_units import count_powers, parse_number, parse_unit
@@ -324,6 +324,7 @@ def checked_camera(
             f"sky of the others by {abs(sky.checker):.2g} times the noise: if it is an undebayered "
             f"colour frame, {ONE_COLOUR}"
         )
+        warn(remarks[-1:])
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
