@@ -212,6 +212,17 @@ def test_offsets_of_rows_or_columns_are_in_the_noise_of_stars(axis, offset):
     assert sums.std() == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_predictions_of_pixels_that_share_their_noise_are_warned_of(model, image, options, axis):
+    """Their errors are of independent pixels."""
+    options = {**options, **camera(1.0)}
+    shape = (1, image.shape[1]) if axis else (image.shape[0], 1)
+    noise = 0.7 * np.sqrt(SKY / GAIN + (READ / GAIN) ** 2)
+    offsets = np.random.default_rng(8).normal(0, noise, shape)
+    notes = [model.predict_image(pixels, **options).notes for pixels in (image, image + offsets)]
+    assert ["pixels share their noise" in "".join(lines) for lines in notes] == [False, True]
+
+
 def test_faint_sources_are_not_noise_that_pixels_share():
     rng = np.random.default_rng(6)
     image = rng.normal(0, 10.0, (300, 300))

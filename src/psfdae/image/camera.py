@@ -70,6 +70,8 @@ class SkySample:
         and, where pixels share their noise, that of sums of pixels.
     highest : float
         Largest pixel of all squares.
+    correlation : float
+        Noise of sums of pixels over that of independent pixels, at least 1.
     checker : float
         Level of the pixels of even rows and columns and of odd ones, less the level of the others,
         in units of the noise: that of the squares of a chessboard.
@@ -78,6 +80,7 @@ class SkySample:
     level: float
     noise: float
     highest: float
+    correlation: float
     checker: float
 
 
@@ -247,8 +250,9 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
     checker = float(np.nanmean(white) - np.nanmean(black))
     # Resampled pixels share noise: sums of them scatter by more than independent ones.
-    noise = noise_correlation(bands) * float(np.median(noises))
-    return SkySample(float(np.median(levels)), noise, highest, checker)
+    correlation = noise_correlation(bands)
+    noise = correlation * float(np.median(noises))
+    return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
 
 
 def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
@@ -306,7 +310,7 @@ def checked_camera(
     values : dict of str to CameraValue
         Those that fit the pixels.
     remarks : list of str
-        A sentence on each that does not.
+        A sentence on each that does not, on colours, and on noise that pixels share.
 
     Raises
     ------
@@ -325,6 +329,12 @@ def checked_camera(
             f"colour frame, {ONE_COLOUR}"
         )
         warn(remarks[-1:])
+    if sky.correlation > 1.0:
+        remarks.append(
+            f"{image.path}: pixels share their noise: errors of predictions are of independent "
+            f"pixels, up to {sky.correlation:.2f} times too small for faint stars; errors of "
+            "photometry include it"
+        )
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
