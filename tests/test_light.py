@@ -142,7 +142,13 @@ def plate(saturation, count=9, spacing_px=44, seed=1):
     return (counts + 3000 + rng.normal(0, 40, light.shape)).astype(np.float32), place, flux
 
 
-@pytest.fixture(scope="module", params=[5e3, 1e9], ids=["saturated plate", "linear camera"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(5e3, id="saturated plate"),
+        pytest.param(1e9, id="linear camera", marks=pytest.mark.slow),
+    ],
+)
 def measured_twice(request):
     """Saturation, model, its prediction of stars of its own image, photometry, true fluxes."""
     image, place, flux = plate(request.param)

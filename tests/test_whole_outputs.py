@@ -190,8 +190,11 @@ def commands(folder):
 
 
 NAMES = (
-    *("photometry", "predict", "wavefront", "psf", "night table", "example-field"),
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("from-stars", "exposure")),
+    *("photometry", "predict", "psf", "night table", "example-field"),
+    *(
+        pytest.param(name, marks=pytest.mark.slow)
+        for name in ("from-stars", "exposure", "wavefront")
+    ),
 )
 
 
