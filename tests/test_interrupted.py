@@ -79,7 +79,10 @@ def test_a_killed_process(half_done, undisturbed, victim):
         time.sleep(0.1)
     assert run.poll() is None, "the training left no checkpoint"
     for child in psutil.Process(run.pid).children(recursive=True):
-        words = child.cmdline()
+        try:
+            words = child.cmdline()
+        except (psutil.NoSuchProcess, psutil.ZombieProcess):  # it has ended since
+            continue
         worker = "fit" in words and "--checkpoint" in words
         if worker if victim == "fit" else any("bin/snakemake" in word for word in words[:2]):
             child.kill()
