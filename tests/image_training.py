@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from psfdae import load_model
 from psfdae.commands.cli import main
-from psfdae.model import calibration
+from psfdae.training import calibration
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, example_field
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from psfdae.base.files import read_product
+from psfdae.denoise.error_model import ErrorModel
 from psfdae.methods.bundle_info import Architecture, BundleInfo
 from psfdae.methods.networks.dae import build_dae
-from psfdae.model.error_model import ErrorModel
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars

@@ -13,7 +13,7 @@ import numpy as np
 from astropy.table import Table
 from scipy.spatial import cKDTree
 
-from psfdae.model.field_psfs import FieldPsfs
+from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import robust_scatter
 
 SKY, READ_NOISE = 400.0, 3.0  # electrons, which are the counts of the image

@@ -14,7 +14,7 @@ import psfdae
 import small_field
 from image_training import few_draws
 from psfdae.image.image_input import ImageInput, ImageStatements
-from psfdae.model.validation import Report
+from psfdae.report.validation import Report
 from psfdae_paper.configuration.base import config_dir
 
 OTHERS = [1j, b"1", object(), [], datetime.date(2024, 1, 1), {}, (1, 2, 3)]

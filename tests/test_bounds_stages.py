@@ -10,7 +10,7 @@ import pytest
 from psfdae.base.files import ProductError, read_product
 from psfdae.methods import method
 from psfdae.methods.interface import Needs
-from psfdae.model.star_sets import noisy_test_images, split_stars
+from psfdae.training.star_sets import noisy_test_images, split_stars
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.bounds.tables import POSTERIOR_MEANS
 from psfdae_paper.configuration.compose import load_stage

@@ -12,12 +12,12 @@ from scipy.ndimage import gaussian_filter
 import psfdae
 from image_training import SIZES
 from psfdae import PsfModel, StarFlag
+from psfdae.denoise.image_prediction import other_instrument
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
 from psfdae.methods.field_spline import FieldModel
 from psfdae.methods.interface import TrainingSet
-from psfdae.model.image_prediction import other_instrument
 from psfdae.stars.bright_stars import BrightStars, magnitude
 from psfdae.stars.noise import NoiseModel
 

@@ -13,16 +13,16 @@ import torch
 from safetensors.numpy import save
 
 import command_line
-from psfdae.methods.networks.dae import build_dae, run_network
-from psfdae.model import packing
-from psfdae.model.bundle import (
+from psfdae.denoise.bundle import (
     BundleError,
     creation_date,
     estimator,
     read_bundle,
     write_bundle,
 )
-from psfdae.model.flux_model import FluxModel, robust_flux
+from psfdae.denoise.flux_model import FluxModel, robust_flux
+from psfdae.methods.networks.dae import build_dae, run_network
+from psfdae.training import packing
 
 
 @pytest.fixture(scope="module")

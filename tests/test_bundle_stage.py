@@ -13,21 +13,21 @@ from prediction_stars import gaussians
 from psfdae import StarFlag
 from psfdae.base.belonging import write_origin
 from psfdae.base.files import Column, ProductError, read_product, write_product
-from psfdae.methods import groups_of
-from psfdae.model.bundle import (
+from psfdae.denoise.bundle import (
     BundleError,
     estimator,
     read_bundle,
     shipped_path,
     write_bundle,
 )
-from psfdae.model.calibration import StarErrors, crossed_coverage
-from psfdae.model.error_model import at_noise, brightest, mahalanobis
-from psfdae.model.flux_model import FluxModel
-from psfdae.model.psf_model import PsfModel
-from psfdae.model.star_sets import HeldOutStars, noise_model, noisy_test_images, read_stars
+from psfdae.denoise.error_model import at_noise, brightest, mahalanobis
+from psfdae.denoise.flux_model import FluxModel
+from psfdae.denoise.star_model import PsfModel
+from psfdae.methods import groups_of
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split
+from psfdae.training.calibration import StarErrors, crossed_coverage
+from psfdae.training.star_sets import HeldOutStars, noise_model, noisy_test_images, read_stars
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle as stage
 from psfdae_paper.stages.evaluate import Models

@@ -19,15 +19,15 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
 from psfdae.base.files import read_product
+from psfdae.denoise.bundle import BundleError
 from psfdae.image.camera import CameraValue
 from psfdae.image.image_input import ImageInput
 from psfdae.image.stamps import cut_image
-from psfdae.model import crowded
-from psfdae.model.bundle import BundleError
-from psfdae.model.neighbours import light_of_others
-from psfdae.model.photon_noise import measure_gain, with_measured_gain
-from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import StarFluxes, Wings, draw_tents, wings_of
+from psfdae.photometry import crowded
+from psfdae.photometry.photon_noise import measure_gain, with_measured_gain
+from psfdae.psf.grid import PsfGrid
+from psfdae.psf.wings import StarFluxes, Wings, draw_tents, wings_of
+from psfdae.training.neighbours import light_of_others
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, FRAME = 330, 200.0, 10, 61
@@ -387,7 +387,7 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     raw = stars_of(sky)
     level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))
     saturated = stars_of(sky, saturate=level).candidates.verdict == "saturated"
-    monkeypatch.setattr("psfdae.model.stars.is_crowded", lambda _: True)
+    monkeypatch.setattr("psfdae.training.stars.is_crowded", lambda _: True)
     clean = stars_of(sky, saturate=level)
     # Those are still seen without their neighbours.
     assert saturated.any() and (clean.candidates.verdict[saturated] == "saturated").all()

@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
 from image_training import few_draws
+from psfdae.denoise.bundle import read_bundle
 from psfdae.image.camera import camera_values
 from psfdae.image.detection import Sky
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
-from psfdae.model.bundle import read_bundle
-from psfdae.model.settings import from_words
+from psfdae.training.settings import from_words
 from psfdae_paper.stages import simulate
 
 SIDE = 520

@@ -15,7 +15,7 @@ from docs_pages import ROOT, blocks, commands, pages, read
 from fits_inputs import write_field
 from image_training import few_draws
 from psfdae.commands.cli import main
-from psfdae.model.bundle import read_bundle
+from psfdae.denoise.bundle import read_bundle
 from workflow_runs import clone, shell
 
 SMALL = ("parts.train_stars=60", "parts.test_stars=20")
@@ -160,7 +160,7 @@ def test_python_blocks_run(tmp_path, monkeypatch):
         b for b in bodies if not re.search("from_image|predict_image|psfdae.wavefront|mlflow", b)
     ]
     assert bodies
-    (shipped,) = (ROOT / "src/psfdae/model/bundles").glob("*.safetensors")
+    (shipped,) = (ROOT / "src/psfdae/denoise/bundles").glob("*.safetensors")
     shutil.copy(shipped, tmp_path / "image.psf.safetensors")
     monkeypatch.chdir(tmp_path)
     for body in bodies:

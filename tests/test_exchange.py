@@ -14,10 +14,10 @@ from photutils.psf import GriddedPSFModel
 
 from command_line import printed, psfdae, refused
 from psfdae import Error, load_model
-from psfdae.model import exchange
-from psfdae.model.bundle import name_foreign_format
-from psfdae.model.exchange import PsfexField, load_field
-from psfdae.model.field_psfs import FieldPsfs, PredictionError
+from psfdae.denoise.bundle import name_foreign_format
+from psfdae.psf import exchange
+from psfdae.psf.exchange import PsfexField, load_field
+from psfdae.psf.interface import FieldPsfs, PredictionError
 
 galsim = pytest.importorskip("galsim")
 des = pytest.importorskip("galsim.des")

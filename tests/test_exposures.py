@@ -15,10 +15,10 @@ from psfdae import PredictionError, Stars, load_model
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field_search import fit_field
 from psfdae.methods.field_spline import deformations
-from psfdae.model.exposures import exposure, for_exposures
-from psfdae.model.settings import from_words
-from psfdae.model.validation import validate
-from psfdae.model.wings import Wings
+from psfdae.psf.wings import Wings
+from psfdae.report.validation import validate
+from psfdae.training.exposures import exposure, for_exposures
+from psfdae.training.settings import from_words
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP = 450, 100.0, 10

@@ -14,7 +14,7 @@ from psfdae import load_model
 from psfdae.base import errors
 from psfdae.base.errors import MissingExtraError
 from psfdae.commands.cli import refusal
-from psfdae.model.bundle import write_bundle
+from psfdae.denoise.bundle import write_bundle
 from workflow_runs import ROOT, captured
 
 

@@ -8,9 +8,9 @@ from psfdae.base.errors import Error
 from psfdae.image.image_input import ImageInput
 from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag
-from psfdae.model.calibration import StarErrors
-from psfdae.model.crowded import photometry
-from psfdae.model.settings import from_words
+from psfdae.photometry.crowded import photometry
+from psfdae.training.calibration import StarErrors
+from psfdae.training.settings import from_words
 from small_field import GAIN, READ, SKY, image_of, moffat, ring
 
 CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}

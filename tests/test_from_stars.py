@@ -23,19 +23,19 @@ from psfdae.base.files import read_product, write_product
 from psfdae.base.rng import stream
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import locked_folder
+from psfdae.denoise.bundle import read_bundle
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
 from psfdae.methods import groups_of, method
-from psfdae.model.bundle import read_bundle
-from psfdae.model.settings import from_words
-from psfdae.model.star_sets import split_stars
-from psfdae.model.validation import Report
+from psfdae.report.validation import Report
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import shift_stamps
 from psfdae.stars.noise import NoiseModel, OwnNoise
 from psfdae.stars.splits import held_out_fields
+from psfdae.training.settings import from_words
+from psfdae.training.star_sets import split_stars
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import FieldRecipe, example_field, star_images

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from psfdae.denoise.bundle import BundleError
 from psfdae.methods import mixing, mixture_fit
 from psfdae.methods.clusters import without_slope
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.methods.interface import Needs, TrainingSet
-from psfdae.model.bundle import BundleError
-from psfdae.model.packing import packed
 from psfdae.stars.noise import NoiseModel
+from psfdae.training.packing import packed
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6

@@ -34,13 +34,13 @@ from prediction_stars import with_network
 from psfdae import Error, load_model
 from psfdae.base.files import read_product, temporary_name
 from psfdae.base.reading import read_table, read_yaml
+from psfdae.denoise import bundle as bundles
+from psfdae.denoise.bundle import read_bundle, shipped_path
 from psfdae.image import fits_file as images
 from psfdae.image import list_formats
 from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.methods.networks.weights import load_weights
-from psfdae.model import bundle as bundles
-from psfdae.model.bundle import read_bundle, shipped_path
 
 SIDE = 16
 CUBE, TILES, LIST, TABLE, MODEL = (

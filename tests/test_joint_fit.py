@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 
-from psfdae.model.joint_fit import chains, fit_stars, standard_errors
-from psfdae.model.psf_grid import PsfGrid
+from psfdae.photometry.joint_fit import chains, fit_stars, standard_errors
+from psfdae.psf.grid import PsfGrid
 
 SIGMA_PX, FWHM_PX, BOX_PX = 1.2, 2.83, 7
 

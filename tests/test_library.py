@@ -14,10 +14,10 @@ import pytest
 import psfdae
 from docs_pages import blocks, read
 from image_training import FIELD, MIXTURE, SIZES, few_draws
+from psfdae.denoise.star_model import PsfModel
 from psfdae.methods import method
-from psfdae.model.calibration import COVERAGE
-from psfdae.model.psf_model import PsfModel
-from psfdae.model.settings import DATASET_CHOICE, from_words, of_config, settings_model
+from psfdae.training.calibration import COVERAGE
+from psfdae.training.settings import DATASET_CHOICE, from_words, of_config, settings_model
 from psfdae_paper.configuration.compose import load_stage
 
 

@@ -10,11 +10,12 @@ import psfdae
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
-from psfdae.model import crowded, neighbours
-from psfdae.model.exchange import load_field, write_psfex
-from psfdae.model.image_photometry import photometry_of_image
-from psfdae.model.psf_grid import PsfGrid
-from psfdae.model.wings import Wings
+from psfdae.photometry import crowded
+from psfdae.photometry.image_photometry import photometry_of_image
+from psfdae.psf.exchange import load_field, write_psfex
+from psfdae.psf.grid import PsfGrid
+from psfdae.psf.wings import Wings
+from psfdae.training import neighbours
 from simulated_fields import CAMERA, compare, simulate_field
 from small_field import drawn
 

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 import psfdae
 from psfdae.image.image_input import ImageInput
-from psfdae.model.matched_filter import find_stars, measure_snr
-from psfdae.model.psf_grid import PsfGrid
+from psfdae.photometry.matched_filter import find_stars, measure_snr
+from psfdae.psf.grid import PsfGrid
 from simulated_fields import CAMERA, TrueField, compare, false_share, simulate_field
 
 SIZE = 200

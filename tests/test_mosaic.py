@@ -12,10 +12,10 @@ from astropy.table import Table
 
 from command_line import printed, psfdae, refused
 from psfdae.commands import mosaic
+from psfdae.denoise.bundle import read_bundle
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
 from psfdae.image.image_input import ImageInput, ImageStatements
-from psfdae.model.bundle import read_bundle
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars import example
 

@@ -17,7 +17,7 @@ from astropy.table import Table
 
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae.model import psf_model
+from psfdae.denoise import star_model as psf_model
 from psfdae_paper.evaluation.night import LIMITS, night_page, read_night, with_verdicts
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,

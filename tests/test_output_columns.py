@@ -21,7 +21,7 @@ from command_line import printed
 from image_training import few_draws
 from psfdae import StarFlag, load_model
 from psfdae.base.files import write_csv
-from psfdae.model import validation
+from psfdae.report import validation
 from psfdae.sensing import sampling
 from psfdae.sensing.sampling import Chains
 from psfdae.stars.moments import measure_shapes

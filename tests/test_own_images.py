@@ -16,12 +16,12 @@ from command_line import printed, refused
 from command_line import psfdae as run
 from image_training import few_draws
 from psfdae import StarFlag, load_model
+from psfdae.denoise.bundle import read_bundle, write_bundle
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import collect
 from psfdae.image.selection_advice import saturation_advice
 from psfdae.image.stamps import cut
-from psfdae.model.bundle import read_bundle, write_bundle
-from psfdae.model.settings import from_words
+from psfdae.training.settings import from_words
 
 SIDE, SKY, NOISE = 10, 187.0, 10.0
 COLUMNS, ROWS = 330, 300

@@ -9,11 +9,11 @@ import pytest
 from scipy import ndimage
 
 from prediction_stars import observe
+from psfdae.denoise import flux_model as module
+from psfdae.denoise.flux_model import FluxModel, robust_flux
+from psfdae.denoise.leading_modes import LeadingModes, clipped_rms
+from psfdae.denoise.star_flux import Photometer
 from psfdae.image.stamps import StarFlag, border_pixels, cut, displacement, smoothed
-from psfdae.model import flux_model as module
-from psfdae.model.flux_model import FluxModel, robust_flux
-from psfdae.model.leading_modes import LeadingModes, clipped_rms
-from psfdae.model.photometry import Photometer
 from psfdae.stars.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)

@@ -19,11 +19,11 @@ from psfdae.image.sky_level import SkyStructure, noise_correlation, sky_level, s
 from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
 from psfdae.image.trails import add_trails, find_trails
 from psfdae.methods.field import FieldMixture
-from psfdae.model import crowded
-from psfdae.model.fitting import fitted_to
-from psfdae.model.neighbours import _Field
-from psfdae.model.stars import Stars
+from psfdae.photometry import crowded
 from psfdae.stars.bright_stars import BrightStars
+from psfdae.training.fitting import fitted_to
+from psfdae.training.neighbours import _Field
+from psfdae.training.stars import Stars
 from small_field import CAMERA, SKY, drawn, moffat, noisy
 
 SIDE = 320

@@ -15,11 +15,11 @@ from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
 from psfdae.commands import predict as stage
+from psfdae.denoise import prediction as writer
+from psfdae.denoise.denoiser import SNR_TOLERANCE
+from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.image_input import ImageInput
 from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
-from psfdae.model import prediction as writer
-from psfdae.model.psf_model import SCALE_TOLERANCE
-from psfdae.model.restoration import SNR_TOLERANCE
 from workflow_runs import ROOT
 
 SIDE = 320

@@ -9,11 +9,11 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import PredictionError, StarFlag
+from psfdae.denoise import denoiser as restoration
+from psfdae.denoise.prediction import CUBES
+from psfdae.denoise.star_model import PsfModel
 from psfdae.image.stamps import cut
 from psfdae.methods.interface import Packing
-from psfdae.model import restoration
-from psfdae.model.prediction import CUBES
-from psfdae.model.psf_model import PsfModel
 
 
 def rms(values):

@@ -11,7 +11,7 @@ from astropy.table import Table
 from psfdae.image import selection_advice as advice
 from psfdae.image.stamps import cut
 from psfdae.image.star_criteria import misfit
-from psfdae.model.report_checks import (
+from psfdae.report.checks import (
     MEAN_PSF,
     check_held_out,
     check_stars,

@@ -52,7 +52,7 @@ def test_code_that_draws_reads_images_or_is_new_trains_nothing(changed):
     paths = [
         *("psfdae/methods/metrics.py", "psfdae/figure_style.py", "psfdae/strip.py"),
         *("psfdae/image/observation.py", "psfdae/image/fits_file.py", "psfdae/image/catalogue.py"),
-        *("psfdae/model/report.py", "psfdae/model/validation.py", "psfdae/model/plot.py"),
+        *("psfdae/report/page.py", "psfdae/report/validation.py", "psfdae/report/plot.py"),
         *("psfdae/commands/predict.py", "psfdae/commands/cli.py"),
         *("psfdae/methods/newest.py", "psfdae_paper/methods/newest.py"),
         *("psfdae_paper/evaluation/curves.py", "psfdae_paper/evaluation/figures.py"),

@@ -9,7 +9,6 @@ import pytest
 
 from psfdae.base.files import Product
 from psfdae.base.rng import stream
-from psfdae.model.star_sets import noisy_test_images
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
 from psfdae.stars.noise import mixed_levels
 from psfdae.stars.splits import (
@@ -19,6 +18,7 @@ from psfdae.stars.splits import (
     held_out_split,
     random_split,
 )
+from psfdae.training.star_sets import noisy_test_images
 from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
 from psfdae_paper.stars.framing import (
     FramingError,

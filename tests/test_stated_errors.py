@@ -12,10 +12,10 @@ from command_line import printed
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
-from psfdae.model.calibration import with_model_errors
-from psfdae.model.crowded import photometry, star_flags
-from psfdae.model.fitting import described, fitted_to
-from psfdae.model.packing import uncalibrated, with_wings
+from psfdae.photometry.crowded import photometry, star_flags
+from psfdae.training.calibration import with_model_errors
+from psfdae.training.fitting import described, fitted_to
+from psfdae.training.packing import uncalibrated, with_wings
 from small_field import GAIN, READ, SKY, noisy
 
 SIZE = 600

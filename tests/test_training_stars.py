@@ -12,7 +12,7 @@ from psfdae.base.errors import Error
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.selection import Verdict
-from psfdae.model.stars import Stars
+from psfdae.training.stars import Stars
 from small_field import GAIN, READ, drawn, moffat, noisy, ring
 
 CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}

@@ -10,8 +10,8 @@ import pytest
 from psfdae.methods import method
 from psfdae.methods.interface import TrainingSet
 from psfdae.methods.metrics import mse
-from psfdae.model.star_sets import noise_model
 from psfdae.optics.wavefronts import monomial_coefficients
+from psfdae.training.star_sets import noise_model
 from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
 from psfdae_paper.bounds.floor import local_error
 from psfdae_paper.bounds.modes import largest_of_groups

@@ -14,9 +14,9 @@ from skimage.metrics import mean_squared_error, structural_similarity
 
 from docs_pages import read
 from psfdae.base.files import read_product, write_text
+from psfdae.denoise.bundle import read_bundle
 from psfdae.methods import method
-from psfdae.model.bundle import read_bundle
-from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
+from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.aligners import aligners_of
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.evaluation.comparison import seed_scatter
@@ -280,7 +280,7 @@ def test_shipped_bundle_is_trained_on_its_stars_and_written_where_it_is_read(tmp
     fits = dict.fromkeys(("train", "bundle", "fit_gmm", "bundle_gmm"), 2)
     assert jobs == {"templates": 2, "stars": 2, **fits}
     snakemake(tmp_path, "shipped")
-    bundle = read_bundle(tmp_path / "src/psfdae/model/bundles/wfsat.psf.safetensors")
+    bundle = read_bundle(tmp_path / "src/psfdae/denoise/bundles/wfsat.psf.safetensors")
     assert (bundle.info.name, bundle.info.subpixel) == ("wfsat", True)
     assert bundle.info.config["train"]["noise"]["name"] == "field"
     assert planned(tmp_path, "shipped") == {}

@@ -30,31 +30,31 @@ progress.show_with(terminal.bar)
 
 if TYPE_CHECKING:
     from psfdae.base.errors import Error
+    from psfdae.denoise.prediction import Prediction
+    from psfdae.denoise.star_model import PsfModel, load_model
     from psfdae.image.detected_stars import detect
     from psfdae.image.stamps import StarFlag
-    from psfdae.model.field_psfs import PredictionError
-    from psfdae.model.fitting import fit
-    from psfdae.model.prediction import Prediction
-    from psfdae.model.psf_model import PsfModel, load_model
-    from psfdae.model.stars import Stars
-    from psfdae.model.validation import Report, validate
+    from psfdae.psf.interface import PredictionError
+    from psfdae.report.validation import Report, validate
     from psfdae.sensing.results import Wavefronts, wavefront
     from psfdae.telescope.settings import read_telescope
+    from psfdae.training.fitting import fit
+    from psfdae.training.stars import Stars
 
 _MODULES = {
     "Error": "base.errors",
-    "Prediction": "model.prediction",
-    "PredictionError": "model.field_psfs",
-    "PsfModel": "model.psf_model",
-    "Report": "model.validation",
+    "Prediction": "denoise.prediction",
+    "PredictionError": "psf.interface",
+    "PsfModel": "denoise.star_model",
+    "Report": "report.validation",
     "StarFlag": "image.stamps",
-    "Stars": "model.stars",
+    "Stars": "training.stars",
     "Wavefronts": "sensing.results",
     "detect": "image.detected_stars",
-    "fit": "model.fitting",
-    "load_model": "model.psf_model",
+    "fit": "training.fitting",
+    "load_model": "denoise.star_model",
     "read_telescope": "telescope.settings",
-    "validate": "model.validation",
+    "validate": "report.validation",
     "wavefront": "sensing.results",
 }
 

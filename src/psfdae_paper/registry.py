@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psfdae.model.bundle import SUFFIX, Bundle, write_bundle
-from psfdae.model.packing import uncalibrated
-from psfdae.model.star_sets import read_stars
+from psfdae.denoise.bundle import SUFFIX, Bundle, write_bundle
+from psfdae.training.packing import uncalibrated
+from psfdae.training.star_sets import read_stars
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.tracking import TrackedRun
 

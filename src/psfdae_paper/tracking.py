@@ -22,11 +22,11 @@ from psfdae.base.belonging import STARS, require_origin
 from psfdae.base.files import ProductError, read_product, sha256_of
 from psfdae.base.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.base.settings import leaves
+from psfdae.denoise.bundle import SUFFIX
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.methods.interface import CONFIG, HISTORY, Method
-from psfdae.model.bundle import SUFFIX
 from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_networks, trained_networks
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load

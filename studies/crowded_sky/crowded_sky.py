@@ -36,7 +36,7 @@ from scipy.spatial import cKDTree
 
 from psfdae import load_model
 from psfdae.image.image_input import ImageInput
-from psfdae.model import crowded
+from psfdae.photometry import crowded
 from psfdae_paper.source import git_commit
 
 SIZE_PX, STARS, BRIGHT = 1000, 2000, 600

@@ -24,7 +24,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.metrics import clustered_mean, mse
-from psfdae.model.star_sets import field_positions, read_stars, training_set
+from psfdae.training.star_sets import field_positions, read_stars, training_set
 from psfdae_paper.bounds import mode_search
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load

@@ -22,7 +22,7 @@ import pandas as pd
 from psfdae.base.threads import limit_threads
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.methods.metrics import clustered_mean, mse
-from psfdae.model.star_sets import read_stars, training_set
+from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load
 

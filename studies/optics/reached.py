@@ -21,7 +21,7 @@ from psfdae.base.files import read_product
 from psfdae.base.threads import limit_threads
 from psfdae.methods import method
 from psfdae.methods.metrics import clustered_mean
-from psfdae.model.star_sets import field_positions, training_set
+from psfdae.training.star_sets import field_positions, training_set
 from psfdae_paper.bounds.estimates import bounded_stars, true_modes
 from psfdae_paper.bounds.mode_search import climb
 from psfdae_paper.bounds.stamp_model import StarPosteriors

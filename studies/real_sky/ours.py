@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from psfdae.commands.cli import main
-from psfdae.model import stars
+from psfdae.training import stars
 
 split, *words = sys.argv[1:]
 lattice = stars.star_grid

@@ -23,7 +23,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 from psfdae.base.files import read_product
 from psfdae.methods.dae import Dae
 from psfdae.methods.networks.dae import DaeTraining, run_network
-from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
+from psfdae.training.star_sets import noisy_test_images, split_stars, training_set
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 

@@ -17,7 +17,7 @@ import pandas as pd
 
 from psfdae.base.files import read_product
 from psfdae.methods import method
-from psfdae.model.star_sets import (
+from psfdae.training.star_sets import (
     field_positions,
     noisy_test_images,
     split_stars,

@@ -27,7 +27,7 @@ from psfdae.base.files import read_product
 from psfdae.methods.dae import Dae
 from psfdae.methods.interface import HISTORY
 from psfdae.methods.networks import dae, training
-from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
+from psfdae.training.star_sets import noisy_test_images, split_stars, training_set
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 

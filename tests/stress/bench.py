@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psfdae.base.rng import stream
+from psfdae.denoise.flux_model import FluxModel
+from psfdae.denoise.star_flux import Photometer
 from psfdae.methods.networks.dae import TrainingSet, image_scale
-from psfdae.model.flux_model import FluxModel
-from psfdae.model.packing import leading
-from psfdae.model.photometry import Photometer
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import draw_jitter
+from psfdae.training.packing import leading
 from psfdae_paper.stages import stars as stars_stage
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux

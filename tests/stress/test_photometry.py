@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from psfdae.denoise.flux_model import FluxModel, robust_flux
 from psfdae.image.stamps import StarFlag, border_median
-from psfdae.model.flux_model import FluxModel, robust_flux
 
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0  # sampling errors that a measured RMS may be off by

@@ -105,7 +105,7 @@ def time_method(name, tree, stars, bound):
     """Return CPU seconds of the fit, stars per second at the slowest level, and mean errors."""
     from psfdae.base.threads import limit_threads
     from psfdae.methods.metrics import mse
-    from psfdae.model import star_sets
+    from psfdae.training import star_sets
     from psfdae_paper.bounds.estimates import SPLIT, bounded_stars
 
     # Imports are no part of the fit.

@@ -21,9 +21,9 @@ from psfdae.base.options import File
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
 from psfdae.commands.cli import program
-from psfdae.model import star_sets
 from psfdae.stars.noise import NoiseModel, mixed_levels
 from psfdae.stars.splits import draw_jitter
+from psfdae.training import star_sets
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -101,7 +101,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     many passes as threads beside each other. Then the memory of the prediction in MB,
     interpreter and libraries included.
     """
-    from psfdae.model.psf_model import load_model
+    from psfdae.denoise.star_model import load_model
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
@@ -170,7 +170,7 @@ def poppy(
 
 def bundle_errors(bundle, truth, config):
     """Errors of a bundle on noise-free stars of flux 1, a row for each noise level."""
-    from psfdae.model.psf_model import load_model
+    from psfdae.denoise.star_model import load_model
 
     model, noise = (
         load_model(bundle),
@@ -194,7 +194,7 @@ def bundle_errors(bundle, truth, config):
 
 def require_bundle(bundle, config):
     """Refuse a bundle whose training stars are not of the configured scene."""
-    from psfdae.model.bundle import read_bundle
+    from psfdae.denoise.bundle import read_bundle
 
     trained_on = read_bundle(bundle).info.config.get("stars")
     if isinstance(trained_on, dict):
@@ -206,7 +206,7 @@ def quality(result, truth, flux, expected, case):
 
     `coverage95` is of `UNCERT` times `ratio95`.
     """
-    from psfdae.model.error_model import brightest
+    from psfdae.denoise.error_model import brightest
 
     good = np.isfinite(result.psf).all(axis=(1, 2))
     psf, width = result.psf[good], result.uncertainty[good]
@@ -231,7 +231,7 @@ def coverage(
 
     Either half of the stars, with flux and sky found, by what the other half says of the errors.
     """
-    from psfdae.model.bundle import read_bundle
+    from psfdae.denoise.bundle import read_bundle
 
     products = [star_sets.read_stars(path, "template") for path in stars]
     rows = []
@@ -250,10 +250,10 @@ def refuse(bundle, stars):
 
 def covered(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
-    from psfdae.model.bundle import estimator
-    from psfdae.model.calibration import calibrated
-    from psfdae.model.error_model import brightest
-    from psfdae.model.psf_model import PsfModel
+    from psfdae.denoise.bundle import estimator
+    from psfdae.denoise.error_model import brightest
+    from psfdae.denoise.star_model import PsfModel
+    from psfdae.training.calibration import calibrated
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     settings = part(("seed", "noise", "parts"), trained)
@@ -305,7 +305,7 @@ def outliers(
     companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as
     wide as the mean star.
     """
-    from psfdae.model.psf_model import load_model
+    from psfdae.denoise.star_model import load_model
 
     product = star_sets.read_stars(stars, "realisation")
     require(stars, product.config, STARS, config)

@@ -143,12 +143,12 @@ def last_cost(runs):
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.base.files import read_product
+    from psfdae.denoise.bundle import read_bundle, write_bundle
+    from psfdae.denoise.error_model import ErrorModel
+    from psfdae.denoise.flux_model import FluxModel
     from psfdae.methods.bundle_info import Architecture, BundleInfo
-    from psfdae.model.bundle import read_bundle, write_bundle
-    from psfdae.model.error_model import ErrorModel
-    from psfdae.model.flux_model import FluxModel
-    from psfdae.model.packing import leading
     from psfdae.stars.noise import noise_equivalent_px
+    from psfdae.training.packing import leading
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])

@@ -16,7 +16,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.commands.cli import program
 from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
-from psfdae.model import star_sets
+from psfdae.training import star_sets
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 

@@ -56,7 +56,7 @@ rule shipped:
     params:
         config=lambda w: settings("ship", f"dataset={SHIPPED_DATASET}"),
         source=source_hash("ship"),
-        folder="src/psfdae/model/bundles",
+        folder="src/psfdae/denoise/bundles",
         bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:
         "Renewing the model that comes with the package"

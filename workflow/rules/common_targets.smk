@@ -1,5 +1,5 @@
 from psfdae_paper.configuration.aligners import ALIGNERS, trained_networks
-from psfdae.model.bundle import SUFFIX
+from psfdae.denoise.bundle import SUFFIX
 
 with one_line():
     TIMED = import_module("costs").load_points()

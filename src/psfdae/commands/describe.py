@@ -6,9 +6,9 @@ from typing import Annotated
 
 from psfdae.base.options import File
 from psfdae.commands.cli import command
+from psfdae.denoise.bundle import Bundle, read_bundle
+from psfdae.denoise.description import error_table, model_facts
 from psfdae.image.errors import one_line
-from psfdae.model.bundle import Bundle, read_bundle
-from psfdae.model.description import error_table, model_facts
 
 
 @command("describe")

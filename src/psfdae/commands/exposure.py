@@ -7,9 +7,9 @@ from typing import Annotated
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
+from psfdae.denoise.bundle import SUFFIX
+from psfdae.denoise.star_model import load_model
 from psfdae.image.image_input import ImageInput, ImageStatements
-from psfdae.model.bundle import SUFFIX
-from psfdae.model.psf_model import load_model
 
 
 @command("exposure")
@@ -39,7 +39,7 @@ def exposure_command(
     check_targets((*source.files(), model), out, overwrite=overwrite)
     loaded = load_model(model)
 
-    from psfdae.model.exposures import exposure as adapt_to_exposure
+    from psfdae.training.exposures import exposure as adapt_to_exposure
 
     adapted, sentence = adapt_to_exposure(loaded, source, out.name.removesuffix(SUFFIX))
     adapted.save(out)

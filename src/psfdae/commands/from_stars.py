@@ -25,15 +25,16 @@ from psfdae.base.settings import ConfigError, as_overrides
 from psfdae.commands.cli import command, typed_words
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
 from psfdae.commands.predict import write_list
+from psfdae.denoise.bundle import SUFFIX
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import Method
-from psfdae.model.bundle import SUFFIX
-from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import (
+from psfdae.report.validation import validate
+from psfdae.training.exposures import for_exposures
+from psfdae.training.fitting import (
     choose_method,
     described,
     fitted_to,
@@ -41,9 +42,14 @@ from psfdae.model.fitting import (
     pack_model,
     worth_trying,
 )
-from psfdae.model.settings import DATASET_CHOICE, Settings, SettingsReader, of_config, with_keywords
-from psfdae.model.stars import Stars
-from psfdae.model.validation import validate
+from psfdae.training.settings import (
+    DATASET_CHOICE,
+    Settings,
+    SettingsReader,
+    of_config,
+    with_keywords,
+)
+from psfdae.training.stars import Stars
 
 
 class FolderError(Error, RuntimeError):

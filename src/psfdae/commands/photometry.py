@@ -12,8 +12,8 @@ from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import SUFFIXES, write_table
-from psfdae.model.exchange import load_field
-from psfdae.model.image_photometry import PhotometryError, photometry_of_image
+from psfdae.photometry.image_photometry import PhotometryError, photometry_of_image
+from psfdae.psf.exchange import load_field
 
 
 @command("photometry")

@@ -19,16 +19,16 @@ from psfdae.base.files import atomic_path, check_outputs, is_cut_off, rename_tog
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
+from psfdae.denoise.bundle import SUFFIX
+from psfdae.denoise.image_prediction import notes_on_model, offsets_from_list, open_for_model
+from psfdae.denoise.prediction import prediction_file
+from psfdae.denoise.star_model import PsfModel, load_model
 from psfdae.image.fits_file import Card
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag
-from psfdae.model.bundle import SUFFIX
-from psfdae.model.field_psfs import PredictionError
-from psfdae.model.image_prediction import notes_on_model, offsets_from_list, open_for_model
-from psfdae.model.prediction import prediction_file
-from psfdae.model.psf_model import PsfModel, load_model
+from psfdae.psf.interface import PredictionError
 
 
 def write_list(observation: Observation, path: Path) -> None:
@@ -117,7 +117,7 @@ def predict_command(
             if list_path is not None:
                 write_list(observation, list_path)
             if plot is not None:
-                from psfdae.model.plot import map_of_file
+                from psfdae.report.plot import map_of_file
 
                 write_png(map_of_file(unfinished), plot)
     except OSError as error:

@@ -11,9 +11,9 @@ import numpy as np
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
-from psfdae.model import exchange
-from psfdae.model.exchange import load_field
-from psfdae.model.field_psfs import FieldPsfs, PredictionError
+from psfdae.psf import exchange
+from psfdae.psf.exchange import load_field
+from psfdae.psf.interface import FieldPsfs, PredictionError
 
 
 @command("psf")

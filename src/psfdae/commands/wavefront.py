@@ -17,13 +17,13 @@ from psfdae.base.files import rename_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
+from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.detector_frame import find_offset
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import central_pixel
-from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.sensing.output import report_lines, wavefront_hdus
 from psfdae.sensing.results import Wavefronts
 from psfdae.sensing.results import wavefront as measure_wavefronts

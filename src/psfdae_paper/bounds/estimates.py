@@ -11,8 +11,8 @@ from psfdae.base.files import Column, Product
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
 from psfdae.methods.metrics import mse
-from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae.telescope.aberrations import Seidel
+from psfdae.training.star_sets import noisy_test_images, split_stars
 from psfdae_paper.bounds.mode_search import climb, search
 from psfdae_paper.bounds.modes import Knowledge, Modes, separate
 from psfdae_paper.bounds.posterior import (

@@ -11,8 +11,8 @@ import numpy as np
 from psfdae.base.files import Product, ProductError
 from psfdae.methods import method as method_named
 from psfdae.methods.metrics import clustered_mean, mse
-from psfdae.model.star_sets import noise_model
 from psfdae.optics.wavefronts import monomial_coefficients
+from psfdae.training.star_sets import noise_model
 from psfdae_paper.bounds.estimates import (
     ENOUGH_ESS,
     SPLIT,

@@ -18,7 +18,7 @@ from psfdae.base.files import Product, ProductError
 from psfdae.base.reading import read_table
 from psfdae.methods.interface import Estimate
 from psfdae.methods.metrics import quality, summarised
-from psfdae.model.star_sets import field_positions
+from psfdae.training.star_sets import field_positions
 
 CELL = ["dataset", "split", "reference", "noise_level"]
 """Columns that identify a column of the paper's tables: methods are compared inside it."""

@@ -18,7 +18,7 @@ from psfdae.base.figures import SERIES_COLORS, StripRow, new_figure, restoration
 from psfdae.base.files import ProductError
 from psfdae.base.reading import read_table
 from psfdae.image.tables import html_table
-from psfdae.model.report import image_tag
+from psfdae.report.page import image_tag
 from psfdae.stars.moments import SIGMA_OF_MAD
 from psfdae_paper.stars.nights import PLACES
 

@@ -35,8 +35,8 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods.dae import Dae
 from psfdae.methods.fit_files import store
 from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
-from psfdae.model.star_sets import noise_model
 from psfdae.stars.noise import mixed_levels
+from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of, trained_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain

@@ -21,7 +21,7 @@ from psfdae.base.files import Product, ProductError, read_product, write_csv, wr
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
-from psfdae.model.star_sets import noise_model
+from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.likelihood import expected_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (

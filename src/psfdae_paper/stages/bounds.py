@@ -23,7 +23,7 @@ from psfdae.base.progress import steps
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
 from psfdae.methods import method
-from psfdae.model.star_sets import field_positions, training_set
+from psfdae.training.star_sets import field_positions, training_set
 from psfdae_paper.bounds import tables
 from psfdae_paper.bounds.estimates import SPLIT, bounded_stars, fresh_stars
 from psfdae_paper.bounds.floor import Comparison

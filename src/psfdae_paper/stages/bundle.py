@@ -18,13 +18,20 @@ from psfdae.base.options import AboveZero, File, Folder
 from psfdae.base.rng import stream
 from psfdae.base.settings import Reference, SplitKind
 from psfdae.base.threads import limit_threads
+from psfdae.denoise.bundle import (
+    SUFFIX,
+    Bundle,
+    BundleError,
+    read_bundle,
+    shipped_path,
+    write_bundle,
+)
+from psfdae.denoise.star_model import PsfModel
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import CONFIG, Method
-from psfdae.model import packing
-from psfdae.model.bundle import SUFFIX, Bundle, BundleError, read_bundle, shipped_path, write_bundle
-from psfdae.model.psf_model import PsfModel
-from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
+from psfdae.training import packing
+from psfdae.training.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config

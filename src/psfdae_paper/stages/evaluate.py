@@ -25,7 +25,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import Method
-from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars, training_set
+from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars, training_set
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config

@@ -17,7 +17,7 @@ from psfdae.base.settings import Reference, SplitKind
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
-from psfdae.model.star_sets import read_stars, training_set
+from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config

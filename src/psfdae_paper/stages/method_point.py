@@ -15,7 +15,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
 from psfdae.methods import groups_of, method
 from psfdae.methods.interface import HISTORY
-from psfdae.model.star_sets import read_stars, training_set
+from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Measured, Training, fit_in, measure_images

@@ -23,9 +23,9 @@ from psfdae.base.files import write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.commands.cli import refusal, typed_values
+from psfdae.denoise.bundle import SUFFIX
 from psfdae.image.image_input import ImageInput, ImageStatements
 from psfdae.image.tables import write_table
-from psfdae.model.bundle import SUFFIX
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation.night import (
     TABLE_COLUMNS,
@@ -37,8 +37,8 @@ from psfdae_paper.evaluation.night import (
 from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
 
 if TYPE_CHECKING:
-    from psfdae.model.psf_model import PsfModel
-    from psfdae.model.stars import Stars
+    from psfdae.denoise.star_model import PsfModel
+    from psfdae.training.stars import Stars
 
 Row = dict[str, object]
 
@@ -195,7 +195,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
     out : Path
         HTML page that needs no other file, but links the images' reports.
     """
-    from psfdae.model.psf_model import load_model
+    from psfdae.denoise.star_model import load_model
 
     night = read_night(table, "name", "verdict", "reason")
     # PSFs over the field of the best, the median and the worst image, by the FWHM in the middle.
@@ -239,8 +239,8 @@ def reason_of(error: Exception, row: Mapping[str, object]) -> str:
 
 def bright_stars(row: Mapping[str, object]) -> Stars:
     """Return the bright stars of an image of the list; without a catalogue they are detected."""
-    from psfdae.model.settings import settings_model
-    from psfdae.model.stars import Stars
+    from psfdae.training.settings import settings_model
+    from psfdae.training.stars import Stars
 
     stated = typed_values(ImageStatements, {name: str(text) for name, text in row.items()})
     source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in stated, **stated})
@@ -275,9 +275,9 @@ def from_most_usual(
 
 def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
     """Return the field model of an image, changed from that of another image if there is one."""
-    from psfdae.model.exposures import adapted_to_stars
-    from psfdae.model.fitting import fit
-    from psfdae.model.star_choice import MIN_STARS_WITH_ERROR
+    from psfdae.training.exposures import adapted_to_stars
+    from psfdae.training.fitting import fit
+    from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
     training_stars = np.count_nonzero(~stars.held_out)
@@ -350,8 +350,8 @@ def measured(row: Mapping[str, object], stars: Stars, model: PsfModel, folder: P
         of bright, measured and flagged stars; magnitude of the 20th brightest star in counts;
         zero point and its scatter; median χ² of the stars.
     """
-    from psfdae.model.image_photometry import photometry_of_image
-    from psfdae.model.validation import validate
+    from psfdae.photometry.image_photometry import photometry_of_image
+    from psfdae.report.validation import validate
 
     path = folder / str(row["name"])
     reference = Path(str(row["reference"])) if row.get("reference") else None

@@ -21,7 +21,7 @@ from psfdae.base.rng import stream
 from psfdae.base.settings import Reference, SplitKind
 from psfdae.methods.fit_files import storage_of
 from psfdae.methods.interface import Method
-from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars, split_stars
+from psfdae.training.star_sets import noise_model, noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import MeasuredStars
 

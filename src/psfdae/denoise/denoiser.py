@@ -1,0 +1,526 @@
+"""Restoration of stars by a model bundle: from stamps to PSFs with errors and flags.
+
+Each star goes through three steps, and no star influences another one:
+
+1. `Restorer._centred`: the star is moved to the middle of its stamp, and its flux, sky and noise
+   are found by the mean PSF of the training (`psfdae.denoise.star_flux`).
+2. The method restores its PSF: `restored_by_measurement` for a method that measures flux, sky and
+   centre itself (`psfdae.methods.field`), `Restorer._by_photometry` for all others.
+3. `Restorer._prediction`: half-widths of the errors, χ², light beyond the stamp, shape and flags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from itertools import combinations, pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psfdae.denoise.bundle import Bundle
+from psfdae.denoise.error_model import ErrorModel, mahalanobis
+from psfdae.denoise.flux_model import NOISE_FLOOR, FluxModel, Photometry, is_faint
+from psfdae.denoise.prediction import Prediction
+from psfdae.denoise.star_flux import Photometer
+from psfdae.image.stamps import (
+    Stamps,
+    StarFlag,
+    border_median,
+    border_scatter,
+    cut,
+    displacement,
+    raise_flag,
+)
+from psfdae.methods.interface import Method, Packing
+from psfdae.psf.wings import Wings, outer_shares
+from psfdae.stars.bright_stars import magnitude
+from psfdae.stars.moments import measure_shapes
+
+SNR_TOLERANCE = 1.25
+"""Factor by which a star may be beyond the S/N of the training: its S/N is no better known."""
+
+MAX_CHI2 = 10.0
+"""Largest reduced χ² of a star without the flag POOR_FIT."""
+
+
+class CentredStars(NamedTuple):
+    """Stars in the middle of their stamps, with their photometry, before they are restored.
+
+    Attributes
+    ----------
+    stars : Stamps
+        As they were given.
+    has_exact_centre : ndarray of bool, shape (n,)
+        True where the listed centre is exact.
+    stamps, bad : ndarray, shape (n, d, d)
+        Centred stamps, and True for pixels that are not used.
+    shift : ndarray of int, shape (n, 2)
+        Pixels by which the stars were moved, (row, column).
+    flags : ndarray of uint16, shape (n,)
+    border_level : ndarray, shape (n,)
+        Median of the border of a stamp, a rough sky.
+    photometry : Photometry
+    """
+
+    stars: Stamps
+    has_exact_centre: np.ndarray
+    stamps: np.ndarray
+    bad: np.ndarray
+    shift: np.ndarray
+    flags: np.ndarray
+    border_level: np.ndarray
+    photometry: Photometry
+
+    def measurable(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return stamps above the level of their border, repaired, with their noise.
+
+        Returns
+        -------
+        data : ndarray, shape (n, d, d), float64
+            0 in stamps that are unusable.
+        noise : ndarray, shape (n,)
+            Standard deviation of a pixel.
+        is_unusable : ndarray of bool, shape (n,)
+            True if a stamp has nothing to measure: bad, constant, or beyond any number.
+        """
+        photometry, stamps, bad = self.photometry, self.stamps, self.bad
+        # Bad pixels as the photometry repaired them, or the level of the border where it could not.
+        is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
+        level = self.border_level[:, None, None]
+        repaired = (
+            photometry.images * photometry.flux[:, None, None]
+            + photometry.background[:, None, None]
+        )
+        repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
+        data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
+        # Stamps need as many good pixels as the photometry asks for, and any contrast.
+        modulus = np.abs(data).max(axis=(1, 2))
+        has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
+        is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
+        is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
+        data = np.where(is_unusable[:, None, None], 0.0, data)
+        # σ² of a pixel: that of the sky, and the mean of the star's photons.
+        noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
+        photons = np.maximum(photometry.flux, 0.0) / self.stars.gain / stamps[0].size
+        noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
+        return data, noise, is_unusable
+
+
+class RestoredStars(NamedTuple):
+    """PSFs of stars as a method gives them.
+
+    Attributes
+    ----------
+    psf : ndarray, shape (n, d, d)
+        PSFs of flux 1; NaN where there is no flux.
+    sigma : ndarray, shape (n, d, d), or None
+        Standard deviation of `psf`, if the method knows it.
+    photometry : Photometry
+        Fluxes and skies by the method where it measures them.
+    has_no_flux : ndarray of bool, shape (n,)
+    outlier_score : ndarray, shape (n,)
+        How unlike all training stars a star is; NaN where the method has no score.
+    centre : ndarray, shape (n, 2)
+        Centre (row, column) by the method, in the image if the stars are those of one, else in
+        their stamps; NaN unless the method measures stars.
+    covariance : ndarray, shape (n, 4, 4)
+        Covariance of flux, sky, row and column; NaN unless the method measures stars.
+    """
+
+    psf: np.ndarray
+    sigma: np.ndarray | None
+    photometry: Photometry
+    has_no_flux: np.ndarray
+    outlier_score: np.ndarray
+    centre: np.ndarray
+    covariance: np.ndarray
+
+    def part(self, rows: slice) -> RestoredStars:
+        """Return some of the stars."""
+        values: dict[str, Any] = {
+            name: array[rows] if isinstance(array, np.ndarray) else array
+            for name, array in self._asdict().items()
+        }
+        return RestoredStars(**values | {"photometry": self.photometry.part(rows)})
+
+    def centre_columns(self) -> dict[str, np.ndarray]:
+        """Return the columns on centres, and on errors beside that of the flux.
+
+        A number that is known has the error 0, and correlates with nothing.
+        """
+        sigma = np.sqrt(np.maximum(np.einsum("nii->ni", self.covariance), 0.0))
+        names = ("flux", "background", "y", "x")
+        columns = {"y_fit": self.centre[:, 0], "x_fit": self.centre[:, 1]}
+        columns |= {f"{name}_error": sigma[:, i] for i, name in enumerate(names) if i}
+        # ρ_ij = C_ij / (σ_i σ_j).
+        for i, j in combinations(range(4), 2):
+            product = sigma[:, i] * sigma[:, j]
+            correlation = self.covariance[:, i, j] / np.where(product > 0, product, 1.0)
+            columns[f"corr_{names[i]}_{names[j]}"] = np.where(product == 0, 0.0, correlation)
+        return columns
+
+
+class Restorer:
+    """A bundle that is ready to use: the method, and the matrices of the photometry.
+
+    Safe to use from several threads.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    method : Method
+        That of the bundle.
+    """
+
+    def __init__(self, bundle: Bundle, method: Method) -> None:
+        self.bundle, self.method = bundle, method
+        self.free_flux = method.free_flux()
+        packing = method.packing or Packing()
+        # Stamps of more than 32 px come in smaller blocks.
+        pixels = bundle.info.stamp_px**2
+        self.block_size = min(packing.together, max(1, packing.together * 32**2 // pixels))
+        # A network rounds otherwise if it computes another number of stars together.
+        self._padded_count = self.block_size if packing.padded else 1
+        self._photometer = Photometer(bundle.flux_model, bundle.info.components)
+        self.wings: Wings | None = bundle.wings
+        calibration = bundle.info.config.get("stars", {}).get("calibration_stars", {})
+        self._centring_px = float(calibration.get("centring_px") or 0.0)
+
+    def blocks(self, stars: Stamps) -> list[Stamps]:
+        """Return stars in parts of `block_size`."""
+        size = self.block_size
+        return [stars.part(slice(start, start + size)) for start in range(0, len(stars), size)]
+
+    def restore(self, stars: Stamps, fixed: bool = False) -> Prediction:
+        """Return the PSFs of at most `block_size` stars, whose listed centres are exact if `fixed`.
+
+        Raises
+        ------
+        ValueError
+            If the method meets a pixel that is not finite.
+        """
+        count = len(stars)
+        if count < self._padded_count:
+            # Stars repeated up to that number, which are dropped again; a blank one if there is
+            # none.
+            columns = (getattr(stars, column.name) for column in fields(stars))
+            size = self._padded_count
+            stars = Stamps(*(np.resize(values, (size, *values.shape[1:])) for values in columns))
+        # Unusable stars are NaN or infinite on the way, and are flagged.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # 2048 stars at a time are measured and described: their arrays fit in memory.
+            parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
+            centred = [self._centred(part, fixed) for part in parts]
+            if self.method.knows_field:
+                errors = self.bundle.errors
+                restored = [restored_by_measurement(part, self.method, errors) for part in centred]
+            else:
+                restored = self._by_photometry(centred)
+            predictions = map(self._prediction, centred, restored)
+            return Prediction.joined([*predictions]).of(slice(count))
+
+    # Step 1: centring and photometry.
+
+    def _centred(self, stars: Stamps, fixed: bool) -> CentredStars:
+        """Move stars to the middle of their stamps, and measure flux, sky and noise there."""
+        has_exact_centre = fixed & np.isfinite(stars.listed).all(axis=1)
+        side = self.bundle.info.stamp_px
+        margin = (stars.data.shape[-1] - side) // 2
+        # The light in the middle of the stamp shows where the star is. Saturated pixels belong to
+        # it; the other bad ones would mislead, and get the level of the border.
+        data, hidden = stars.data, stars.bad & ~stars.saturated
+        if hidden.any():
+            data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
+        shift = displacement(data, self.bundle.info.jitter_px, self._centring_px)
+        shift[has_exact_centre] = 0
+        # A star cannot be moved farther than the pixels around its stamp reach.
+        is_too_far = np.abs(shift).max(axis=1) > margin
+        shift[is_too_far] = 0
+        # Stamps of the model's side about the star; pixels that none shows are bad.
+        stamps, bad, saturated = (
+            cut(frames, side, shift) for frames in (data, stars.bad, stars.saturated)
+        )
+        # Flags of the list, and those of pixels and centring.
+        flags = stars.flags.copy()
+        raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.OFF_CENTRE, is_too_far)
+        bad = bad | saturated
+        # A sky that is given and is more than 5 σ off that of the border is flagged.
+        border_level = border_median(stamps, bad)
+        if np.isfinite(stars.background).any():
+            limit = 5.0 * border_scatter(stamps)
+            raise_flag(flags, StarFlag.SKY_OFF, np.abs(border_level - stars.background) > limit)
+        photometry = self._photometer.measure(stamps, bad, border_level, stars)
+        return CentredStars(
+            stars, has_exact_centre, stamps, bad, shift, flags, border_level, photometry
+        )
+
+    # Step 2: the method.
+
+    def _by_photometry(self, centred: Sequence[CentredStars]) -> list[RestoredStars]:
+        """Restore stars with the fluxes of the photometry, which the method may correct.
+
+        A method that finds fluxes does so first, for stars of unknown flux and sky. It takes the
+        noise for larger then: what it does not know of a bright star would pass for flux. Parts are
+        restored together, in which some stars have about the same noise.
+        """
+        # Photometry of all parts together, and stars that have none.
+        info = self.bundle.info
+        photometry = Photometry.joined([part.photometry for part in centred])
+        has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
+        has_flux = ~has_no_flux
+        # Factors of the fluxes, between 1/2 and 2; more would be no correction. A method is told
+        # the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
+        near_clusters: dict[str, Any] = {}
+        is_free = has_flux & np.concatenate(
+            [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
+        )
+        if is_free.any() and self.method.finds_flux:
+            # √(noise² + misfit²): what the method does not know of a star counts as noise.
+            images, noise = self._normalised(photometry, has_no_flux)
+            level = np.hypot(noise, info.misfit) / info.kappa
+            factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
+            is_free &= np.isfinite(factor)  # a damaged model may find none
+            photometry = photometry.with_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
+        psf, sigma = np.full_like(photometry.images, np.nan), None
+        score = np.full(len(has_flux), np.nan)
+        # The PSFs; stars of a catalogue that reaches far beyond the image have all no flux.
+        if has_flux.any():
+            images, noise = self._normalised(photometry, has_no_flux)
+            level = noise / info.kappa
+            estimate = self.method.estimate(images, level, **near_clusters)
+            psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
+            psf[has_no_flux] = np.nan
+            if sigma is not None:
+                sigma[has_no_flux] = np.nan
+            # Only a model with a limit asks how unlike the training stars they are.
+            if self.bundle.errors.outlier_limit is not None:
+                clusters = {name: values[has_flux] for name, values in near_clusters.items()}
+                score[has_flux] = self.free_flux.outlier_score(
+                    images[has_flux], level[has_flux], **clusters
+                )
+        # The parts again, without centres.
+        ends = np.cumsum([0, *(len(part.stars) for part in centred)])
+        unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
+        restored = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [restored.part(slice(*rows)) for rows in pairwise(ends)]
+
+    def _normalised(
+        self, photometry: Photometry, has_no_flux: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return images (n, d, d) of flux 1 and their noise (n,); a mean PSF where is no flux."""
+        # Stars without flux cost as much, and are NaN afterwards; their noise is the largest of the
+        # training.
+        images = photometry.images
+        if has_no_flux.any():
+            mean_psf = self.bundle.flux_model.mean.reshape(images.shape[1:])
+            images = np.where(has_no_flux[:, None, None], mean_psf, images).astype(images.dtype)
+        noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
+        return images, np.where(has_no_flux, self.bundle.info.noise_max, noise)
+
+    # Step 3: errors and flags.
+
+    def _prediction(self, centred: CentredStars, restored: RestoredStars) -> Prediction:
+        """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
+        info, errors = self.bundle.info, self.bundle.errors
+        stars, flags, photometry = centred.stars, centred.flags, restored.photometry
+        psf, sigma = restored.psf, restored.sigma
+        measures_stars = self.method.knows_field
+        # Noise over the flux: the unit of the training, on which errors and limits depend.
+        noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
+        shapes = measure_shapes(psf)
+        # S/N of a matched filter: √(Σ psf²) F/σ.
+        snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
+        distance = mahalanobis(photometry.images, noise, self.bundle.flux_model, info.components)
+        # PSFs, their errors and what is left of the stamps, in the unit of the stamps: errors of
+        # PSFs of flux 1 times the flux, and r = x − b − F psf.
+        flux = photometry.flux.astype(np.float32)[:, None, None]
+        # F psf ± F w, with the half-width w of the case of each star.
+        half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
+        psf *= flux
+        residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
+        # Pixels that were repaired tell nothing.
+        residual[~photometry.used] = np.nan
+        flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
+        chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
+        # A method that measures stars has the star's photons in its errors. It knows the noise of
+        # bright stars, and comes ever nearer to the star itself: it has no upper limit of the S/N.
+        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
+        photons = np.where(measures_stars, 0.0, photons)
+        flux_error = np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons)
+        # Flags beside those of centring, photometry and method. The S/N of a star is known to its
+        # tolerance.
+        is_unlike = errors.is_unlike_training(noise, distance, restored.outlier_score)
+        flags |= photometry.flags
+        raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
+        is_bright = snr > info.snr_max * SNR_TOLERANCE
+        raise_flag(flags, StarFlag.SNR_HIGH, (not measures_stars) & is_bright)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
+        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
+        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
+        columns = {
+            "id": stars.id,
+            "x": stars.x,
+            "y": stars.y,
+            "flux": photometry.flux,
+            "flux_error": flux_error,
+            "noise": photometry.noise,
+            "snr": snr,
+            "ratio95": ratio95[:, 0],
+            "ratio95_bright": ratio95[:, 1],
+            "chi2": chi2,
+            "distance": distance,
+            "outlier_score": restored.outlier_score,
+            "fwhm_px": shapes.fwhm_px,
+            "ellipticity": shapes.ellipticity,
+            "position_angle_deg": shapes.position_angle_deg,
+            "shift_x": centred.shift[:, 1],
+            "shift_y": centred.shift[:, 0],
+            "flags": flags,
+        }
+        columns |= self._total_fluxes(stars, photometry, flux_error)
+        columns |= restored.centre_columns()
+        return Prediction(
+            columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
+        )
+
+    def _total_fluxes(
+        self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
+    ) -> dict[str, Any]:
+        """Return fluxes with the light beyond the stamps, and skies without that in the stamps."""
+        flux, sky = photometry.flux, photometry.background
+        if self.wings is None or not self.method.knows_field:
+            unknown = np.full(len(flux), np.nan)
+            return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
+        place = np.stack([stars.x, stars.y], axis=1)
+        # A wider PSF has more light beyond its stamp.
+        outer_part = outer_shares(self.method.psf_at, place, flux)
+        factor, factor_error = self.wings.total_over_flux(outer_part)
+        # The error of a flux that was given is not known: it is NaN.
+        total_error = np.hypot(flux_error * factor, flux * factor_error)
+        # Light of wings that is even in the stamp is in the sky of a star whose sky is not known.
+        even_light = np.maximum(flux, 0.0) * self.wings.scale(outer_part) * self.wings.profile[0]
+        sky = np.where(np.isnan(stars.background), sky - np.nan_to_num(even_light), sky)
+        return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
+
+
+def restored_by_measurement(
+    centred: CentredStars, method: Method, errors: ErrorModel
+) -> RestoredStars:
+    """Restore stars with the fluxes that the method measures in place of the photometry.
+
+    The photometry repairs bad pixels and tells the noise.
+
+    Parameters
+    ----------
+    centred : CentredStars
+    method : Method
+        One with the capability `knows_field`.
+    errors : ErrorModel
+        Errors of measured stars due to errors of the model, which are added to those of the method.
+    """
+    stars, photometry, border_level = centred.stars, centred.photometry, centred.border_level
+    # Stamps above the level of their border; the sky that is measured counts from it, too.
+    data, noise, is_unusable = centred.measurable()
+    has_flux = np.isfinite(stars.flux)
+    # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
+    # that of its flux.
+    flux = np.where(has_flux, stars.flux, photometry.flux)
+    star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
+    place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
+    # PSF, flux, sky and centre at once; what is stated is taken as it is. Centres count from the
+    # middle of the stamp, which was moved.
+    estimate = method.measure(
+        data,
+        noise,
+        place,
+        stars.listed - centred.shift,
+        centred.has_exact_centre,
+        flux=stars.flux,
+        sky=stars.background - border_level,
+        gain=stars.gain,
+    )
+    # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
+    measured = estimate.measured
+    assert measured is not None and estimate.sigma is not None
+    covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
+    flux_error = np.sqrt(covariance[:, 0, 0])
+    # A flux that was given counts if the photometry could use it, another one above its error.
+    flux = np.where(has_flux, stars.flux, measured.flux)
+    is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
+    has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
+    # Flags on pixels are those of the photometry, on the flux those of the method.
+    flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
+    raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
+    is_measured = ~has_flux & ~has_no_flux
+    raise_flag(flags, StarFlag.FAINT, is_measured & is_faint(flux, flux_error))
+    raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
+    # The same photometry with the method's fluxes and skies: images are (x − b) / F.
+    unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
+    images = (data - measured.background[:, None, None]) / unit
+    sky = border_level + measured.background
+    photometry = replace(
+        photometry,
+        flux=np.where(is_unusable, np.nan, flux),
+        flux_error=np.where(has_flux | is_unusable, np.nan, flux_error),
+        background=np.where(is_unusable, photometry.background, sky),
+        images=np.where(has_no_flux[:, None, None], 0.0, images).astype(np.float32),
+        flags=flags,
+    )
+    # Centres count from the middle of the stamp as it was given: its pixel in the image if that is
+    # known.
+    middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
+    middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
+    centre = middle + centred.shift + measured.centre
+    # Stars without a flux are told nothing.
+    score = estimate.outlier_score
+    score = np.full(len(flux), np.nan) if score is None else score.copy()
+    for array in (estimate.psf, estimate.sigma, centre, covariance, score):
+        array[has_no_flux] = np.nan
+    return RestoredStars(
+        estimate.psf, estimate.sigma, photometry, has_no_flux, score, centre, covariance
+    )
+
+
+def reduced_chi2(
+    residual: np.ndarray,
+    psf: np.ndarray,
+    flux_sigma: np.ndarray | None,
+    noise: np.ndarray,
+    gain: np.ndarray,
+) -> np.ndarray:
+    """Return Σ r²/v over what is expected of it, over pixels that are not NaN, (n,).
+
+    A restored star follows its own noise where it is bright. If the method knows the σ u of its
+    pixels, in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at least 1 %, of
+    what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+
+    Parameters
+    ----------
+    residual, psf : ndarray, shape (n, d, d)
+        r and the PSF in the unit of the stamps.
+    flux_sigma : ndarray, shape (n, d, d), or None
+        u, in the same unit.
+    noise, gain : ndarray, shape (n,)
+        σ of the sky in a pixel, and electrons per unit, NaN where unknown: v = σ² + PSF/gain.
+    """
+    # v = σ² + PSF/gain, where the gain is known.
+    variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
+    if np.isfinite(gain).any():
+        per_electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]
+        variance = variance + np.maximum(psf, 0.0) * per_electron
+    # What is expected of r²/v in each pixel: 1, or less by what the star follows of its own noise.
+    is_used = np.isfinite(residual) & np.isfinite(variance)
+    expected = np.ones(residual.shape)
+    if flux_sigma is not None:
+        mean_variance = variance.mean(axis=(1, 2), keepdims=True)
+        part = np.clip(1.0 - flux_sigma.astype(np.float64) ** 2 / mean_variance, 0.01, 1.0)
+        expected = part * (mean_variance + part * (variance - mean_variance)) / variance
+    total, expected_total = (
+        np.where(is_used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
+        for values in (np.square(residual / np.sqrt(variance)), expected)
+    )
+    chi2 = total / np.where(expected_total > 0, expected_total, np.inf)
+    return np.where(is_used.any(axis=(1, 2)), chi2, np.nan)

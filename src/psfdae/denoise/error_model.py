@@ -1,0 +1,320 @@
+"""Calibrated errors of a fitted method: how far its PSFs, fluxes and centres are off.
+
+In go PSFs of stars with their noise over the flux, and what of noise, flux and sky was stated; out
+come half-widths of intervals that hold 68 and 95 % of the errors. `psfdae.training.calibration`
+finds an `ErrorModel` by stars that no training has seen.
+
+Errors of PSFs are per pixel and per noise level. They are not normally distributed: the core of a
+PSF, its wings and the rare star that is unlike all others share a pixel, and the root mean square
+is then wider than the interval that holds 68 % of the errors. Where a method states a σ of every
+pixel, half-widths are in units of it: they correct its σ, which knows the star, by what came true.
+
+These half-widths are for known flux and sky, and for all pixels alike. Where flux or sky are
+estimates, errors are larger, and where a star is bright they are of another distribution: factors
+for each case, for the brightest pixels and for the others, make up for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psfdae.denoise.flux_model import FluxModel
+from psfdae.image.stamps import Stamps
+
+
+class Estimated(IntEnum):
+    """Case of a star: which of its flux and sky were estimated, because they were not stated."""
+
+    NOTHING = 0
+    FLUX = 1
+    FLUX_AND_SKY = 2
+
+
+class ModelErrors(NamedTuple):
+    """Standard errors of measured stars due to errors of the PSF model, at any S/N.
+
+    Attributes
+    ----------
+    flux : float
+        Error of the flux, over the flux, RMS over the field.
+    sky : float
+        Error of the sky in a pixel, over the flux.
+    centre : float
+        Error of the centre along each axis, in pixels.
+    fitted_flux : float
+        Error of the flux over the flux, RMS over the field, where the PSF is fitted on a sky that
+        is known from the whole image.
+    middle : ndarray, shape (2,)
+        Place (x₀, y₀) in the image from which the variance of a flux grows.
+    growth : ndarray, shape (4,)
+        Coefficients (a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² +
+        c w² + d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By
+        default it is the same at all places.
+    """
+
+    flux: float = 0.0
+    sky: float = 0.0
+    centre: float = 0.0
+    fitted_flux: float = 0.0
+    middle: np.ndarray = np.zeros(2)
+    growth: np.ndarray = np.eye(4)[0]
+
+    def flux_factor(self, place: np.ndarray) -> np.ndarray:
+        """Return √v: errors of fluxes at places (n, 2), x and y, over those of the field, (n,).
+
+        1 where the place is not known (NaN).
+        """
+        # v = (a, b, c, d) · (1, u², w², u² w²).
+        u2, w2 = np.square(place - self.middle).T
+        terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
+        return np.where(np.isfinite(u2 + w2), np.sqrt(self.growth @ terms), 1.0)
+
+    def added_to(self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Return covariances of measured stars with the errors of the model too.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (n, 4, 4)
+            Covariance of flux, sky, row and column, due to noise.
+        flux : ndarray, shape (n,)
+        place : ndarray, shape (n, 2)
+            Place x and y in the image; NaN where unknown.
+
+        Returns
+        -------
+        ndarray, shape (n, 4, 4)
+            A number that is known, whose variance is almost 0, stays so.
+        """
+        # Standard errors by the model: those of flux and sky grow with the flux.
+        unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
+        model_sigma = np.concatenate([unit * [self.flux, self.sky], zeros + self.centre], axis=1)
+        model_sigma *= self.flux_factor(place)[:, None]
+        # A method that is given a number returns it with a σ far below any that noise makes.
+        variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
+        known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
+        model_sigma[np.sqrt(variance) < known_sigma] = 0.0
+        # Both errors are independent, and those of the model in each number are taken to be, too.
+        return np.asarray(covariance + model_sigma[:, :, None] ** 2 * np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """Errors of a fitted method at S levels of noise.
+
+    Half-widths are in units of the flux, or of σ where the method gives a σ (`Estimate.sigma`).
+
+    Attributes
+    ----------
+    noise : ndarray, shape (S,)
+        Noise nodes, ascending: RMS of the sky in a pixel over the flux.
+    half_width68 : ndarray, shape (S, d, d)
+        Half-width that contains 68.27 % of the errors of a pixel.
+    ratio95 : ndarray, shape (S,)
+        Factor by which `half_width68` contains 95 % of the errors.
+    scale68, scale95 : ndarray, shape (S, 2, 3, 2)
+        Factors by which 68 % and 95 % half-widths are larger. Axes: noise stated or estimated; the
+        case of `Estimated`; faint or bright pixels (`brightest`).
+    flux_scale : ndarray, shape (S,)
+        Scatter of the flux over its stated error, where flux and sky are estimated.
+    distance_limit : float
+        99.9 % quantile of the distance of test stars (`mahalanobis`).
+    outlier_limit : ndarray, shape (S,), or None
+        99.9 % quantile of the outlier score of test stars, if the method has a score.
+    measured : ModelErrors
+        Errors of stars that the method measures itself.
+    """
+
+    noise: np.ndarray
+    half_width68: np.ndarray
+    ratio95: np.ndarray
+    scale68: np.ndarray
+    scale95: np.ndarray
+    flux_scale: np.ndarray
+    distance_limit: float
+    outlier_limit: np.ndarray | None = None
+    measured: ModelErrors = field(default_factory=ModelErrors)
+
+    @classmethod
+    def uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
+        """Return errors whose factors are 1, and whose limit of the distance is 0."""
+        unit, scale = np.ones(len(noise)), np.ones((len(noise), 2, len(Estimated), 2))
+        return cls(noise, half_width68, unit, scale, scale, unit, distance_limit=0.0)
+
+    @staticmethod
+    def shapes(nodes: int, stamp_px: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape of every array of errors at S nodes, in stamps of a side, by name."""
+        # Noise stated or estimated; what of flux and sky was estimated; faint or bright pixels.
+        case = (nodes, 2, len(Estimated), 2)
+        return {
+            "noise": (nodes,),
+            "half_width68": (nodes, stamp_px, stamp_px),
+            "ratio95": (nodes,),
+            "scale68": case,
+            "scale95": case,
+            "flux_scale": (nodes,),
+            "distance_limit": (),
+            "outlier_limit": (nodes,),
+            "measured": (10,),
+        }
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
+        """Return the errors that a file has as arrays, by the names of `shapes`."""
+        values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
+        # Ten numbers of the model's own errors; the last six are middle and growth of the flux's.
+        table = arrays["measured"]
+        flux, sky, centre, fitted_flux = table[:4].tolist()
+        measured = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
+        return cls(**values | {"measured": measured})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
+        # The reverse of `of_arrays`.
+        values = {table.name: getattr(self, table.name) for table in fields(self)}
+        values["measured"] = np.hstack(self.measured)
+        return {
+            name: np.asarray(value, np.float32 if name == "half_width68" else np.float64)
+            for name, value in values.items()
+            if value is not None
+        }
+
+    def half_width(
+        self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return how wide the errors of PSFs of flux 1 are, and those of their fluxes.
+
+        All depends on which of noise, flux and sky of a star were estimated.
+
+        Parameters
+        ----------
+        psf : ndarray, shape (n, d, d)
+        sigma : ndarray, shape (n, d, d), or None
+            Standard deviation of each pixel by the method.
+        noise : ndarray, shape (n,)
+            Pixel RMS over the flux.
+        stars : Stamps
+            Flux, sky and noise as they were stated; NaN where they were estimated.
+
+        Returns
+        -------
+        half_width : ndarray, shape (n, d, d)
+            Half-width of the interval that holds 68 % of the errors.
+        ratio95 : ndarray, shape (n, 2)
+            Its factor for 95 %, of faint and of bright pixels.
+        flux_scale : ndarray, shape (n,)
+            Factor of the error of the flux.
+        """
+        # Errors of stars of known flux and sky, at this noise, in units of the method's σ.
+        half_width = at_noise(noise, self.noise, self.half_width68)
+        if sigma is not None:
+            half_width = half_width * sigma
+        # The half-width of 95 %, as a multiple of that of 68 %.
+        ratio95 = np.interp(noise, self.noise, self.ratio95)
+        # Factors of the case of each star, for faint and bright pixels, shape (n, 2).
+        estimates_noise, estimates_flux, estimates_sky = (
+            np.isnan(values) for values in (stars.noise, stars.flux, stars.background)
+        )
+        case = np.where(estimates_sky, Estimated.FLUX_AND_SKY, estimates_flux.astype(int))
+
+        def at_case(table: np.ndarray) -> np.ndarray:
+            """Interpolate a table of all cases (S, 2, 3, 2) at the noise and case of each star."""
+            # Linear in the noise, each of the 12 numbers of a node by itself.
+            columns = table.reshape(len(table), -1).T
+            values = np.stack([np.interp(noise, self.noise, column) for column in columns], axis=1)
+            of_case = values.reshape(-1, *table.shape[1:])
+            return np.asarray(of_case[np.arange(len(noise)), estimates_noise.astype(int), case])
+
+        # A pixel has the factor of its brightness; ratios of 95 % follow from both factors.
+        scale68, scale95 = at_case(self.scale68), at_case(self.scale95)
+        faint_scale, bright_scale = scale68.T.astype(np.float32)[:, :, None, None]
+        half_width = half_width * np.where(brightest(psf), bright_scale, faint_scale)
+        # The stated error of a flux is scaled where it was counted: with flux and sky estimated.
+        flux_scale = np.interp(noise, self.noise, self.flux_scale)
+        flux_scale = np.where(estimates_flux & estimates_sky, flux_scale, 1.0)
+        return half_width, ratio95[:, None] * scale95 / scale68, flux_scale
+
+    def is_unlike_training(
+        self, noise: np.ndarray, distance: np.ndarray, outlier_score: np.ndarray
+    ) -> np.ndarray:
+        """Return True for stars beyond the limits of distance or score; all of shape (n,)."""
+        # A distance is in units of the training set at any noise; a score has a limit at each node.
+        is_unlike = distance > self.distance_limit
+        if self.outlier_limit is not None:
+            is_unlike |= outlier_score > np.interp(noise, self.noise, self.outlier_limit)
+        return is_unlike
+
+
+def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Interpolate maps of errors linearly at the noise of each star.
+
+    They are linear in the noise and not in its logarithm: an error is a floor plus a part that
+    grows about as fast as the noise. Outside the nodes the nearest one counts.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (n,)
+        RMS of the sky noise in a pixel over the flux, such as `BundleInfo.noise_min`.
+    nodes : ndarray, shape (S,)
+        Noise at which the maps were measured, ascending.
+    maps : ndarray, shape (S, d, d)
+
+    Returns
+    -------
+    ndarray, shape (n, d, d)
+        Maps in their own unit; NaN where the noise is NaN.
+    """
+    noise = np.asarray(noise, dtype=np.float64)
+    # Position among the nodes: the lower node, and the fraction of the way to the upper one.
+    position = np.interp(noise, nodes, np.arange(len(nodes), dtype=np.float64))
+    lower = np.where(np.isfinite(position), np.minimum(position, len(nodes) - 1), 0).astype(np.intp)
+    upper = np.minimum(lower + 1, len(nodes) - 1)
+    fraction = (position - lower).astype(maps.dtype)[:, None, None]
+    # (1 − f) · lower map + f · upper map; a noise that is NaN has a fraction that is NaN.
+    return np.asarray(maps[lower] * (1 - fraction) + maps[upper] * fraction)
+
+
+def brightest(psf: np.ndarray) -> np.ndarray:
+    """Return a mask of the brightest pixels of each PSF (n, d, d), 20 of 256 (8 %) of its pixels.
+
+    Errors of these pixels, the core, scale in another way than those of the many faint pixels.
+    """
+    # The threshold is the faintest of the bright pixels; equal pixels count as bright as well.
+    flat = psf.reshape(len(psf), -1)
+    faint_count = flat.shape[1] - max(1, round(20 / 256 * flat.shape[1]))
+    return psf >= np.partition(flat, faint_count, axis=1)[:, faint_count, None, None]
+
+
+def mahalanobis(
+    stamps: np.ndarray, noise: np.ndarray, model: FluxModel, components: int
+) -> np.ndarray:
+    """Return the distance of stars from the training set, along its leading eigenvectors.
+
+    D² = Σ_k (e_kᵀ(x − m))² / (Λ_k + noise²) over the eigenvectors e_k with the largest eigenvalues
+    Λ_k: the distance of Mahalanobis (1936) with the noise of the star as part of the covariance.
+    Without it, every faint star would be far from the mean. D² is about `components` for bright and
+    for faint stars.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted, repaired, of flux 1, framed as the training stars.
+    noise : ndarray, shape (n,)
+        RMS of the sky noise in a pixel over the flux.
+    model : FluxModel
+    components : int
+        Number of eigenvectors, `BundleInfo.components`.
+
+    Returns
+    -------
+    ndarray, shape (n,), float64
+    """
+    # Scores along the eigenvectors, each over its standard deviation with the star's noise.
+    centred = stamps.reshape(len(stamps), -1) - model.mean
+    scores = centred @ model.basis[:, -components:]
+    variance = model.variance[-components:] + np.asarray(noise, dtype=np.float64)[:, None] ** 2
+    return np.asarray(np.sqrt((scores**2 / variance).sum(axis=1)))

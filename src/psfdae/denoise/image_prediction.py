@@ -1,0 +1,239 @@
+"""Prediction of the stars of an image: what the command `predict` and `PsfModel` have in common.
+
+In go a model, and an image with its star list; out come an observation whose pixels are those of
+the model, and sentences on what limits the trust in the predictions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from pydantic import PositiveInt
+
+from psfdae.base.arguments import check_arguments
+from psfdae.base.errors import call, keyword
+from psfdae.denoise.prediction import Prediction
+from psfdae.image.camera import other_instruments
+from psfdae.image.image_input import ImageInput
+from psfdae.image.observation import Observation
+from psfdae.image.positions import list_offset
+from psfdae.image.stamps import Stamps, StarFlag
+from psfdae.photometry.image_photometry import CAUSES
+from psfdae.psf.interface import PredictionError
+
+if TYPE_CHECKING:
+    from psfdae.denoise.star_model import PsfModel
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
+
+
+class WholeImages:
+    """Calls of a `PsfModel` that take a whole image, as the commands of the same names do."""
+
+    @check_arguments
+    def predict_image(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        fixed: bool = False,
+        threads: PositiveInt | None = None,
+        **statements: Any,
+    ) -> Prediction:
+        """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            FITS image, or cube of stamps.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list, as `Stars.from_image` takes it.
+        fixed : bool
+            Its centres are exact, for models that measure centres (field).
+        threads : int, optional
+            By default, all cores.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
+            `background_column` of the list.
+
+        Returns
+        -------
+        Prediction
+            One row per star; `notes` has sentences on the image and its list.
+
+        Raises
+        ------
+        Error
+            If the image or its list cannot be used, or its pixels are not those of the model.
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return predict_stars(cast("PsfModel", self), source, threads, fixed)
+
+    @check_arguments
+    def adapt(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        name: str | None = None,
+        **statements: Any,
+    ) -> PsfModel:
+        """Return this model adapted to another exposure, as `psfdae exposure` does.
+
+        The stars of the exposure show how its PSF differs from that of the model; ten may be
+        enough.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `predict_image`
+        name : str, optional
+            Name of the new model, by default that of the image.
+
+        Raises
+        ------
+        Error
+            If this is no model of a field, or the image has too few bright stars.
+        """
+        from psfdae.training.exposures import exposure
+
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return exposure(cast("PsfModel", self), source, name or source.name)[0]
+
+
+def predict_stars(
+    model: PsfModel, source: ImageInput, threads: int | None, fixed: bool
+) -> Prediction:
+    """Return the predictions of all stars of an image, with sentences on what limits them.
+
+    Parameters
+    ----------
+    model : PsfModel
+    source : ImageInput
+        The image with its list, and what is stated about it.
+    threads : int or None
+        None takes all cores.
+    fixed : bool
+        Listed centres are exact.
+
+    Raises
+    ------
+    PredictionError
+        If the image has pixels of another scale, or of an unknown one.
+    ObservationError
+        If the image or its list cannot be used, or the positions of the list are far off.
+    """
+    observation = open_for_model(model, source, fixed)
+    # Of the stamps, only the offsets of the stars from their list stay in memory.
+    predictions, offsets = [], []
+    for stamps, prediction in model.stream(observation, threads, fixed):
+        predictions.append(prediction)
+        offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
+    # The stars are near the listed positions, or the list is refused.
+    offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
+    notes = [observation.summary(), offset_note if observation.shape else None]
+    prediction = Prediction.joined(predictions)
+    unlike_count = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
+    notes += notes_on_model(model, observation, unlike_count)
+    return replace(prediction, notes=tuple(filter(None, notes)))
+
+
+def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> Observation:
+    """Open an image whose pixels must be those of a model.
+
+    Raises
+    ------
+    PredictionError
+        If its pixel scale is another one, or not known; or if listed centres are exact (`fixed`),
+        and there is no list, or the model measures no centres.
+    """
+    observation = source.open(model.info.stamp_px, model.margin_px)
+    if model.info.source == "stars":
+        # A model of an image may have been trained without a known pixel scale, too.
+        observation = observation.assuming()
+    statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} states it)"
+    assumed = statement if observation.scale_assumed else ""
+    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    if fixed and not (model.method.knows_field and observation.shape):
+        raise PredictionError(
+            f"{source.path}: {call('fixed=True', '--fixed-positions')} takes an image with a star "
+            f"list, and a model of the method field"
+        )
+    return observation
+
+
+def notes_on_model(model: PsfModel, observation: Observation, unlike_count: int) -> list[str]:
+    """Return sentences on what limits the trust in predictions of an image.
+
+    They are on another frame or instrument than the training's, on stars unlike the training's
+    (`unlike_count` is their number), and on light outside of stamps.
+    """
+    notes = model.to_image_frame(observation)[1]
+    # Another telescope, camera or filter, as far as both images name theirs.
+    if difference := other_instrument(model, observation):
+        notes.append(f"{observation.path}: {difference}")
+    # Of stars as in the training, 0.1 % have this flag.
+    if unlike_count >= max(3, 0.1 * observation.count):
+        misfit = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
+        notes.append(f"{observation.path}: {misfit}: {CAUSES}")
+    if observation.shape and model.method.knows_field and not model.wings:
+        notes.append(
+            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
+            f"{model.stamp_px} px; flux is the light in the stamp"
+        )
+    return notes
+
+
+def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) -> np.ndarray:
+    """Return the offsets of stars from their listed positions.
+
+    Parameters
+    ----------
+    stamps : Stamps
+    prediction : Prediction
+        Predictions of these stamps.
+    margin_px : int
+        Pixels by which a star may have been moved to the middle of its stamp.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Along x and y in px; NaN for stars that are too faint, have no flux, or are not listed.
+    """
+    # A model that measures centres (field) gives the offset itself.
+    centre_offset = np.stack([prediction.x_fit - stamps.x, prediction.y_fit - stamps.y], axis=1)
+    # For another one, it is the shift by which the stamp was centred on its brightest pixel. A star
+    # that is off by more than the margin allows is given a pixel more than that.
+    off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
+    shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
+    shift = np.where(off_centre[:, None], margin_px + 1.0, shift)
+    # Noise moves the brightest pixel of a faint star.
+    unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
+    offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
+    return np.where(unclear[:, None], np.nan, offset)
+
+
+def other_instrument(model: PsfModel, observation: Observation) -> str:
+    """Describe how an image's telescope, camera or filter differs from the training image.
+
+    The colours of the star lists count as well, where the image's list has any.
+
+    Returns
+    -------
+    difference : str
+        Empty if all that both headers and lists name is the same.
+    """
+    # What the headers of both images name: telescope, camera, filter; and the lists: a colour.
+    stars, instrument = model.info.config.get("stars", {}), observation.instrument
+    trained_on = dict(stars.get("instrument", {}))
+    if observation.colour_column and "colour_column" in stars:
+        key = "the column of colours"
+        trained_on[key] = stars["colour_column"]
+        instrument = {**instrument, key: observation.colour_column}
+    return "; ".join(
+        f"{key} is {value!r}, the model {model.name!r} was trained on {trained_value!r}"
+        for key, trained_value, value in other_instruments(trained_on, instrument)
+    )

@@ -1,0 +1,174 @@
+"""Flux, sky and noise of stars from their own stamps, and the images for the network.
+
+`Photometer` fits stars without bad pixels all at once, in the space of the leading eigenvectors of
+the covariance of the training set (`psfdae.denoise.leading_modes`). A star whose pixels leave the
+range of the training set, or with bad pixels, goes to `psfdae.denoise.flux_model.robust_flux`,
+which has the equations: it solves the same ones with all eigenvectors, leaves such pixels out and
+replaces them by what the others make of them. Neither can do the work of the other at the same cost
+or to the same digits.
+
+The median of the border is only the start for the sky: PSFs with wings have light there, which the
+fit knows of. The noise σ is the scatter of the residuals of the border in units of what the fit
+expects there, so that light of the star in the border is no noise.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from psfdae.denoise.flux_model import FluxModel, Photometry, is_faint, robust_flux
+from psfdae.denoise.leading_modes import LeadingModes
+from psfdae.image.stamps import Stamps, StarFlag, raise_flag
+
+
+class Photometer:
+    """Photometry of stars by the PSFs of a training set.
+
+    Parameters
+    ----------
+    model : FluxModel
+    components : int
+        Number of leading eigenvectors that the fit of many stars knows.
+    """
+
+    least_flux: ClassVar[float] = 1.0 / float(np.finfo(np.float32).max)
+    """Least flux over the brightest pixel of a star with an image of flux 1 in single precision."""
+
+    def __init__(self, model: FluxModel, components: int) -> None:
+        self.model = model
+        self.leading = LeadingModes(model, components)
+        self._low, self._high = (limit.astype(np.float32) for limit in model.pixel_range)
+
+    def measure(
+        self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, stated: Stamps
+    ) -> Photometry:
+        """Measure flux, sky and noise of stars.
+
+        Parameters
+        ----------
+        stamps : ndarray, shape (n, d, d)
+            Stamps in any unit, sky included, finite.
+        bad : ndarray of bool, shape (n, d, d)
+            Pixels that are not used.
+        start : ndarray, shape (n,)
+            Sky to start from (`psfdae.image.stamps.border_median`).
+        stated : Stamps
+            Its `flux`, `background` and `noise` are taken where they are not NaN.
+        """
+        count = len(stamps)
+        hidden = bad.reshape(count, -1)
+        flux_known, sky_known = np.isfinite(stated.flux), np.isfinite(stated.background)
+        # Stamps above the sky in units of their brightest pixel, in which no square overflows; a
+        # mean PSF in place of those without light.
+        sky = np.where(sky_known, stated.background, start)
+        x = (stamps.reshape(count, -1) - sky[:, None]).astype(np.float32)
+        np.copyto(x, 0.0, where=hidden)
+        scale = np.abs(x).max(axis=1).astype(np.float64)
+        lit = np.isfinite(scale) & (scale > 0)
+        scale = np.where(lit, scale, 1.0)
+        x[~lit] = self.model.mean
+        x /= scale.astype(np.float32)[:, None]
+        # All stars in the space of the leading eigenvectors.
+        fit = self.leading.fit(x, sky_known, stated.flux / scale, stated.noise / scale)
+        # Images of flux 1 without the sky that is left, (x − b) / F.
+        has_flux = fit.flux > self.least_flux
+        flux = np.where(has_flux, fit.flux, 1.0)
+        images = x - fit.sky.astype(np.float32)[:, None]
+        images /= flux.astype(np.float32)[:, None]
+        # Good pixels are in the range of the training set, but for their noise.
+        reach = (self.model.clip_sigma * fit.noise / flux).astype(np.float32)[:, None]
+        has_outlier = (images - reach > self._high).any(axis=1)
+        has_outlier |= (images + reach < self._low).any(axis=1)
+        images[~has_flux] = 0.0
+        # In the unit of the stamps; what was stated stays.
+        measured = Photometry(
+            flux=np.where(flux_known, stated.flux, fit.flux * scale),
+            flux_error=np.where(flux_known, np.nan, fit.error * scale),
+            background=np.where(sky_known, sky, sky + fit.sky * scale),
+            noise=np.where(np.isfinite(stated.noise), stated.noise, fit.noise * scale),
+            images=images.reshape(stamps.shape),
+            used=np.ones(stamps.shape, dtype=bool),
+            flags=np.zeros(count, dtype=np.uint16),
+        )
+        raise_flag(measured.flags, StarFlag.FAINT, is_faint(measured.flux, measured.flux_error))
+        # Stars with bad pixels, outliers, or less flux than twice its error again, with care.
+        is_clear = flux_known | (fit.flux > 2.0 * fit.error)
+        careful = hidden.any(axis=1) | ~lit | ~is_clear | ~has_flux | has_outlier
+        self._carefully(np.flatnonzero(careful), stamps, hidden, sky, stated, measured)
+        return measured
+
+    def _carefully(
+        self,
+        stars: np.ndarray,
+        stamps: np.ndarray,
+        hidden: np.ndarray,
+        sky: np.ndarray,
+        stated: Stamps,
+        measured: Photometry,
+    ) -> None:
+        """Fit the stars of some rows with `robust_flux`, and overwrite their rows of `measured`."""
+        # Stars of unknown sky have a model of their own, in which any sky is as likely.
+        has_free_sky = ~np.isfinite(stated.background[stars])
+        for is_free, members in ((True, stars[has_free_sky]), (False, stars[~has_free_sky])):
+            if not members.size:
+                continue
+            model, blind_estimate = self.model.with_free_sky if is_free else self.model, None
+            # 16 stars per fit, made up with mean PSFs: other sizes would round otherwise.
+            for group in np.split(members, range(16, members.size, 16)):
+                x, side = np.tile(self.model.mean, (16, 1)), stamps.shape[-1]
+                flat = stamps[group].reshape(group.size, -1).astype(np.float64)
+                x[: group.size] = np.where(hidden[group], np.nan, flat - sky[group, None])
+                # Fluxes, and stamps with bad pixels and outliers repaired, of the whole group.
+                # Groups without a good pixel, the stars beyond an image, are all the same.
+                blind = group.size == 16 and hidden[group].all()
+                estimate = blind_estimate if blind else None
+                if estimate is None:
+                    estimate = robust_flux(x.reshape(-1, side, side), model)
+                    blind_estimate = estimate if blind else blind_estimate
+                self._overwrite(measured, group, estimate, sky[group], stated)
+
+    def _overwrite(
+        self,
+        measured: Photometry,
+        group: np.ndarray,
+        estimate: Photometry,
+        sky: np.ndarray,
+        stated: Stamps,
+    ) -> None:
+        """Overwrite rows `group` of a photometry by an estimate, of which they are the first."""
+        # A flux that is given counts, and so do the repaired pixels and their noise.
+        count = group.size
+        known_flux, known_noise = stated.flux[group], stated.noise[group]
+        has_flux, repaired = np.isfinite(known_flux), estimate.images[:count].reshape(count, -1)
+        fitted_flux, fit_flags = estimate.flux[:count], estimate.flags[:count]
+        fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
+        # A star has no flux if it was not fitted, if the flux is below its error and not given, or
+        # if it has no image in single precision. A flux that is given is not faint.
+        is_lost = ~fitted | ~(flux > self.least_flux * np.abs(repaired).max(axis=1))
+        is_lost |= ~has_flux & ((fit_flags & StarFlag.NO_FLUX) > 0)
+        # NO_FLUX is judged with the fluxes that are given; all other flags are those of the fit.
+        flags = fit_flags & ~np.uint16(StarFlag.NO_FLUX)
+        flags[has_flux] &= ~np.uint16(StarFlag.FAINT)
+        raise_flag(flags, StarFlag.NO_FLUX, is_lost)
+        # The sky that is left, b = mean(x) − F/P, and images of flux 1 without it.
+        residual_sky = repaired.mean(axis=1) - np.nan_to_num(fitted_flux) / repaired.shape[1]
+        residual_sky = np.where(np.isfinite(stated.background[group]), 0.0, residual_sky)
+        images = (repaired - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
+        images[is_lost] = 0.0
+        # The noise as of other stars, by the pixels of the border that were used.
+        filled = np.tile(self.model.mean.astype(np.float32), (len(estimate.flux), 1))
+        filled[:count] = images
+        # These are images of flux 1 without sky, both known here: only the noise is fitted.
+        unit, used = np.ones(len(filled)), estimate.used.reshape(filled.shape)
+        noise = self.leading.fit(filled, unit > 0, unit, np.nan * unit, used).noise[:count] * flux
+        noise = np.where(is_lost, estimate.noise[:count], noise)
+        # Rows of the photometry; what was stated stays.
+        measured.flux[group] = flux
+        measured.flux_error[group] = np.where(has_flux, np.nan, estimate.flux_error[:count])
+        measured.background[group] = sky + np.where(fitted, residual_sky, 0.0)
+        measured.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
+        measured.images[group] = images.reshape(estimate.images[:count].shape)
+        measured.used[group] = estimate.used[:count]
+        measured.flags[group] = flags

@@ -1,0 +1,1 @@
+"""Stars of a whole image: joint fits, crowded fields, wings, photon noise."""

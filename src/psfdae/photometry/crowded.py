@@ -1,0 +1,340 @@
+"""Photometry of all stars of an image, those that overlap together, with a model of its field.
+
+All stars are fitted at once (`psfdae.photometry.joint_fit`). Stars that are fainter, or in the
+light of brighter ones, are then found where the models are subtracted
+(`psfdae.photometry.matched_filter`), and all are fitted again, on a sky without the light of stars,
+until no more are found. Stars that were found there and have no flux of 3 σ are dropped. The light
+that a star has beyond its stamp is measured with them (`psfdae.psf.wings`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.base.progress import steps
+from psfdae.denoise.denoiser import MAX_CHI2
+from psfdae.denoise.flux_model import is_faint
+from psfdae.image.observation import Observation
+from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.photometry.joint_fit import JointFit, chains, fit_stars, pairs_within
+from psfdae.photometry.matched_filter import find_stars
+from psfdae.photometry.photon_noise import pixel_error
+from psfdae.psf.grid import PsfGrid
+from psfdae.psf.wings import (
+    StarFluxes,
+    Wings,
+    add_model_errors,
+    aperture_correction,
+    around_stars,
+    outer_shares,
+)
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from psfdae.psf.interface import FieldPsfs
+
+MAX_CHI2_RATIO = 2.5
+"""Median χ² of an image's bright stars, over that of the training, from which all are flagged."""
+
+MAX_TURNS = 5
+"""Joint fits; stars are looked for after all but the last two."""
+
+RESIDUAL_SNR = 4.0
+"""Minimum S/N of a star in the residuals: of 10⁶ pixels of noise, some 25 peaks are higher."""
+
+
+@dataclass(frozen=True)
+class CrowdedPhotometry:
+    """Stars of an image, and what is left of the image without them.
+
+    Attributes
+    ----------
+    model : FieldPsfs
+    stars : Table
+        A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
+        wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`
+        (stars in a chain of neighbours), `chi2` (reduced, of the pixels of the fit), `flags`
+        (`StarFlag`s), `photutils_flags`. Stars of a list have its `id` and come in its order.
+        Errors are √χ² times those of the noise where χ² > 1; that of the flux has the model's,
+        too (`FieldPsfs.flux_error`).
+    residual, light : ndarray, shape (h, w)
+        Image without sky and stars, and that of all stars, counts.
+    wings : Wings or None
+        Wings in the fluxes: those of the image, or of the model if no star is bright enough to show
+        any.
+    image_wings : Wings or None
+        Wings of the image, which faint stars hardly show; None without a star that has light.
+    chi2_ratio : float
+        Median χ² of bright stars over the χ² that the training stars would have; NaN if not known.
+    """
+
+    model: FieldPsfs
+    stars: Table
+    residual: np.ndarray
+    light: np.ndarray
+    wings: Wings | None
+    image_wings: Wings | None
+    chi2_ratio: float = np.nan
+
+    def times(self, factor: float) -> CrowdedPhotometry:
+        """Return the same in a unit in which all light is larger by a factor."""
+        stars = self.stars.copy()
+        for name in ("flux", "flux_error", "flux_model"):
+            stars[name] *= factor
+        return replace(
+            self, stars=stars, residual=factor * self.residual, light=factor * self.light
+        )
+
+    @property
+    def radius_px(self) -> float:
+        """Radius within which a flux is the light of its star; half a stamp without wings."""
+        half = self.model.stamp_px / 2
+        return half if self.wings is None else float(self.wings.radius_px[-1])
+
+    def part_of_model(self) -> tuple[float, float]:
+        """Return the part of a typical star's flux that is in the stamp, and its standard error."""
+        light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
+        return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
+
+    def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
+        """Return the flux of a star over what an aperture gets; see `psfdae.psf.wings`."""
+        return aperture_correction(self.model, self.wings, x, y, radius_px)
+
+
+def photometry(
+    model: FieldPsfs, observation: Observation, threshold: float = RESIDUAL_SNR
+) -> CrowdedPhotometry:
+    """Fit positions and fluxes of all stars of an image.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+        That knows the PSF at every place of this image.
+    observation : Observation
+        The image with its stars. No others are looked for if they are those of a list.
+    threshold : float
+        Minimum S/N of stars that are found where the models of others are subtracted.
+
+    Raises
+    ------
+    PredictionError
+        If the model knows no PSF of a place.
+    ObservationError
+        If there is no sky to measure.
+    """
+    observation, unit = observation.to_sky_unit(), observation.unit_factor
+    # PSFs of the field, and lengths that follow from the PSF in its middle.
+    psfs = PsfGrid.of(model, by_magnitude=True).times(unit)
+    fwhm, side = model.fwhm_px(), model.stamp_px
+    # Side of the pixels that are fitted to a star, odd, about 1.6 FWHM.
+    box_px = 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
+    x, y = np.rint(np.mean(model.field_range(), axis=0))
+    middle_psf = model.psf_at(float(x), float(y), 1)
+    area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
+    # The image with its sky; saturated pixels are not fitted.
+    sky, limit = observation.sky(), observation.saturate
+    image = sky.flat + sky.level
+    saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
+    bad = sky.bad | saturated
+    sky = replace(sky, bad=bad)
+    # Stars start where the list or the detection has them, with the wings of the model.
+    origin, flux = np.array(observation.positions, dtype=np.float64), None
+    place = origin
+    wings, wing_light = model.wings, np.zeros_like(image)
+    # The first errors are from the pixels themselves, light of neighbours included.
+    error = pixel_error(sky.noise, sky.flat, observation.gain)
+    # Positions of all stars that were found in residuals: each is tried once.
+    peaks = np.empty((0, 2))
+    for turn in steps("photometry", range(MAX_TURNS)):
+        # Centres move by at most a FWHM from where stars were expected.
+        without_wings = image - sky.level - wing_light
+        fit = fit_stars(psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin)
+        del without_wings, wing_light  # of a large image, each map takes much memory
+        place = np.where(np.isfinite(fit.place), fit.place, place)
+        flux = fit.flux
+        # Sky and light beyond the stamps, from the image without the light of stars.
+        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux / unit))
+        # At first, stars are no better known than to the error of the wings.
+        sky, wing_light, wings = around_stars(
+            image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, saturated
+        )
+        # Noise in the weights would make fluxes too small: from now on they are of the models.
+        error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
+        if turn == MAX_TURNS - 1 or (turn > 0 and observation.detections is None):
+            break
+        # A star found in residuals is dropped if it is faint, if it may be what the PSF of another
+        # star lacks, or if it has moved to another star.
+        sigma = np.hypot(fit.flux_error, _psf_doubt(place, flux, side, area_px))
+        real = flux > min(threshold, 3.0) * sigma
+        real[pairs_within(place, 0.5 * fwhm)] = False  # of one star
+        real[: observation.count] = True
+        place, flux, origin = place[real], flux[real], origin[real]
+        # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
+        # stars and find none.
+        if observation.detections is not None and turn < MAX_TURNS - 2:
+            sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
+            positions = np.concatenate([place, peaks])
+            new, new_flux = find_stars(psfs, sky.flat, sigma, positions, threshold, fwhm)
+            place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
+            flux = np.append(flux, new_flux)
+        if turn > 0 and real.all() and len(place) == len(real):
+            break
+    # Wings of the model, if this image has no star that is bright enough to show them.
+    wings_used = wings if wings is not None and wings.is_measured else model.wings
+    stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm)
+    stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, box_px, fwhm)
+    # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
+    chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
+    light = fit.light + wing_light
+    result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
+    return result.times(1.0 / unit)  # in the unit of the image
+
+
+def tabulate_stars(
+    model: FieldPsfs,
+    observation: Observation,
+    fit: JointFit,
+    origin: np.ndarray,
+    wings: Wings | None,
+    fwhm: float,
+) -> Table:
+    """Return a row for each star with all its light, all errors, and flags that need no pixels.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+        Model of the PSFs, with their errors.
+    observation : Observation
+        The image with its stars, in the unit of the fit.
+    fit : JointFit
+        All stars, with their fluxes in the stamps.
+    origin : ndarray, shape (n, 2)
+        Expected positions of the stars, x and y in pixels.
+    wings : Wings or None
+        Light outside of the stamps; None adds none to the fluxes.
+    fwhm : float
+        FWHM of the PSF in pixels, which groups stars.
+    """
+    from astropy.table import Table
+
+    total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
+    if wings is not None:
+        flux = fit.flux / observation.unit_factor
+        total, total_error = wings.total_over_flux(outer_shares(model.on_pixels, fit.place, flux))
+    is_detected = observation.detections is not None
+    # With a list, the errors of stars that overlap are larger than this bias, and of either sign.
+    flux = fit.flux - fit.flux_bias if is_detected else fit.flux
+    # Light that no model explains, of the PSF's own errors or of undetected stars, is as much
+    # in the fluxes as in the residuals.
+    excess = np.sqrt(np.fmax(fit.chi2, 1.0))
+    # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
+    # whatever its χ²: σ² = χ² σ_noise² + (σ_model F)² + (σ_wings F)².
+    relative_error = np.hypot(model.flux_error(fit.place), total_error / total)
+    # Stars of a list keep its numbers and flags.
+    stars = Table({"id": np.arange(1, len(flux) + 1) if is_detected else observation.stars.id})
+    stars["x"], stars["y"] = fit.place.T
+    stars["x_error"], stars["y_error"] = excess * fit.place_error.T
+    stars["flux"] = total * flux
+    stars["flux_error"] = np.hypot(total * excess * fit.flux_error, relative_error * total * flux)
+    stars["flux_model"] = flux
+    # Chains of neighbours, numbered from 1.
+    group = chains(fit.place, 2.4 * fwhm)
+    stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
+    stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
+    stars["flags"] = np.zeros(len(stars), np.uint16) if is_detected else observation.stars.flags
+    # Noise has some peaks below 5 σ in an image of a million pixels: a source may be no star.
+    faint = is_faint(np.array(stars["flux"]), np.array(stars["flux_error"]), 5.0)
+    raise_flag(stars["flags"], StarFlag.FAINT, faint & is_detected)
+    # Farther from where it was expected than noise explains, a star may be another one.
+    distance_px = np.hypot(*(fit.place - origin).T)
+    sigma_px = np.hypot(stars["x_error"], stars["y_error"])
+    is_far = distance_px > np.maximum(0.5 * fwhm, 3.0 * sigma_px)
+    raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
+    return stars
+
+
+def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
+    """Return the median of bright stars' χ² over the χ² that the training stars would have.
+
+    All stars are flagged UNLIKE_TRAINING if it is above `MAX_CHI2_RATIO`.
+
+    Parameters
+    ----------
+    fit : JointFit
+        All stars of the image, with their χ².
+    flags : ndarray, shape (n,)
+        Changed here; bright stars are those without another flag than POOR_FIT.
+    variance : float
+        Variance v of the training stars about their PSF, summed over the noise-equivalent area.
+
+    Returns
+    -------
+    float
+        NaN if the variance is not known, or with fewer than three bright stars.
+    """
+    # χ² = 1 + (F/σ_F)² v: noise, and residuals of variance v F².
+    snr = fit.flux / fit.flux_error
+    is_bright = (flags & ~np.uint16(StarFlag.POOR_FIT) == 0) & (snr > 20.0)
+    ratio = (fit.chi2 / (1.0 + snr**2 * variance))[is_bright]
+    median_ratio = float(np.median(ratio)) if len(ratio) >= 3 else np.nan
+    raise_flag(flags, StarFlag.UNLIKE_TRAINING, np.full(len(flags), median_ratio > MAX_CHI2_RATIO))
+    return median_ratio
+
+
+def star_flags(
+    stars: Table, bad: np.ndarray, saturated: np.ndarray, side: int, fwhm: float
+) -> np.ndarray:
+    """Return the flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
+
+    Parameters
+    ----------
+    stars : Table
+        As in `CrowdedPhotometry`.
+    bad, saturated : ndarray of bool, shape (h, w)
+        Pixels that were not fitted.
+    side : int
+    fwhm : float
+        In pixels.
+    """
+    from scipy.ndimage import maximum_filter
+
+    place = np.stack([stars["x"], stars["y"]], axis=1)
+    is_located = np.isfinite(place).all(axis=1)
+    flags, photutils = np.zeros(len(stars), np.uint16), np.array(stars["photutils_flags"])
+    # Pixels of the box about each star.
+    height, width = bad.shape
+    column, row = np.rint(np.where(is_located[:, None], place, -side)).astype(int).T
+    half = side // 2
+    edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
+    at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+    for pixels, flag in ((bad, StarFlag.MASKED), (saturated, StarFlag.SATURATED)):
+        raise_flag(flags, flag, is_located & maximum_filter(pixels, side, mode="constant")[at])
+    raise_flag(flags, StarFlag.TRUNCATED, edge & is_located)
+    # Flux, fit and neighbours.
+    flux, error = np.array(stars["flux"]), np.array(stars["flux_error"])
+    raise_flag(flags, StarFlag.NO_FLUX, ~np.isfinite(flux))
+    raise_flag(flags, StarFlag.FAINT, is_faint(flux, error))
+    # Not at rest, or a place at its bound.
+    raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > MAX_CHI2) | (photutils & 8 > 0))
+    raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
+    raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
+    return flags
+
+
+def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
+    """Return the flux (n,) that errors of the PSFs of other stars may make at places (n, 2).
+
+    A PSF may lack 1.5 % of its light in and about its stamp of `side` pixels, of which a star gets
+    what falls on its noise-equivalent area.
+    """
+    # Squares of the fluxes of all stars near enough to each star.
+    is_bright = (flux > 0)[:, None]
+    pairs = pairs_within(np.where(is_bright, place, np.nan), 0.75 * side)
+    square = np.zeros(len(place))
+    for first, second in ((0, 1), (1, 0)):
+        np.add.at(square, pairs[:, first], np.square(flux[pairs[:, second]]))
+    return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))

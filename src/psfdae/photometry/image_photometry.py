@@ -1,0 +1,392 @@
+"""Photometry of the stars of an image in one call, for the command line and for Python.
+
+In go a model that knows the PSF at every place, an image and what is stated about it, and perhaps
+reference stars; out come a table of all stars, and the image without its sky and stars. The fit
+itself is in `psfdae.photometry.crowded`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from psfdae.base.arguments import check_arguments
+from psfdae.base.errors import Error, keyword, warn
+from psfdae.image.catalogue import as_catalogue
+from psfdae.image.errors import ascii_line
+from psfdae.image.image_input import ImageInput
+from psfdae.image.positions import list_offset
+from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.image.tables import star_table
+from psfdae.photometry import crowded
+from psfdae.photometry.crowded import CrowdedPhotometry
+from psfdae.photometry.photon_noise import with_measured_gain
+
+if TYPE_CHECKING:
+    from astropy.nddata import CCDData
+    from astropy.table import QTable, Table
+    from astropy.wcs import WCS
+
+    from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
+    from psfdae.image.observation import Observation
+    from psfdae.psf.interface import FieldPsfs
+
+
+CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
+"""Possible causes if all stars are unlike the training stars."""
+
+
+class PhotometryError(Error, ValueError):
+    """Statements that exclude each other, or too few stars for a zero point."""
+
+
+@dataclass(frozen=True)
+class ImagePhotometry:
+    """Stars of an image with their fluxes.
+
+    Attributes
+    ----------
+    measured : CrowdedPhotometry
+        The fit; its `residual` is the image without sky and stars.
+    table : QTable
+        A row for each star, with units, magnitudes if the zero point is known, sky coordinates if
+        the image has a WCS, and further columns of the star list. Its meta names the image and the
+        model, and has the zero point.
+    notes : tuple of str
+        Sentences on the image, its list, the zero point and the light that fluxes contain.
+    wcs : WCS or None
+        That of the image.
+    """
+
+    measured: CrowdedPhotometry
+    table: QTable
+    notes: tuple[str, ...]
+    wcs: WCS | None
+
+    @property
+    def residual(self) -> CCDData:
+        """Image without its sky and stars, in the unit of the image and with its WCS."""
+        from astropy.nddata import CCDData
+
+        pixels, unit = self.measured.residual.astype(np.float32), self.table["flux"].unit
+        return CCDData(pixels, unit=unit, wcs=self.wcs)
+
+
+class ImageFluxes:
+    """Photometry of a whole image, for all models that know the PSF at every place."""
+
+    @check_arguments
+    def photometry(
+        self,
+        image: Image,
+        catalogue: StarList | None = None,
+        *,
+        zero_point: float | None = None,
+        reference: StarList | None = None,
+        magnitude_column: str = "mag",
+        **statements: Any,
+    ) -> QTable:
+        """Measure the fluxes of all stars of an image, overlapping ones together.
+
+        It is the table that the command `psfdae photometry` writes.
+
+        Parameters
+        ----------
+        image : path-like, array, NDData, HDU or HDUList
+            The image that the model learnt from, or another one with the same PSF.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list; no other stars are looked for.
+        zero_point : float, optional
+            Magnitude of a flux of 1.
+        reference : as `catalogue`, optional
+            Star list with magnitudes, which give the zero point.
+        magnitude_column : str
+            Column of the reference with the magnitudes.
+        **statements
+            Statements on the image, such as `detect=True` in place of a list; they are named and
+            explained in `psfdae.image.image_input.ImageStatements`.
+
+        Returns
+        -------
+        QTable
+            A row for each star, with units.
+
+        Raises
+        ------
+        Error
+            If the image or a list cannot be used, or the model knows no PSF of a place.
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        model = cast("FieldPsfs", self)
+        return photometry_of_image(model, source, zero_point, reference, magnitude_column).table
+
+    def residual(
+        self, image: Image, catalogue: StarList | None = None, **statements: Any
+    ) -> CCDData:
+        """Return an image without its sky and stars, which are measured as by `photometry`.
+
+        `psfdae.photometry.image_photometry.photometry_of_image` gives table and residual of one
+        measurement.
+
+        Parameters
+        ----------
+        image, catalogue, **statements : as those of `photometry`
+        """
+        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
+        return photometry_of_image(cast("FieldPsfs", self), source).residual
+
+
+def photometry_of_image(
+    model: FieldPsfs,
+    source: ImageInput,
+    zero_point: float | None = None,
+    reference: StarList | None = None,
+    magnitude_column: str = "mag",
+    opened: Observation | None = None,
+) -> ImagePhotometry:
+    """Measure the fluxes of all stars of an image, overlapping ones together.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+        Model that knows the PSF at every place of this image.
+    source : ImageInput
+        The image, and what is stated about it. With `detect`, its `origin` is that of the
+        reference.
+    zero_point : float, optional
+        Magnitude of a flux of 1.
+    reference : StarList, optional
+        Star list with magnitudes, which give the zero point.
+    magnitude_column : str
+        Column of the reference with the magnitudes.
+    opened : Observation, optional
+        `source` with its stars, if it was opened before: it is not read and searched again.
+
+    Raises
+    ------
+    PhotometryError
+        If statements exclude each other, the image is a cube, or fewer than three reference stars
+        are stars of the image.
+    PredictionError
+        If the model knows no PSF of a place, or has pixels of another scale.
+    ObservationError
+        If the image or a list cannot be used.
+    """
+    # Refuse statements that do not fit together.
+    if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
+        raise PhotometryError(
+            f"{keyword('zero_point')} takes a number, or {keyword('reference')} gives it"
+        )
+    if source.colour_column:
+        raise PhotometryError(
+            f"{source.path}: stars get the PSF of the mean colour: no {keyword('colour_column')}"
+        )
+    # With --detect, no list of the image needs an origin: it is that of the reference.
+    origin = source.origin
+    if reference is not None and source.detect:
+        source = replace(source, origin=None)
+    # The model must know the PSF at every place (`field_range` refuses others), and have pixels
+    # as large as those of the image.
+    model.field_range()
+    observation = opened or source.open(model.stamp_px).assuming()
+    if observation.shape is None:
+        raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
+    model.check_scale(observation.pixel_scale_arcsec, str(source.path))
+    # The image may show another part of the detector than the training.
+    model, frame_notes = model.to_image_frame(observation)
+    # Read the stars of the reference before the long work, in case they cannot be used.
+    magnitudes = scatter = None
+    if reference is not None:
+        stars = replace(source, catalogue=reference, origin=origin, detect=False, on_image=False)
+        positions = stars.open(model.stamp_px).positions
+        assert positions is not None  # of an image
+        star_list = as_catalogue(reference)
+        magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
+
+    # All stars of the image, and the zero point by those that the reference has.
+    observation = with_measured_gain(model, observation)
+    measured, list_note = measure_stars(model, observation, source.given_threshold)
+    zero_point_note = None
+    if magnitudes is not None:
+        zero_point, scatter, zero_point_note = measure_zero_point(measured, *magnitudes)
+    table = photometry_table(measured, observation, zero_point)
+    table.meta |= {
+        "INFILE": ascii_line(source.path.name),
+        "PSFMODEL": ascii_line(measured.model.name),
+        "PSFSHA": measured.model.sha256,
+        "FLUXRAD": measured.radius_px,
+        "INMODEL": measured.part_of_model()[0],
+        **({} if zero_point is None else {"ZEROPT": zero_point}),
+        **({} if scatter is None else {"ZEROPTSD": scatter}),
+    }
+    if measured.chi2_ratio > crowded.MAX_CHI2_RATIO:
+        misfit = f"χ² of bright stars is {measured.chi2_ratio:.3g} times the training's (median)"
+        frame_notes.append(f"{source.path}: {misfit}, all are flagged UNLIKE_TRAINING: {CAUSES}")
+    warn(frame_notes)
+    notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
+    notes = (*notes, *frame_notes)
+    return ImagePhotometry(measured, table, tuple(filter(None, notes)), observation.wcs)
+
+
+def measure_stars(
+    model: FieldPsfs, observation: Observation, threshold: float | None = None
+) -> tuple[CrowdedPhotometry, str | None]:
+    """Measure the stars that can be measured, and return a row for every star of the list.
+
+    Returns
+    -------
+    measured : CrowdedPhotometry
+        The stars, and the image without them.
+    list_note : str or None
+        A sentence on how far the stars are off the positions of their list, if there is one.
+    """
+    # A row without a position cannot be fitted, and one of a star that is listed twice has no
+    # light of its own: measure the others, and add flagged rows for these.
+    unusable = observation.without_position() | observation.listed_again()
+    usable = observation.select(~unusable) if unusable.any() else observation
+    measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR)
+    if unusable.any():
+        stars = with_unmeasured_rows(measured.stars, observation, unusable)
+        measured = replace(measured, stars=stars)
+    if observation.catalogue is None or len(measured.stars) != observation.count:
+        return measured, None
+    # The stars are fitted where they are, whatever the list says.
+    offset = np.stack([measured.stars["x"], measured.stars["y"]], axis=1) - observation.positions
+    return measured, list_offset(observation.catalogue, offset, accept=True)
+
+
+def light_notes(measured: CrowdedPhotometry, source: ImageInput) -> list[str]:
+    """Return sentences on the light that fluxes contain, and on their bias."""
+    # How much of a flux the model of the PSF does not have.
+    if measured.wings is None:
+        notes = ["no star is bright enough to show light beyond the model's stamp"]
+    else:
+        part, part_error = measured.part_of_model()
+        notes = [
+            f"fluxes are the light within {measured.radius_px:.3g} px; the model of the PSF has "
+            f"{100 * part:.2f} ± {100 * part_error:.2f} % of it"
+        ]
+        model_wings = measured.model.wings
+        if model_wings is not None and measured.wings.differs_from(model_wings):
+            notes.append(
+                f"light outside the stamps: {measured.wings} in this image, which its fluxes have; "
+                f"{model_wings} in the training, which flux_total of psfdae predict has"
+            )
+    if source.detect:
+        # Selection by brightness: Eddington (1913, MNRAS 73, 359).
+        notes.append(
+            "of stars near the detection threshold, those are found that noise makes brighter: "
+            "their fluxes are too large in the mean, the more the fainter they are"
+        )
+    return notes
+
+
+def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
+    """Return a row for every star of the list; those that were not measured have NaN and flags.
+
+    Parameters
+    ----------
+    stars : Table
+        A row for each star that was measured, in the order of the list.
+    observation : Observation
+        All stars of the list.
+    unusable : ndarray of bool, shape (n,)
+        Rows that were not measured.
+    """
+    from astropy.table import Table
+
+    assert observation.positions is not None
+    # Each column with 0 or NaN in the rows that were not measured.
+    rows = Table()
+    for name in stars.colnames:
+        measured = np.array(stars[name])
+        missing = np.nan if measured.dtype.kind == "f" else 0
+        rows[name] = np.full(len(unusable), missing, measured.dtype)
+        rows[name][~unusable] = measured
+    # What the list says of these stars.
+    rows["id"] = observation.stars.id
+    rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
+    rows["flags"] |= observation.stars.flags
+    raise_flag(rows["flags"], StarFlag.NO_FLUX, unusable)
+    return rows
+
+
+def measure_zero_point(
+    measured: CrowdedPhotometry, positions: np.ndarray, magnitude: np.ndarray, reference: str
+) -> tuple[float, float, str]:
+    """Return the zero point, the scatter of its stars, and a sentence with its standard error.
+
+    Both are in magnitudes; the scatter is the standard deviation of one star's zero point.
+
+    Parameters
+    ----------
+    measured : CrowdedPhotometry
+        Stars of the image with their fluxes F.
+    positions : ndarray, shape (n, 2)
+        Pixel positions x, y of the reference stars in the image.
+    magnitude : ndarray, shape (n,)
+        Their magnitudes m.
+    reference : str
+        Name of the star list, for messages.
+
+    Raises
+    ------
+    PhotometryError
+        If fewer than three reference stars are stars of the image.
+    """
+    from scipy.spatial import cKDTree
+
+    from psfdae.stars.moments import robust_scatter
+
+    # Stars of the image with a flux above 0, and reference stars with position and magnitude.
+    stars = measured.stars
+    flux = np.array(stars["flux"], dtype=np.float64)
+    has_flux = np.flatnonzero(np.isfinite(flux) & (flux > 0))
+    star_positions = np.stack([stars["x"], stars["y"]], axis=1)[has_flux]
+    complete = np.isfinite(positions).all(axis=1) & np.isfinite(magnitude)
+    # Each reference star is the nearest star of the image if that is within half a FWHM.
+    distance_px, star = cKDTree(star_positions).query(positions[complete])
+    matched = distance_px < 0.5 * measured.model.fwhm_px()
+    # ZP = m + 2.5 log₁₀ F for each; the median, as stars may be variable or matched wrongly.
+    zero_points = magnitude[complete][matched] + 2.5 * np.log10(flux[has_flux[star[matched]]])
+    count = len(zero_points)
+    if count < 3:
+        raise PhotometryError(
+            f"{reference}: {count} of its stars with a magnitude are stars of the image, 3 are "
+            "needed for a zero point"
+        )
+    scatter = float(robust_scatter(zero_points[:, None])[0])
+    value, error = float(np.median(zero_points)), scatter / math.sqrt(count)
+    note = f"zero point {value:.4f} ± {error:.4f} mag ({count} stars of {reference})"
+    return value, scatter, note
+
+
+def photometry_table(
+    measured: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
+) -> QTable:
+    """Return the stars with units, magnitudes, sky coordinates and the columns of their list.
+
+    Parameters
+    ----------
+    measured : CrowdedPhotometry
+        The stars; one for every star of the observation if these are of a list.
+    observation : Observation
+        The image, which has the unit of the fluxes and, perhaps, a WCS.
+    zero_point : float, optional
+        Magnitude of a flux of 1; without it there are no magnitudes.
+    """
+    # Columns of the fit; magnitudes if the zero point is known, and places on the sky.
+    columns = {name: np.array(measured.stars[name]) for name in measured.stars.colnames}
+    columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
+    with np.errstate(all="ignore"):
+        if zero_point is not None:
+            # m = ZP − 2.5 log₁₀ F, and σ_m = 2.5 / ln 10 · σ_F / F.
+            flux = np.where(columns["flux"] > 0, columns["flux"], np.nan)
+            columns["mag"] = zero_point - 2.5 * np.log10(flux)
+            columns["mag_error"] = 2.5 / math.log(10.0) * columns["flux_error"] / flux
+        columns |= observation.sky_columns(columns["x"], columns["y"])
+    return star_table(columns, observation.unit, observation.list_columns)

@@ -1,0 +1,395 @@
+"""Positions and fluxes of all stars of an image from one weighted least-squares fit.
+
+The image x is the sum of the light of its stars, each a flux F times the PSF P at its place:
+
+    x = Σ_i F_i P(p − p_i) + n,    n ~ N(0, σ²).
+
+The parameters of a star are those for which the derivatives of its light, in a box of pixels about
+it, have no part of the residuals of the whole model left, Σ_box (x − model) ∂model_i / σ² = 0:
+the light that every other star has in the box belongs to the model, but what the PSF is like far
+from the star does not decide. The equations of stars whose boxes overlap are solved together, by
+Gauss–Newton steps on one sparse matrix (Stetson 1987, PASP 99, 191, solves them group by group).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.base.progress import steps
+from psfdae.psf.grid import PsfGrid
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Stars of an image as they were fitted; NaN for those without pixels to fit.
+
+    Attributes
+    ----------
+    place, place_error : ndarray, shape (n, 2)
+        Centres, x and y, 0-based pixels, and their standard errors.
+    flux, flux_error : ndarray, shape (n,)
+        Light in the stamp of the PSF, counts, and its standard errors.
+    flux_bias : ndarray, shape (n,)
+        Mean excess of the fluxes because centres are free, counts.
+    chi2 : ndarray, shape (n,)
+        Reduced χ² of the pixels of the box.
+    flags : ndarray of int, shape (n,)
+        Flags as photutils' `PSFPhotometry` has them (`photutils.psf.decode_psf_flags`).
+    light : ndarray, shape (h, w)
+        Light of all stars, counts.
+    """
+
+    place: np.ndarray
+    place_error: np.ndarray
+    flux: np.ndarray
+    flux_error: np.ndarray
+    flux_bias: np.ndarray
+    chi2: np.ndarray
+    flags: np.ndarray
+    light: np.ndarray
+
+
+def fit_stars(
+    psfs: PsfGrid,
+    image: np.ndarray,
+    error: np.ndarray,
+    bad: np.ndarray,
+    place: np.ndarray,
+    flux: np.ndarray | None,
+    box_px: int,
+    range_px: float,
+    origin: np.ndarray | None = None,
+) -> JointFit:
+    """Fit all stars of an image together.
+
+    Parameters
+    ----------
+    psfs : PsfGrid
+    image, error : ndarray, shape (h, w)
+        Image without its sky, and σ of its pixels, counts.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    place : ndarray, shape (n, 2)
+        Start of the fit, x and y; stars whose place is not finite are not fitted.
+    flux : ndarray, shape (n,), or None
+        Fluxes at the start, if known.
+    box_px : int
+        Side of the pixels about each star that decide on it, odd.
+    range_px : float
+        Distance that a star may move from its origin along either axis.
+    origin : ndarray, shape (n, 2), optional
+        Places of the stars by a list or by detection, by default where the fit starts.
+    """
+    fit = _Fit(psfs, image, error, bad, place, min(box_px, psfs.side_px))
+    middle = fit.start if origin is None else origin[fit.stars]
+    # Fluxes are linear in the pixels: those at the places of the start are one step away.
+    fit.set_flux(fit.best_flux() if flux is None else np.nan_to_num(flux[fit.stars]))
+    # A place is known to its range: an even chance of ± a has the variance a²/3.
+    prior = np.array([0.0, 3.0, 3.0]) / range_px**2
+    damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.squares()
+    moving = np.ones(len(fit.stars), dtype=bool)
+    # Stars without neighbours take three or four steps, close pairs ten.
+    for _ in steps("joint fit", range(15)):
+        design = fit.design()
+        step, gradient = fit.solve(design, prior, damping)
+        # No farther at once than the light is nearly linear in the place, and not out of its range.
+        move = np.clip(step[:, 1:], -range_px / 4, range_px / 4)
+        move = np.clip(fit.place + move, middle - range_px, middle + range_px) - fit.place
+        step = np.column_stack([step[:, 0], move])
+        # A group is at rest if its χ² would fall by less than 0.01: it is within 0.1 σ.
+        expected = np.bincount(group, (step * gradient).sum(axis=1))
+        moving = (expected > 0.01)[group]
+        if not moving.any():
+            break
+        # Stars of a group at rest stay where they are.
+        rows = np.flatnonzero(moving)
+        fit.move(rows, step[rows])
+        # Levenberg (1944, Q. Appl. Math. 2, 164): a step of a group after which it fits worse is
+        # taken back, and the next one is shorter the less this one was worth what was expected.
+        squares = fit.squares()
+        gain = np.bincount(group, cost - squares)
+        is_worse, is_poor = ((gain < part * expected)[group] & moving for part in (-0.5, 0.1))
+        back = np.flatnonzero(is_worse)
+        fit.move(back, -step[back])
+        damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
+        cost = fit.squares() if len(back) else squares
+    bound = np.abs(fit.place - middle) > 0.999 * range_px
+    return fit.result(len(place), prior, moving, bound)
+
+
+def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
+    """Return the pairs of stars that are nearer to each other than a distance, (k, 2), by number.
+
+    Stars of which no place (n, 2) is known are in no pair.
+    """
+    from scipy.spatial import cKDTree
+
+    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    # Numbers of the tree are those of the located stars.
+    pairs = cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")
+    return np.asarray(located[pairs])
+
+
+def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
+    """Return the numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
+
+    A star of which no place (n, 2) is known is a chain of its own.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    # Chains are the connected components of the graph of these pairs.
+    pairs = pairs_within(place, distance_px)
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
+class _Fit:
+    """State of a fit of m stars: their places and fluxes, and what they leave of the image.
+
+    The image has a border, as wide as a stamp, of pixels that do not count, so that stamps of
+    stars at its edge are whole.
+    """
+
+    parameters = 3  # of a star: flux, and position x and y
+
+    def __init__(
+        self,
+        psfs: PsfGrid,
+        image: np.ndarray,
+        error: np.ndarray,
+        bad: np.ndarray,
+        place: np.ndarray,
+        box_px: int,
+    ) -> None:
+        self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
+        # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
+        side = psfs.side_px
+        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float64), side)
+        weight = np.pad(np.where(bad, 0.0, 1.0 / error), side)
+        # Stars on the image whose boxes have at least as many pixels as a star has parameters.
+        height, width = image.shape
+        on_image = np.isfinite(place).all(axis=1)
+        on_image[on_image] = ((place[on_image] > -1) & (place[on_image] < (width, height))).all(
+            axis=1
+        )
+        self.stars = np.flatnonzero(on_image)
+        self._middle = np.rint(place[self.stars]).astype(int)
+        pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
+        fitted = pixels >= self.parameters
+        self.stars, self._middle, self.pixels = (
+            values[fitted] for values in (self.stars, self._middle, pixels)
+        )
+        # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
+        # are the pixels of all boxes.
+        self.boxes, self._stamps = map(self._pixel_numbers, (box_px, side))
+        self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
+        # Places and fluxes at the start, the stars' light and its derivatives there.
+        self.weight = weight.ravel()[self.boxes]
+        self.start = place[self.stars].astype(np.float64)
+        self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
+        self._light = np.empty((len(self.stars), side, side))
+        self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
+        self._draw(np.arange(len(self.stars)))
+
+    def _pixel_numbers(self, side_px: int) -> np.ndarray:
+        """Return the numbers (m, s, s) of the pixels about stars in the image with its border."""
+        axis = np.arange(side_px) - side_px // 2 + self.psfs.side_px
+        row, column = self._middle[:, 1, None] + axis, self._middle[:, 0, None] + axis
+        return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
+
+    def _draw(self, rows: np.ndarray) -> None:
+        """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
+        # Of a stamp, the box in its middle decides. 512 stars at a time, for memory.
+        side = self.psfs.side_px
+        edge = (side - self.box_px) // 2
+        for part in np.array_split(rows, len(rows) // 512 + 1):
+            corner = self._middle[part] - side // 2
+            stamps = self.psfs.stamps(self.place[part], corner, side, self.flux[part])
+            self._light[part] = stamps[:, 0]
+            self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
+
+    def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
+        """Subtract the light of some stars with these fluxes from the residuals."""
+        # Stamps of stars overlap: pixels that several have are subtracted from several times.
+        light = flux[:, None, None] * self._light[rows]
+        np.subtract.at(self.residual.reshape(-1), self._stamps[rows], light)
+
+    def set_flux(self, flux: np.ndarray) -> None:
+        """Give the stars, which have none yet, fluxes (m,)."""
+        self.flux = flux.astype(np.float64)
+        # Where the PSF changes with the magnitude, it is that of these fluxes from now on.
+        if self.psfs.magnitudes.size:
+            self._draw(np.arange(len(flux)))
+        self._subtract(np.arange(len(flux)), self.flux)
+
+    def best_flux(self) -> np.ndarray:
+        """Return the fluxes (m,) that fit best at the places as they are."""
+        return self.solve(self._derivatives[:, :1] * self.weight[:, None], np.zeros(1))[0][:, 0]
+
+    def move(self, rows: np.ndarray, change: np.ndarray) -> None:
+        """Change flux, x and y of some stars by (k, 3)."""
+        # The light as it was goes back into the residuals, and that of the new place is taken off.
+        self._subtract(rows, -self.flux[rows])
+        self.flux[rows] += change[:, 0]
+        self.place[rows] += change[:, 1:]
+        self._draw(rows)
+        self._subtract(rows, self.flux[rows])
+
+    def design(self) -> np.ndarray:
+        """Return the derivatives (m, 3, b, b) of the light by flux, x and y, in units of σ."""
+        # ∂(F P)/∂F = P, ∂(F P)/∂x = F ∂P/∂x, and the same by y.
+        factor = np.stack([np.ones_like(self.flux), self.flux, self.flux], axis=1)
+        return np.asarray(self._derivatives * factor[..., None, None] * self.weight[:, None])
+
+    def squares(self) -> np.ndarray:
+        """Return the sums (m,) of the squared residuals in the boxes, in units of σ."""
+        # χ² of each box; the light of all other stars is subtracted there, too.
+        residual = self.weight * self.residual.ravel()[self.boxes]
+        return np.asarray(np.square(residual).sum(axis=(1, 2)))
+
+    def solve(
+        self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Gauss–Newton step (m, k) of a design (m, k, b, b), and the slope of −χ²/2."""
+        from scipy.sparse import diags_array
+        from scipy.sparse.linalg import splu
+
+        # Levenberg's damping is a part of the diagonal, which is 1 in these units.
+        matrix, unit = _normal_matrix(design, self._rows, prior)
+        added = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
+        matrix = (matrix + diags_array(added)).tocsc()
+        # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
+        residual = self.weight * self.residual.ravel()[self.boxes]
+        gradient = np.einsum("mkrc,mrc->mk", design, residual)
+        if not len(unit):
+            return gradient, gradient
+        # It is positive definite: no pivots, and an order for symmetric matrices.
+        options = {"SymmetricMode": True}
+        factors = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        return factors.solve((gradient / unit).ravel()).reshape(unit.shape) / unit, gradient
+
+    def result(
+        self, count: int, prior: np.ndarray, moving: np.ndarray, bound: np.ndarray
+    ) -> JointFit:
+        """Return the fit of `count` stars, these among them.
+
+        `moving` stars (m,) were not at rest; x or y at the end of its range is in `bound` (m, 2).
+        """
+        # Standard errors, and the reduced χ² of the pixels of each box.
+        matrix, unit = _normal_matrix(self.design(), self._rows, prior)
+        error = standard_errors(matrix, unit)
+        # The centre is fitted where noise makes the flux largest: with two free coordinates, it is
+        # too large by F/S² in the mean, where S is the signal-to-noise ratio of the star alone
+        # (Portillo et al. 2020, AJ 159, 165). Below S = 2, the range of the centre limits that.
+        bias = self.flux / np.fmax(np.square(self.flux * unit[:, 0]), 4.0)
+        chi2 = self.squares() / np.maximum(self.pixels - self.parameters, 1)
+        # Flags as photutils has them: 1 not all pixels, 2 off the image, 4 no flux above 0, 8 not
+        # at rest, 32 at the bound of its range.
+        height, width = self.image.shape
+        outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
+        flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
+        flags += 8 * moving + 32 * bound.any(axis=1)
+
+        def of_all(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
+            # Rows of all stars of the list; those that were not fitted have no value.
+            column = np.full((count, *values.shape[1:]), missing, values.dtype)
+            column[self.stars] = values
+            return column
+
+        # The light of all stars is what the image has beyond the residuals.
+        core = np.s_[self.psfs.side_px : -self.psfs.side_px]
+        light = np.where(self.bad, 0.0, self.image).astype(np.float32)
+        np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
+        return JointFit(
+            of_all(self.place),
+            of_all(error[:, 1:]),
+            of_all(self.flux),
+            of_all(error[:, 0]),
+            of_all(bias),
+            of_all(chi2),
+            of_all(flags, 64),  # no overlap with usable pixels
+            light,
+        )
+
+
+def _normal_matrix(
+    design: np.ndarray, boxes: np.ndarray, prior: np.ndarray
+) -> tuple[csc_array, np.ndarray]:
+    """Return the sums over pixels of products of derivatives, scaled to a diagonal of 1.
+
+    Parameters
+    ----------
+    design : ndarray, shape (m, k, b, b)
+        Derivatives by k parameters of m stars in their boxes, in units of σ.
+    boxes : ndarray of int, shape (m, b, b)
+        Numbers of the pixels, from 0, ascending in a box.
+    prior : ndarray, shape (k,)
+        Inverse variances of the parameters.
+
+    Returns
+    -------
+    matrix : csc_array, shape (m k, m k)
+        Normal matrix DᵀD of the design D in units of `unit`, with the prior.
+    unit : ndarray, shape (m, k)
+        Root of the diagonal, 1/σ of a parameter if all others were known.
+    """
+    from scipy.sparse import csc_array, diags_array
+
+    # Root of the diagonal of DᵀD + prior.
+    stars, parameters, *box = design.shape
+    unit = np.sqrt(np.square(design).sum(axis=(2, 3)) + prior)
+    # A column for each parameter, a row for each pixel.
+    size = box[0] * box[1]
+    values = (design / unit[..., None, None]).ravel()
+    rows = np.repeat(boxes.reshape(stars, 1, size), parameters, axis=1).ravel()
+    ends = size * np.arange(unit.size + 1)
+    columns = csc_array((values, rows, ends), shape=(int(boxes.max(initial=0)) + 1, unit.size))
+    # Two stars in one place have no fluxes of their own: a millionth more parts them evenly.
+    diagonal = diags_array((prior / unit**2).ravel() + 1e-6)
+    return (columns.T @ columns + diagonal).tocsc(), unit
+
+
+def standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
+    """Return the standard errors (m, k) of the k parameters of m stars.
+
+    Those of a star are from the inverse of the part of the matrix that belongs to it and to the
+    stars whose boxes overlap with its own; what these share with others changes little.
+
+    Parameters
+    ----------
+    matrix : sparse array, shape (m k, m k)
+        Normal matrix of all parameters, with 1 on its diagonal.
+    unit : ndarray, shape (m, k)
+        Factors by which its rows and columns were divided.
+    """
+    # Blocks of 3 × 3 numbers, one for each pair of stars that overlap.
+    stars, parameters = unit.shape
+    blocks = matrix.tobsr((parameters, parameters))
+    blocks.sort_indices()
+    # Key of the block of two stars (i, j) is i · m + j, ascending; each star has its neighbours.
+    row = np.repeat(np.arange(stars), np.diff(blocks.indptr))
+    key = row * stars + blocks.indices
+    neighbours = np.diff(blocks.indptr)
+    variance = np.empty((stars, parameters))
+    for count in np.unique(neighbours):
+        members = np.flatnonzero(neighbours == count)
+        # Few at a time: matrices of (count · k)² numbers.
+        for part in np.array_split(members, len(members) * count**2 // 2**16 + 1):
+            neighbour_rows = blocks.indices[blocks.indptr[part, None] + np.arange(count)]
+            # Blocks among the neighbours of each star; 0 for those that do not overlap.
+            block_keys = neighbour_rows[:, :, None] * stars + neighbour_rows[:, None, :]
+            block_rows = np.minimum(np.searchsorted(key, block_keys), len(key) - 1)
+            local = blocks.data[block_rows] * (key[block_rows] == block_keys)[..., None, None]
+            # The diagonal of the inverse at the block of the star itself.
+            side = count * parameters
+            inverse = np.linalg.inv(local.transpose(0, 1, 3, 2, 4).reshape(-1, side, side))
+            diagonal = np.einsum("nii->ni", inverse).reshape(-1, count, parameters)
+            variance[part] = diagonal[neighbour_rows == part[:, None]]
+    return np.asarray(np.sqrt(variance) / unit)

@@ -1,0 +1,207 @@
+"""PSFs of a field as splines at the nodes of a grid, for the light of many stars.
+
+A PSF between nodes is the bilinear interpolation of the four around it, and a parabola through
+three magnitudes where the PSF changes with the magnitude of a star. The PSF of a node is a bicubic
+spline through `oversampling` values per pixel. All pixels of a stamp then have the same phase
+between the knots: a stamp needs one set of 4 × 4 weights (de Boor 1978, A practical guide to
+splines), and its derivatives by the position of the star another one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.stars.bright_stars import magnitude
+
+if TYPE_CHECKING:
+    from psfdae.psf.interface import FieldPsfs
+
+
+@dataclass(frozen=True)
+class PsfGrid:
+    """Splines of the PSFs of a field.
+
+    Attributes
+    ----------
+    columns, rows : ndarray, shape (c,) and (r,)
+        Positions of the nodes, in pixels of the image, ascending.
+    psfs : ndarray, shape (r, c, m, m) or (3, r, c, m, m)
+        Values of each PSF, at three magnitudes if there are any; index m//2 is its centre.
+    oversampling : int
+        Values per pixel and axis.
+    magnitudes : ndarray, shape (0,) or (3,)
+        Equidistant magnitudes, ascending, or none. Beyond them the PSF is that of the nearest one.
+    """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    psfs: np.ndarray
+    oversampling: int
+    magnitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(
+        cls, model: FieldPsfs, nodes: int = 9, oversampling: int = 4, by_magnitude: bool = False
+    ) -> PsfGrid:
+        """Sample a model at `nodes` × `nodes` positions over the field of its training stars.
+
+        `by_magnitude` samples it at three magnitudes as well if its PSF changes with them.
+        Otherwise PSFs are averages over the training stars.
+
+        Raises
+        ------
+        PredictionError
+            If the model knows no PSF of a position.
+        """
+        x, y = np.rint(model.grid(nodes, nodes)).T
+        ends = model.magnitude_range if by_magnitude else None
+        magnitudes = np.zeros(0) if ends is None else np.linspace(*ends, 3)
+        layers = [None] if ends is None else magnitudes.tolist()
+        psfs = np.stack([model.psf_at(x, y, oversampling, mag=mag) for mag in layers])
+        # An even stamp has no middle value; with a row and a column of zeros it has.
+        psfs = np.pad(psfs, ((0, 0), (0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
+        psfs = psfs.reshape(*[3] * (ends is not None), nodes, nodes, *psfs.shape[2:])
+        return cls(x[:nodes], y[::nodes], psfs, oversampling, magnitudes)
+
+    def times(self, factor: float) -> PsfGrid:
+        """Return the grid for fluxes in a unit in which all fluxes are larger by a factor."""
+        return replace(self, magnitudes=self.magnitudes + magnitude(np.array(factor)))
+
+    @cached_property
+    def splines(self) -> np.ndarray:
+        """Coefficients (nodes, m + 4, m + 4) of the splines, mirrored by two at each edge."""
+        from scipy.ndimage import spline_filter
+
+        psfs = self.psfs.reshape(-1, *self.psfs.shape[-2:])
+        return np.stack([np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs])
+
+    @property
+    def side_px(self) -> int:
+        """Odd side of stamps that hold all light of a PSF wherever its star is in a pixel."""
+        return 2 * int(self.psfs.shape[-1] // 2 // self.oversampling + 1) + 1
+
+    def stamps(
+        self, centre: np.ndarray, corner: np.ndarray, side_px: int, flux: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the light of stars of flux 1 in stamps of the image, and its derivatives.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (n, 2)
+            Centres of the stars, x and y, 0-based pixels of the image, finite.
+        corner : ndarray of int, shape (n, 2)
+            Column and row of the first pixel of each stamp.
+        side_px : int
+            Side of the stamps.
+        flux : ndarray, shape (n,), optional
+            Fluxes, counts, by which the PSFs differ if the grid has magnitudes. Where they are NaN
+            or not given, the PSF is that of the middle magnitude.
+
+        Returns
+        -------
+        ndarray, shape (n, 3, side_px, side_px)
+            Light, and its derivatives by x and y per pixel, without the change of the PSF over the
+            field. 0 beyond the edge of the PSF.
+        """
+        light = np.zeros((len(centre), 3, side_px, side_px))
+        # Position of the first pixel among the knots, along x and y:
+        # u = o (pixel − centre) + m//2, with its knot ⌊u⌋ and phase u − ⌊u⌋.
+        size = self.psfs.shape[-1]
+        first = self.oversampling * (corner - centre) + size // 2
+        knot = np.floor(first).astype(int)
+        pixel_knot = knot[..., None] + self.oversampling * np.arange(side_px)
+        is_inside = (pixel_knot >= 0) & (pixel_knot + (first > knot)[..., None] <= size - 1)
+        # Stamps with at least one pixel within the PSF; all others stay 0.
+        stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
+        node, share = self._nodes(centre, np.full(len(centre), np.nan) if flux is None else flux)
+        weights, slopes = knot_weights(first - knot)
+        span = self.oversampling * (side_px - 1) + 1
+        # Stamps may reach beyond a PSF: pad its spline with zeros, by no more than they do.
+        begin, end = knot[stars] + 1, self.splines.shape[-1]
+        room = max(0, -begin.min(initial=0), begin.max(initial=0) + span + 3 - end)
+        splines = np.pad(self.splines, ((0, 0), *[(room, room)] * 2))
+        taps = [slice(t, t + span, self.oversampling) for t in range(4)]
+        # Batches, for memory: a pixel needs some 20 coefficients.
+        for batch in np.array_split(stars, len(stars) * side_px**2 // 2**17 + 1):
+            first_spline = knot[batch] + room + 1
+            squares = self._squares(splines, node[batch], share[batch], first_spline, span + 3)
+            # Σ over the four coefficients around each pixel, along x, then along y:
+            # light, ∂/∂x with the slopes along x, ∂/∂y with those along y.
+            smooth, steep = (
+                sum(
+                    kernel[batch, 0, t, None, None] * squares[:, :, tap]
+                    for t, tap in enumerate(taps)
+                )
+                for kernel in (weights, slopes)
+            )
+            for derivative, (values, kernel) in enumerate(
+                ((smooth, weights), (steep, weights), (smooth, slopes))
+            ):
+                light[batch, derivative] = sum(
+                    kernel[batch, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
+                )
+        # A star that moves by a pixel moves by −o knots under its pixels.
+        light[:, 1:] *= -self.oversampling
+        light *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
+        return light
+
+    @staticmethod
+    def _squares(
+        splines: np.ndarray, node: np.ndarray, share: np.ndarray, begin: np.ndarray, side: int
+    ) -> np.ndarray:
+        """Return the coefficients (n, side, side) of the splines at the positions of n stars.
+
+        They are the means of the splines of k nodes `node` (n, k), weighted by `share` (n, k),
+        from the column and row `begin` (n, 2) on.
+        """
+        # One star at a time: each needs another part of its splines.
+        squares = np.empty((len(node), side, side))
+        for star, (column, row) in enumerate(begin.tolist()):
+            square = np.s_[row : row + side, column : column + side]
+            squares[star] = share[star, 0] * splines[node[star, 0]][square]
+            for corner in range(1, node.shape[1]):
+                squares[star] += share[star, corner] * splines[node[star, corner]][square]
+        return squares
+
+    def _nodes(self, centre: np.ndarray, flux: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers (n, 4 or 12) of the nodes around each star, and their weights."""
+        # Along each axis: the nodes below and above, and their weights.
+        axes = []
+        for nodes, position in ((self.columns, centre[:, 0]), (self.rows, centre[:, 1])):
+            lower = np.clip(np.searchsorted(nodes, position) - 1, 0, max(len(nodes) - 2, 0))
+            upper = np.minimum(lower + 1, len(nodes) - 1)
+            width = np.maximum(nodes[upper] - nodes[lower], 1.0)
+            # Beyond the grid the PSF is that at its edge.
+            fraction = np.clip((position - nodes[lower]) / width, 0.0, 1.0)
+            axes.append((np.stack([lower, upper]), np.stack([1.0 - fraction, fraction])))
+        # Four corners: weights are products of those along the axes.
+        (column, column_share), (row, row_share) = axes
+        number = row[:, None] * len(self.columns) + column[None]
+        share = row_share[:, None] * column_share[None]
+        number, share = number.reshape(4, -1).T, share.reshape(4, -1).T
+        if not self.magnitudes.size:
+            return number, share
+        # Parabola through the PSFs at the magnitudes t = −1, 0 and 1 (Lagrange's weights).
+        middle, step = self.magnitudes[1], self.magnitudes[2] - self.magnitudes[1]
+        t = np.nan_to_num(np.clip((magnitude(flux) - middle) / step, -1.0, 1.0))
+        weight = np.stack([0.5 * t * (t - 1.0), 1.0 - t**2, 0.5 * t * (t + 1.0)], axis=1)
+        layer = len(self.columns) * len(self.rows) * np.arange(3)
+        number, share = number[:, None] + layer[:, None], weight[:, :, None] * share[:, None]
+        return number.reshape(-1, 12), share.reshape(-1, 12)
+
+
+def knot_weights(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights (…, 4) of the cubic B-splines around a position, and their slopes.
+
+    `phase` (…) is the fraction t of the way from a knot to the next one. The four B-splines that
+    are not 0 there are, times 6, (1 − t)³, 3t³ − 6t² + 4, the same of 1 − t, and t³.
+    """
+    # Slopes are the derivatives by t: −3u²/6 = −u²/2, (9t² − 12t)/6 = (3t² − 4t)/2, and so on.
+    t, u = phase[..., None], 1.0 - phase[..., None]
+    weights = [u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]
+    slopes = [-(u**2), 3 * t**2 - 4 * t, 4 * u - 3 * u**2, t**2]
+    return np.concatenate(weights, axis=-1) / 6.0, np.concatenate(slopes, axis=-1) / 2.0

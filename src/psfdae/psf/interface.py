@@ -1,0 +1,319 @@
+"""`FieldPsfs`: the PSF at every position of an image, from psfdae or from another program."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias
+
+import numpy as np
+from pydantic import Field
+
+from psfdae.base.arguments import check_arguments, real_numbers
+from psfdae.base.errors import Error
+from psfdae.photometry.image_photometry import ImageFluxes
+from psfdae.stars.moments import measure_shapes
+
+if TYPE_CHECKING:
+    from photutils.psf import GriddedPSFModel
+
+    from psfdae.image.observation import Observation
+    from psfdae.psf.wings import Wings
+
+
+class _Array(Protocol):
+    """Object that numpy can make an array of."""
+
+    def __array__(self) -> np.ndarray: ...
+
+
+Numbers: TypeAlias = float | Sequence[float] | _Array
+"""Number, or several; `ArrayLike` would include texts."""
+
+
+NodeCount: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+"""Number of positions along an axis."""
+
+Oversampling: TypeAlias = Annotated[int, Field(ge=1, le=32)]
+"""Values per pixel; memory grows as the square, and no PSF has structure at a 32nd of a pixel."""
+
+
+class PredictionError(Error, ValueError):
+    """Stars or positions that a model cannot be applied to; one line with what it takes instead.
+
+    Examples
+    --------
+    >>> try:
+    ...     model.predict(np.ones((1, 9, 9)))
+    ... except psfdae.PredictionError as error:
+    ...     print(error)
+    stamps of shape 1×9×9, but the model 'array' takes n×16×16
+    """
+
+
+class FieldPsfs(ImageFluxes, ABC):
+    """PSF at every position of an image, and quantities that follow from it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the model.
+    stamp_px : int
+        Side d of the stamps in which PSFs have the sum 1, even.
+    """
+
+    name: str
+    stamp_px: int
+
+    @property
+    @abstractmethod
+    def sha256(self) -> str:
+        """Checksum of the model."""
+
+    @property
+    @abstractmethod
+    def order(self) -> int:
+        """Order of the polynomial of the PSF over the field; raises as `psf_at`."""
+
+    @property
+    @abstractmethod
+    def image_px(self) -> tuple[int, int] | None:
+        """Columns and rows of the image that the model was trained on, if known."""
+
+    def flux_error(self, place: np.ndarray) -> np.ndarray:
+        """Return the errors of fluxes on a known sky that are due to the model, over the flux.
+
+        Parameters
+        ----------
+        place : ndarray, shape (n, 2)
+            x and y of the stars.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            0 if the errors of the model are not known.
+        """
+        return np.zeros(len(place))
+
+    @property
+    def wings(self) -> Wings | None:
+        """Light of stars beyond their stamps, if it was measured."""
+        return None
+
+    @abstractmethod
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+
+    @property
+    def magnitude_range(self) -> tuple[float, float] | None:
+        """Lowest and highest magnitude with which the PSF changes; None if it does not."""
+        return None
+
+    @abstractmethod
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
+        """Raise PredictionError if pixels have not the size of the model's.
+
+        `source` names the image in the message.
+        """
+
+    def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
+        """Return the model in the pixel coordinates of an image of a part of the detector.
+
+        Returns
+        -------
+        model : FieldPsfs
+            The same where the headers do not show the place (`psfdae.image.detector_frame`).
+        notes : list of str
+            A sentence on an image of another size or place than the training's.
+
+        Raises
+        ------
+        PredictionError
+            If the headers show another binning, or a mirrored image.
+        """
+        return self, []
+
+    def residual_variance(self, side_px: int) -> float:
+        """Return the mean variance of training stars about their PSF, over the flux squared.
+
+        Parameters
+        ----------
+        side_px : int
+            Odd side of the square of pixels about a star.
+
+        Returns
+        -------
+        float
+            NaN if it is not known.
+        """
+        return np.nan
+
+    @abstractmethod
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        """Return PSFs (n, m, m) as `psf_at`, at checked positions (n, 2) to (n, 4).
+
+        Columns are x, y, magnitude and colour; NaN stands for an average over the training stars.
+        """
+
+    @check_arguments
+    def psf_at(
+        self,
+        x: Numbers,
+        y: Numbers,
+        oversampling: Oversampling = 4,
+        *,
+        mag: Numbers | None = None,
+        colour: Numbers | None = None,
+    ) -> np.ndarray:
+        """Return PSFs at positions of the training image, where no star need be.
+
+        Parameters
+        ----------
+        x, y : float or array, shape (n,)
+            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
+        oversampling : int
+            Values per pixel and axis; each is what a whole pixel there would get.
+        mag, colour : float or array, shape (n,), optional
+            Instrumental magnitude −2.5 log₁₀ (flux / counts), and colour as in the star list; by
+            default the PSF is the average over those of the training stars. Beyond these stars it
+            is that of the nearest end of their range; it changes with either only where stars that
+            were left out of the training say so.
+
+        Returns
+        -------
+        ndarray, shape (m, m) or (n, m, m), float64
+            m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
+            middle of the pixel of the position. The flux is that for which a star in the middle
+            of its pixel has the sum 1 in the d × d pixels of its stamp.
+
+        Raises
+        ------
+        PredictionError
+            If the model's method knows no PSF between the stars, a number is not usable, or the
+            model has no PSF of a finite flux above 0 at a position.
+        """
+        # Columns up to the last one that is stated; NaN where a column before it is not.
+        columns = {"x": x, "y": y, "mag": mag, "colour": colour}
+        is_stated = [value is not None for value in columns.values()]
+        count = 4 if is_stated[3] else 3 if is_stated[2] else 2
+        numbers = [
+            real_numbers(name, np.nan if value is None else value, PredictionError)
+            for name, value in columns.items()
+        ]
+        position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position[..., is_stated[:count]]).all():
+            raise PredictionError(
+                "positions, mag and colour must be finite, one of each or arrays of as many"
+            )
+        # A position far outside the image may overflow, which is refused below.
+        with np.errstate(all="ignore"):
+            psfs = self.draw_psfs(position.reshape(-1, count), oversampling)
+        # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
+        # give anything.
+        flux = psfs.sum(axis=(1, 2))
+        is_usable = np.isfinite(flux) & (flux > 0)
+        if not is_usable.all():
+            x0, y0 = position.reshape(-1, count)[np.argmin(is_usable)][:2]
+            raise PredictionError(
+                f"the model {self.name!r}: damaged, or far outside its image: no PSF of a "
+                f"finite flux above 0 at x {x0:.6g}, y {y0:.6g}"
+            )
+        return psfs if position.ndim == 2 else psfs[0]
+
+    def on_pixels(self, position: np.ndarray) -> np.ndarray:
+        """Return PSFs (n, d, d) in the pixels of the image, at positions (n, 2) or (n, 3).
+
+        A third column has the magnitudes; see `psf_at`.
+        """
+        x, y, *mag = position.T
+        return self.psf_at(x, y, 1, mag=mag[0] if mag else None)
+
+    @check_arguments
+    def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
+        """Return the flux of a star over its light within an aperture.
+
+        The flux is all light within `wings.radius_px[-1]`, or without wings that in the stamp.
+
+        Parameters
+        ----------
+        x, y : float
+            Centre of star and aperture, 0-based pixel coordinates.
+        radius_px : float
+            Radius of the aperture.
+
+        Raises
+        ------
+        ValueError
+            If the radius is not above 0, or is larger than that of the flux.
+        PredictionError
+            As `psf_at`.
+        """
+        from psfdae.psf.wings import aperture_correction
+
+        return aperture_correction(self, self.wings, x, y, radius_px)
+
+    @check_arguments
+    def grid(self, columns: NodeCount, rows: NodeCount) -> np.ndarray:
+        """Return positions (n, 2), x and y, evenly over the field; raises as `field_range`."""
+        # Rows of the grid follow each other: x changes fastest.
+        low, high = self.field_range()
+        x, y = (np.linspace(low[i], high[i], count) for i, count in ((0, columns), (1, rows)))
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+    def fwhm_px(self) -> float:
+        """Return the FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        # In the middle of a pixel, so that the FWHM does not depend on a phase.
+        x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
+        return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
+
+    @check_arguments
+    def to_photutils(self, nodes: NodeCount = 9, oversampling: Oversampling = 4) -> GriddedPSFModel:
+        """Return the field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
+
+        Its PSFs have an odd number of values along an axis.
+
+        Parameters
+        ----------
+        nodes : int
+            Positions along either axis, over the field of the training stars.
+        oversampling : int
+            Values per pixel and axis.
+
+        Raises
+        ------
+        PredictionError
+            As `psf_at`.
+        """
+        from astropy.nddata import NDData
+
+        from psfdae.psf.grid import PsfGrid
+
+        # photutils takes PSFs on a regular grid, x changing fastest, and interpolates between them.
+        grid = PsfGrid.of(self, nodes, oversampling)
+        positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
+        meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
+        model_class = grid_class(f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}")
+        return model_class(NDData(grid.psfs.reshape(-1, *grid.psfs.shape[2:]), meta=meta))
+
+
+@cache
+def grid_class(name: str) -> type[GriddedPSFModel]:
+    """Return a class of photutils' `GriddedPSFModel` with a name of its own.
+
+    photutils 3.0 fits groups with the first model of a class, so that each model has its class.
+    """
+    from photutils.psf import GriddedPSFModel
+
+    # A class that is made at run time is pickled as its name.
+    return type(name, (GriddedPSFModel,), {"__reduce__": reduce_grid})
+
+
+def reduce_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
+    """Return what pickle stores of a grid: how to make one without values, and its values."""
+    return blank_grid, (type(grid).__name__,), vars(grid)
+
+
+def blank_grid(name: str) -> GriddedPSFModel:
+    """Return an object of the class `grid_class(name)` without values, for unpickling."""
+    return object.__new__(grid_class(name))

@@ -1,0 +1,1 @@
+"""Held-out validation: checks, figures and the report page."""

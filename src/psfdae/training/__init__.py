@@ -1,0 +1,1 @@
+"""From an image to a training set, the fit, its calibration, and models of exposures."""

@@ -1,0 +1,213 @@
+"""Fit of a model to the bright stars of images: choice of a method, fit, errors, wings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from psfdae.base.arguments import check_arguments
+from psfdae.base.errors import needed_by
+from psfdae.base.rng import stream
+from psfdae.base.settings import ConfigError
+from psfdae.base.threads import fixed_threads
+from psfdae.denoise.star_model import PsfModel
+from psfdae.methods import groups_of
+from psfdae.methods import method as method_of
+from psfdae.methods.fit_files import described_by
+from psfdae.methods.interface import Method
+from psfdae.photometry.image_photometry import measure_stars
+from psfdae.photometry.photon_noise import with_measured_gain
+from psfdae.psf.wings import Wings
+from psfdae.training.packing import model_of, with_wings
+from psfdae.training.settings import with_keywords
+from psfdae.training.star_choice import ENOUGH_STARS
+from psfdae.training.star_sets import field_positions, fit_apart, noise_model
+from psfdae.training.stars import Stars
+
+Kind = TypeVar("Kind", bound=Method)
+
+
+@check_arguments
+def fit(
+    stars: Stars,
+    method: str | None = None,
+    *,
+    name: str | None = None,
+    licence: str = "not stated",
+    **settings: object,
+) -> PsfModel:
+    """Train a model on the bright stars of images, without those that are held out.
+
+    Parameters
+    ----------
+    stars : Stars
+    method : str, optional
+        "gmm", "field" or "dae"; by default, of the methods in the settings, the one with the
+        smallest error on validation stars, or "field" where stars are few.
+    name : str, optional
+        Name of the model; by default the image's.
+    licence : str
+        Licence of the model.
+    **settings
+        Keys of the method's settings, such as `orders=[0, 1, 2]` for "field".
+
+    Returns
+    -------
+    PsfModel
+        `save` writes it to a file.
+
+    Raises
+    ------
+    Error
+        If the method's fits cannot be saved as a model, a package is missing, or a setting is
+        wrong.
+
+    Examples
+    --------
+    >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
+    PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
+    """
+    # Candidates: the stated method, or all of the settings of which one becomes the model.
+    names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
+    for method_name in names:
+        if not makes_models(method_name):
+            raise ConfigError(f"method {method_name!r}: makes no model of an image")
+    candidates = worth_trying(stars, [method_of(method_name) for method_name in names])
+    # Keywords belong to the settings of the candidates; no setting of a method changes the stars.
+    groups = [group for candidate in candidates for group in candidate.groups]
+    stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
+    # With several fits, validation stars decide.
+    fits = {candidate.name: fitted_to(stars, candidate) for candidate in candidates}
+    chosen_name = next(iter(fits)) if len(fits) == 1 else choose_method(stars, fits)[0]
+    return pack_model(stars, fits[chosen_name], name or stars.name, licence)
+
+
+def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
+    """Return the methods that may become the model: for few stars, "field" alone.
+
+    Too few stars are left to choose a method by validation, and only the method "field" falls back
+    to one PSF for all stars.
+    """
+    # Without the field among them, all are tried, however few the stars are.
+    field = [kind for kind in kinds if kind.name == "field"]
+    return field if field and len(stars) < ENOUGH_STARS else [*kinds]
+
+
+def makes_models(name: str) -> bool:
+    """Return True if a method makes a model of an image that can be saved."""
+    kind = method_of(name)
+    return kind.storage is not None and kind.packing is not None
+
+
+def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
+    """Fit a method to the stars that are not held out.
+
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+    checkpoint : Path, optional
+        File for the state of a long fit, from which it goes on if it was interrupted.
+
+    Raises
+    ------
+    MissingExtraError
+        If the method needs a package that is not installed.
+    """
+    # The stars as the method takes them: of the image, without those that are held out.
+    data = stars.training_set(kind, checkpoint=checkpoint)
+    with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
+        return kind.fit(data, **kind.settings(stars.settings))
+
+
+def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
+    """Return the settings that determine a fit, for the description of its product and model.
+
+    Parameters
+    ----------
+    stars : Stars
+    kind : type of Method
+        The fitted method, whose groups of settings count beside split and truth.
+    """
+    group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
+    return described_by(kind, group_settings, Stars.split_kind, Stars.reference)
+
+
+def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
+    """Choose the method with the smallest error on validation stars, unseen by what is judged.
+
+    Parameters
+    ----------
+    stars : Stars
+    fits : mapping of str to Method
+        Fits to these stars, by name of the method.
+
+    Returns
+    -------
+    name : str
+        Name of the chosen method.
+    errors : dict of str to float
+        MSE of PSFs of flux 1 by method: the geometric mean over the noise levels, so that every
+        S/N counts alike.
+    """
+    # Every method restores the same bright stars, degraded with the same noise.
+    settings, product, validation = stars.settings, stars.product, stars.split.validation
+    truth, positions = product["realisation"][validation], field_positions(product)[validation]
+    errors = {}
+    for name, fitted in fits.items():
+        judged, kind = fitted, type(fitted)
+        data = stars.training_set(kind)
+        with fixed_threads(kind.threads(settings)):
+            # A method without a need of validation stars has learnt from them as well: what is
+            # judged is a fit without them. One that needs them, to stop, has not.
+            if not kind.needs.validation:
+                judged = fit_apart(kind, data, product["field_index"], settings)
+            rng = stream(settings.seed, "noise", "own stars")
+            noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
+            # Stars to which the model will be applied have an unknown flux: it is free here.
+            restorer = judged.free_flux()
+            # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
+            log_mse = []
+            for images, level in zip(noisy, data.levels, strict=True):
+                psf = restorer.estimate(images, level, positions, with_sigma=False).psf
+                psf = psf / psf.sum(axis=(1, 2), keepdims=True)
+                log_mse.append(np.log(np.square(psf - truth).mean()))
+        errors[name] = float(np.exp(np.mean(log_mse)))
+    return min(errors, key=errors.__getitem__), errors
+
+
+def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
+    """Return the model of a fit with its errors on held-out stars, and with wings.
+
+    Wings are there if the method knows the field, and an image shows any.
+
+    Parameters
+    ----------
+    stars : Stars
+    fitted : Method
+        Fit to these stars.
+    name, licence : str
+        Name and licence of the model.
+    """
+    # Calibrate the errors of the fit on held-out stars.
+    settings = stars.settings
+    description = described(stars, type(fitted))
+    with fixed_threads(settings.evaluation.threads):
+        model = model_of(
+            fitted, stars.product, Stars.reference, settings, description, name, licence
+        )
+        if not fitted.knows_field or stars.observation.shape is None:
+            return model
+        # Light outside the stamps, as the photometry of each image with this model measures it:
+        # `flux_total` of a star and its flux by photometry are the same.
+        wings = []
+        for image in stars.images:
+            observation = with_measured_gain(model, image.observation.assuming())
+            photometry, _ = measure_stars(model, observation, image.source.given_threshold)
+            wings += [] if photometry.image_wings is None else [photometry.image_wings]
+    if not wings:
+        return model
+    return PsfModel(with_wings(model.bundle, Wings.joined(wings)), model.method)

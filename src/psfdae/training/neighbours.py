@@ -1,0 +1,160 @@
+"""Bright stars of a crowded image after the light of their neighbours is subtracted.
+
+Where many bright stars have a neighbour, a model of the field is made of those that have none. All
+stars are then fitted with it, and in the stamp of each star the light of all others is subtracted.
+Stars whose neighbours are further away than about a FWHM can then be used for the training.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from psfdae.base.errors import Error
+from psfdae.image.selection import collect
+from psfdae.image.stamps import cut_image
+from psfdae.methods.field import FieldMixture
+from psfdae.photometry import crowded
+from psfdae.psf.grid import PsfGrid
+from psfdae.psf.interface import FieldPsfs
+from psfdae.training.fitting import fitted_to
+from psfdae.training.star_residuals import reject_misfits
+from psfdae.training.stars import Stars, stars_of_candidates
+
+
+class _Field(FieldPsfs):
+    """PSF over the field of a fit, without the errors that a model in a bundle has.
+
+    Parameters
+    ----------
+    fitted : FieldMixture
+    stamp_px : int
+        Side of the stamps that the fit was made of.
+    """
+
+    name, image_px = "of stars without neighbours", None
+
+    def __init__(self, fitted: FieldMixture, stamp_px: int) -> None:
+        self.fitted, self.stamp_px = fitted, stamp_px
+
+    @property
+    def order(self) -> int:
+        return self.fitted.order
+
+    @cached_property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
+
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.fitted.low[:2], self.fitted.high[:2]
+
+    @property
+    def magnitude_range(self) -> tuple[float, float] | None:
+        low, high = self.fitted.low.tolist(), self.fitted.high.tolist()
+        return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
+
+    def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
+        """Accept any scale: the fit is used on its own image."""
+
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        return self.fitted.psf_at(position, oversampling)
+
+
+def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
+    """Choose the bright stars of an image again, with the light of all other stars subtracted.
+
+    Parameters
+    ----------
+    stars : Stars
+        Bright stars of one image. If they were chosen in spite of neighbours that are brighter than
+        `neighbour_ratio`, they start a second round.
+    neighbour_ratio : float
+        Largest brightness of an accepted neighbour, over that of the star.
+
+    Returns
+    -------
+    Stars
+        The stars as they were, with a note that tells why, if their image cannot be fitted.
+    """
+    # The new choice has the stated limit on neighbours, and a nearer one on their distance.
+    observation, notes = stars.observation, stars.notes
+    accepted_ratio = stars.settings.calibration_stars.neighbour_ratio
+    calibration = stars.settings.calibration_stars.model_copy(
+        update={"neighbour_ratio": neighbour_ratio}
+    )
+    settings = stars.settings.model_copy(update={"calibration_stars": calibration})
+    assert observation.positions is not None
+    for _ in range(2 if accepted_ratio > neighbour_ratio else 1):
+        # A field from the stars so far, photometry of all stars with it, and a new choice of
+        # bright stars in the cleaned image.
+        field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
+        try:
+            photometry = crowded.photometry(field, observation)
+            # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
+            isolation_px = 1.25 * field.fwhm_px()
+            light = light_of_others(photometry, observation.positions)
+            cleaned = replace(observation, neighbour_light=light)
+            candidates = collect(cleaned, calibration, settings.framing, isolation_px)
+            candidates = reject_misfits(candidates, settings, cleaned.gain)
+            isolated = stars_of_candidates(stars.source, cleaned, candidates, settings)
+        except Error as error:
+            note = f"neighbours: their light was not subtracted ({error})"
+            return replace(stars, notes=(*stars.notes, note))
+        # The next round starts from these stars, on the image as it was.
+        message = (
+            f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
+            f"stamps; bright stars before: {len(stars)}, no neighbour above "
+            f"{100 * accepted_ratio:g} % of their brightness within {calibration.isolation_px:g} "
+            f"px; now: {len(isolated)}, none above {100 * neighbour_ratio:g} % within "
+            f"{isolation_px:.2g} px"
+        )
+        stars = replace(isolated, observation=observation)
+        notes = (*isolated.notes, message)
+    return replace(stars, notes=notes)
+
+
+def light_of_others(
+    photometry: crowded.CrowdedPhotometry, listed: np.ndarray
+) -> Callable[[slice, int, int], np.ndarray]:
+    """Return a function that gives the light of all stars but the one in the middle of a stamp.
+
+    Parameters
+    ----------
+    photometry : CrowdedPhotometry
+    listed : ndarray, shape (n, 2)
+        Positions of a star list, x and y.
+
+    Returns
+    -------
+    callable
+        Its arguments are a slice of the list, the side of the stamps and the margin around them, as
+        `psfdae.image.stamps.cut_image` takes them. It returns the light (m, s, s), s with both
+        margins.
+    """
+    from scipy.spatial import cKDTree
+
+    # Fluxes without the wings, which belong to no stamp alone.
+    stars = photometry.stars
+    centre = np.stack([stars["x"], stars["y"]], axis=1)
+    flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model, by_magnitude=True)
+    measured = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
+    # The fitted star of each star of the list; none is within 1.5 px of a star without position.
+    distance, nearest = cKDTree(centre[measured]).query(np.nan_to_num(listed, nan=-np.inf))
+
+    # The fit has the light of all stars in one image; a list asks for it a part at a time.
+    def light(rows: slice, stamp_px: int, margin: int) -> np.ndarray:
+        x, y = listed[rows].T
+        stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]
+        # The light of all fitted stars, minus that of the star itself.
+        fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
+        star = measured[nearest[rows][fitted_rows]]
+        corner = np.rint(listed[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
+        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1], flux[star])[:, 0]
+        stamps[fitted_rows] -= flux[star, None, None] * star_light
+        return stamps
+
+    return light

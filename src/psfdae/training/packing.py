@@ -1,0 +1,319 @@
+"""Packing of a fit: a model with its errors on test stars and all that it takes to apply it.
+
+In go a fitted method and the product "stars" that it was fitted to; out comes a `PsfModel`, which
+a bundle keeps. Errors of the model are found in `psfdae.training.calibration`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from psfdae.base.files import Product, ProductError
+from psfdae.base.rng import stream
+from psfdae.base.settings import OfTest
+from psfdae.base.version import __version__
+from psfdae.denoise.bundle import Bundle, BundleError, creation_date, estimator
+from psfdae.denoise.error_model import ErrorModel
+from psfdae.denoise.flux_model import FluxModel, signal_to_noise
+from psfdae.denoise.star_model import PsfModel
+from psfdae.methods.bundle_info import BundleInfo
+from psfdae.methods.interface import Method
+from psfdae.methods.metrics import all_metrics
+from psfdae.psf.wings import Wings
+from psfdae.training.calibration import (
+    StarErrors,
+    calibrated,
+    crossed_coverage,
+    noise_nodes,
+    with_misfit,
+    with_model_errors,
+    with_training_stars,
+)
+from psfdae.training.star_sets import HeldOutStars, ModelStars, noisy_test_images
+
+
+def model_of(
+    fitted: Method,
+    stars: Product,
+    reference: str,
+    config: OfTest,
+    trained: Mapping[str, Any],
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+) -> PsfModel:
+    """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
+
+    Parameters
+    ----------
+    fitted : Method
+    stars : product "stars"
+        Stars of the fit.
+    reference : "realisation" or "template"
+        What is restored.
+    config : settings (seed, noise, parts, evaluation)
+    trained : mapping
+        Settings of the fit, and its "split".
+    name, licence : str
+    largest_mb : float, optional
+        Size of the arrays, for which a mixture leaves out fine axes.
+
+    Raises
+    ------
+    BundleError
+        If it cannot be that small.
+    """
+    bundle, model_stars = uncalibrated(
+        fitted, stars, reference, config, trained, name, licence, largest_mb
+    )
+    held_out = model_stars.held_out
+    unpacked = estimator(bundle)  # errors are those of the fit as it is packed
+    rng = stream(config.seed, "noise", "calibration", "misfit")
+    bundle = with_misfit(bundle, unpacked, held_out, rng)
+    if fitted.knows_field:
+        bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
+    # Errors on test stars; in an image, limits of outliers by its training stars, too.
+    bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
+    bundle = with_training_stars(PsfModel(bundle, unpacked), model_stars)
+    # Metrics of test stars at the noise levels of the configuration.
+    noisy = (
+        (level, noisy_test_images(config, stars, model_stars.test, level))
+        for level in config.noise.levels
+    )
+    area, data_range = bundle.info.noise_equivalent_px, config.evaluation.data_range
+    metrics = metrics_by_level(unpacked, held_out, noisy, errors, area, data_range)
+    settings = {**bundle.info.config, "evaluation": config.evaluation.model_dump()}
+    info = bundle.info.model_copy(update={"metrics": metrics, "config": settings})
+    return PsfModel(replace(bundle, info=info), unpacked)
+
+
+def uncalibrated(
+    fitted: Method,
+    stars: Product,
+    reference: str,
+    config: Any,
+    trained: Mapping[str, Any],
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+    components: int = 48,
+) -> tuple[Bundle, ModelStars]:
+    """Return a fit with all that it takes to apply it, but its errors, and the stars for these.
+
+    Parameters are those of `model_of`; of the settings, seed, noise and parts are enough.
+    `components` is the number of leading eigenvectors of the flux model that the bundle stores.
+
+    Returns
+    -------
+    bundle : Bundle
+        Its errors are 0, and fluxes are measured as if the method knew every shape.
+    model_stars : ModelStars
+        Those of the fit, and test stars, by which the errors are to be calibrated.
+    """
+    stamp_fields = _stamp_fields(stars)
+    stamp_px = stamp_fields["stamp_px"]
+    model_stars = ModelStars.of(stars, trained["split"], reference, config)
+    images, noise = model_stars.images, model_stars.held_out.noise
+    # The flux model, its variance beyond the leading eigenvectors spread evenly.
+    flux_model = leading(FluxModel.fit(images), components)
+    # Range of noise, as pixel RMS over the flux, and of S/N.
+    band, area = noise.kappa * np.asarray(config.noise.levels), model_stars.noise_equivalent_px
+    least_noise, greatest_noise = float(band.min()), float(band.max())
+    arrays, method_fields = packed(fitted, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
+    # Everything that is needed to apply the method, and to know what it was trained on.
+    info = BundleInfo(
+        psfdae_version=__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        **stamp_fields,
+        kappa=noise.kappa,
+        noise_min=least_noise,
+        noise_max=greatest_noise,
+        snr_min=float(f"{signal_to_noise(greatest_noise, area):.6g}"),
+        snr_max=float(f"{signal_to_noise(least_noise, area):.6g}"),
+        noise_equivalent_px=area,
+        components=components,
+        training_sha256=checksum(images, model_stars.references),
+        training_stars=len(model_stars.stars),
+        method=fitted.name,
+        reference=reference,
+        **method_fields,
+        config={"stars": stars.config, "train": dict(trained)},
+        metrics=[],
+    )
+    # Errors are 0 until they are measured.
+    nodes = noise_nodes(band)
+    blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
+    bundle = Bundle(info, arrays, flux_model, ErrorModel.uncalibrated(nodes, blank))
+    return bundle, model_stars
+
+
+def _stamp_fields(product: Product) -> dict[str, Any]:
+    """Return the keys of a bundle on stamps, from the configuration of the stars.
+
+    Raises
+    ------
+    ProductError
+        If the description of the stars lacks a key.
+    """
+    config = product.config
+    try:
+        # Simulated stars have a telescope with a diameter; of an image, only its scale is known.
+        telescope, framing = config["telescope"], config["framing"]
+        # Width of a pixel in λ/D, if the aperture is known.
+        pixel_lambda_d = None
+        if "diameter_m" in telescope:
+            diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
+            pixel_rad = float(np.deg2rad(telescope["pixel_scale_arcsec"] / 3600.0))
+            pixel_lambda_d = pixel_rad / diffraction
+        return {
+            "stamp_px": product["realisation"].shape[-1],
+            "pixel_scale_arcsec": telescope["pixel_scale_arcsec"],
+            "pixel_lambda_d": pixel_lambda_d,
+            "jitter_px": framing["jitter_px"],
+            "subpixel": framing.get("subpixel", False),
+            "source": config.get("source", "simulated"),
+        }
+    except KeyError as error:
+        raise ProductError(f"{product.path}: its configuration lacks {error}") from None
+
+
+def packed(
+    fitted: Method, stamp_px: int, noise: float, largest: float
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return arrays of a fit for this noise, or for the least above it that takes few bytes.
+
+    Parameters
+    ----------
+    fitted : Method
+    stamp_px : int
+    noise : float
+        Least pixel RMS over the flux that the arrays are for.
+    largest : float
+        Bytes of the arrays at most.
+
+    Returns
+    -------
+    arrays : dict of ndarray
+    fields : dict
+        Fields of `BundleInfo` that describe them.
+
+    Raises
+    ------
+    BundleError
+        If it takes more than the largest number of bytes in any case.
+    """
+    # Steps of the noise up to that of the flux in every pixel.
+    count = 64
+    # Axes that are finer than the noise cannot be seen: the more noise, the fewer bytes.
+    noises = np.geomspace(noise, max(1.0, noise), count)
+
+    @cache
+    def arrays_of(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return fitted.pack(stamp_px, float(noises[step]))
+
+    def is_small(step: int) -> bool:
+        return sum(array.nbytes for array in arrays_of(step)[0].values()) <= largest
+
+    # Mostly the first one will do, and each takes a while.
+    least_step = 0 if is_small(0) else bisect_left(range(count), True, key=is_small)
+    if least_step == count:
+        raise BundleError(f"{fitted.look.label}: takes more than {largest / 1e6:.2g} MB")
+    return arrays_of(least_step)
+
+
+def leading(model: FluxModel, components: int) -> FluxModel:
+    """Return the model with the variance beyond its leading eigenvectors spread evenly.
+
+    Parameters
+    ----------
+    model : FluxModel
+        With a full basis; eigenvalues ascend.
+    components : int
+        Number of leading eigenvectors whose variance stays.
+    """
+    variance = model.variance.copy()
+    trailing = variance[: variance.size - components]
+    if trailing.size:
+        trailing[:] = trailing.sum() / trailing.size
+    return replace(model, variance=variance)
+
+
+def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
+    """Return the bundle of a field model with the light of stars beyond their stamps."""
+    info = bundle.info
+    # As plain numbers in the description.
+    settings = info.config | {"wings": wings.plain()}
+    return replace(bundle, info=info.model_copy(update={"config": settings}))
+
+
+def metrics_by_level(
+    fitted: Method,
+    stars: HeldOutStars,
+    noisy: Iterable[tuple[float, np.ndarray]],
+    errors: StarErrors,
+    area: float,
+    data_range: float,
+) -> list[dict[str, float]]:
+    """Measure errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
+
+    Parameters
+    ----------
+    fitted : Method
+    stars : HeldOutStars
+    noisy : iterable of (float, ndarray)
+        Each λ with noisy images of all test stars, shape (n, d, d).
+    errors : StarErrors
+        Errors of the same stars at the noise nodes.
+    area : float
+        Noise-equivalent area of a typical star, in pixels.
+    data_range : float
+        Range of values of the metrics (`psfdae.methods.metrics.all_metrics`).
+
+    Returns
+    -------
+    list of dict
+        A row of mean metrics for each level, in their order.
+    """
+    # Coverage is measured crosswise: on stars by the errors that the other stars show.
+    rows, covered = [], crossed_coverage(errors)
+    for level, images in noisy:
+        noise, estimate = stars.noise.kappa * level, fitted.estimate(images, level, stars.position)
+        # Errors of the restored stars, and of the noisy images as a reference.
+        quality = all_metrics(estimate.psf, stars.references, data_range)
+        rows.append(
+            {
+                "noise_level": level,
+                "noise": noise,
+                "snr": signal_to_noise(noise, area),
+                "mse_noisy": float(np.square(images - stars.references).mean()),
+                **{name: float(values.mean()) for name, values in quality.items()},
+                **covered(stars.errors(estimate.psf, unit=estimate.sigma), noise),
+                "stars": len(images),
+            }
+        )
+    return rows
+
+
+def checksum(images: np.ndarray, references: np.ndarray) -> str:
+    """Return the SHA-256 of training stars and of what was to be learnt from them.
+
+    Parameters
+    ----------
+    images, references : ndarray, shape (n, d, d)
+        Type, shape and bytes of both count.
+    """
+    # Arrays of the same bytes but another type or shape are different.
+    digest = hashlib.sha256()
+    for array in (images, references):
+        digest.update(f"{array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
