@@ -32,7 +32,7 @@ import yaml
 
 from psfdae.commands.cli import as_click, command_modules, sections, stage
 from psfdae.image.camera import HEADER_KEYS
-from psfdae.image.image_input import ImageStatements
+from psfdae.image.image_input import ImageOptions
 from psfdae.methods import all_methods
 from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import Alignment
@@ -225,7 +225,7 @@ def image_statements():
             "option": options[field.name].opts[0],
             "meaning": options[field.name].help,
         }
-        for field in fields(ImageStatements)
+        for field in fields(ImageOptions)
     )
 
 

@@ -13,7 +13,7 @@ from image_training import Training
 from job_server import job_server
 from prediction_stars import fresh_psfs, gaussians, with_network
 from psfdae import load_model
-from psfdae.denoise.star_model import PsfModel
+from psfdae.api import PsfModel
 from psfdae.optics.pupil import annular_pupil
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.alignment.stamps import AlignmentStamps

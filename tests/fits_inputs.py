@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
+from psfdae.image import opening
 from psfdae.image.image_input import ImageInput
 from psfdae_paper.stars import example
 
 
 def open_observation(path, stamp_px, margin=0, **stated):
-    return ImageInput(Path(path), **stated).open(stamp_px, margin)
+    return opening.open_observation(ImageInput(Path(path), **stated), stamp_px, margin)
 
 
 def write_cube(path, stamps, compress=False, **cards):

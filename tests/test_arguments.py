@@ -13,7 +13,8 @@ import pytest
 import psfdae
 import small_field
 from image_training import few_draws
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
+from psfdae.image.opening import open_observation
 from psfdae.report.validation import Report
 from psfdae_paper.configuration.base import config_dir
 
@@ -75,7 +76,7 @@ def image():
 
 
 def test_all_statements_are_tested():
-    assert {field.name for field in fields(ImageStatements)} == {*STATEMENTS}
+    assert {field.name for field in fields(ImageOptions)} == {*STATEMENTS}
     assert {field.name for field in fields(ImageInput)} - {"image"} <= {*KINDS}
 
 
@@ -170,7 +171,7 @@ def test_the_line_names_the_argument_and_what_is_expected(image):
 def test_numbers_of_numpy_are_numbers(image):
     pixels, place = image
     numbers = {"gain": np.float32(1.5), "saturate": np.int64(60000), "accept_offset": np.True_}
-    observation = ImageInput.of(pixels, {"catalogue": place, **numbers}).open(16)
+    observation = open_observation(ImageInput.of(pixels, {"catalogue": place, **numbers}), 16)
     assert (observation.gain, observation.saturate) == (1.5, 60000)
 
 

@@ -14,6 +14,7 @@ from image_training import SIZES
 from psfdae import PsfModel, StarFlag
 from psfdae.denoise.image_prediction import other_instrument
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
 from psfdae.methods.field_spline import FieldModel
@@ -215,6 +216,6 @@ def test_colours_are_those_of_the_list_and_of_another_column_are_named(
     stars = psfdae.Stars.from_image(training.image, listed, **words, **SIZES)
     bright = stars.candidates.bright
     assert bright.colour == pytest.approx(np.asarray(listed[column])[bright.row])
-    observation = ImageInput(training.image, catalogue=listed, **words).open(16)
+    observation = open_observation(ImageInput(training.image, catalogue=listed, **words), 16)
     instrument_note = other_instrument(colourful, observation)
     assert (column in instrument_note) == mismatch == bool(instrument_note)

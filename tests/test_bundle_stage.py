@@ -11,6 +11,7 @@ import pytest
 from command_line import printed, psfdae, refused
 from prediction_stars import gaussians
 from psfdae import StarFlag
+from psfdae.api import PsfModel
 from psfdae.base.belonging import write_origin
 from psfdae.base.files import Column, ProductError, read_product, write_product
 from psfdae.denoise.bundle import (
@@ -22,7 +23,6 @@ from psfdae.denoise.bundle import (
 )
 from psfdae.denoise.error_model import at_noise, brightest, mahalanobis
 from psfdae.denoise.flux_model import FluxModel
-from psfdae.denoise.star_model import PsfModel
 from psfdae.methods import groups_of
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split

@@ -29,6 +29,8 @@ from psfdae import Error, Stars, fit
 from psfdae.commands import from_stars
 from psfdae.image.fits_file import science_images
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
+from psfdae.training.from_image import collect_stars
 from small_field import CAMERA, GAIN, READ, SIZE, SKY, TANGENT, field, header, table, write
 
 
@@ -164,7 +166,7 @@ def test_an_image_of_the_tutorials_table_gives_what_it_says(
     small.stetson([(k, x + 1, y + 1) for k, (x, y) in enumerate(place)], tmp_path / "list.als")
     if not is_trained:
         monkeypatch.setattr(
-            from_stars, "write_model", lambda a, b, *_: "\n".join(Stars.of(b, a).notes)
+            from_stars, "write_model", lambda a, b, *_: "\n".join(collect_stars(b, a).notes)
         )
     output = ""
     for option in ["", *re.findall("`(--[a-z]+[- ][^`]*)`", row[2])]:
@@ -192,7 +194,7 @@ def test_an_hdulist_of_a_file_has_its_name_and_the_same_stars(tmp_path, image, p
         from_list = Stars.from_image(hdus, catalogue=place)
     assert from_list.name == "night" and from_list.described() == from_file.described()
     unpickled = pickle.loads(pickle.dumps(from_list.source))
-    assert unpickled.open(16).sha256() == from_file.observation.sha256()
+    assert open_observation(unpickled, 16).sha256() == from_file.observation.sha256()
 
 
 @pytest.mark.parametrize("kind", [StdDevUncertainty, VarianceUncertainty, InverseVariance])
@@ -327,7 +329,7 @@ def test_versions_of_several_science_images_belong_together(tmp_path, image, bad
     fits.HDUList(hdus).writeto(tmp_path / "two.fits")
     for version, mask in ((1, bad), (2, ~bad)):
         source = ImageInput(tmp_path / "two.fits", detect=5.0, extension=f"SCI,{version}")
-        assert (source.open(16).sky().bad == mask).all()
+        assert (open_observation(source, 16).sky().bad == mask).all()
 
 
 # Headers against pixels.

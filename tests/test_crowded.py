@@ -22,11 +22,13 @@ from psfdae.base.files import read_product
 from psfdae.denoise.bundle import BundleError
 from psfdae.image.camera import CameraValue
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.stamps import cut_image
 from psfdae.photometry import crowded
 from psfdae.photometry.photon_noise import measure_gain, with_measured_gain
+from psfdae.photometry.wings_fit import StarFluxes, draw_tents, wings_of
 from psfdae.psf.grid import PsfGrid
-from psfdae.psf.wings import StarFluxes, Wings, draw_tents, wings_of
+from psfdae.psf.wings import Wings
 from psfdae.training.neighbours import light_of_others
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -85,7 +87,7 @@ def sky(tmp_path_factory):
 def phot(sky):
     """The photometry of all stars, which are looked for."""
     folder, path, _ = sky
-    observation = ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
+    observation = open_observation(ImageInput(folder / "i.fits", detect=5.0), STAMP)
     return crowded.photometry(load_model(path), observation, 5.0)
 
 
@@ -144,7 +146,9 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, phot):
     assert model.info.config["stars"] == stars.config
     light, error = model.wings.light()
     assert light == pytest.approx(phot.wings.light()[0], abs=4 * error + 0.004)
-    observation = ImageInput(folder / "i.fits", catalogue=folder / "i.csv").open(STAMP, 2)
+    observation = open_observation(
+        ImageInput(folder / "i.fits", catalogue=folder / "i.csv"), STAMP, 2
+    )
     ((_, measured),) = model.stream(observation)
     is_single = ~true["pair"] & (true["flux"] > 1e4)
     ratio = measured.flux_total[is_single] / true["flux"][is_single]
@@ -219,7 +223,10 @@ def test_the_light_of_wings_is_the_sum_over_pixels():
 def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     """Variance grows with the light of a star by 1/gain; not in an image without photon noise."""
     folder, path, true = sky
-    model, observation = load_model(path), ImageInput(folder / "i.fits", detect=5.0).open(STAMP)
+    model, observation = (
+        load_model(path),
+        open_observation(ImageInput(folder / "i.fits", detect=5.0), STAMP),
+    )
     unknown = replace(observation, camera=observation.camera | {"gain": CameraValue(None, "")})
     assert with_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
     assert with_measured_gain(model, observation) is observation
@@ -329,7 +336,7 @@ def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighb
     image = fits.getdata(folder / "i.fits") + np.random.default_rng(1).poisson(halo)
     place = np.stack([true["x"], true["y"]], axis=1)
     source = ImageInput(np.minimum(image, 6e4), catalogue=place, origin=0, gain=1.0, saturate=6e4)
-    phot = crowded.photometry(load_model(model), source.open(STAMP), 5.0)
+    phot = crowded.photometry(load_model(model), open_observation(source, STAMP), 5.0)
     distance = np.hypot(*(place - middle).T)
     near = (distance > 12) & (distance < 45) & (phot.stars["flags"] == 0)
     pull = (phot.stars["flux"] - true["flux"]) / phot.stars["flux_error"]
@@ -387,7 +394,7 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     raw = stars_of(sky)
     level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))
     saturated = stars_of(sky, saturate=level).candidates.verdict == "saturated"
-    monkeypatch.setattr("psfdae.training.stars.is_crowded", lambda _: True)
+    monkeypatch.setattr("psfdae.training.from_image.is_crowded", lambda _: True)
     clean = stars_of(sky, saturate=level)
     # Those are still seen without their neighbours.
     assert saturated.any() and (clean.candidates.verdict[saturated] == "saturated").all()

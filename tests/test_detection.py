@@ -18,6 +18,7 @@ from psfdae.image.camera import camera_values
 from psfdae.image.detection import Sky
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
 from psfdae.training.settings import from_words
 from psfdae_paper.stages import simulate
@@ -51,7 +52,7 @@ def pixels(field):
 
 
 def opened(path, **stated):
-    return ImageInput(path, **stated).open(16, 8)
+    return open_observation(ImageInput(path, **stated), 16, 8)
 
 
 # Finding

@@ -15,6 +15,7 @@ from psfdae.commands.wavefront import note_axis
 from psfdae.image.detector_frame import detector_frames, find_offset
 from psfdae.image.fits_file import array_image
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 
 SIZE, FIRST = 380, (150, 170)  # px of the training image; first column and row of the subframe
 STATISTICS = {"gain": 1.0, "read_noise": 3.0, "pixel_scale_arcsec": 0.6, "saturate": 6e4}
@@ -225,7 +226,7 @@ def test_adaptation_names_the_part_of_the_field_without_stars(image, model, axis
 def test_field_angles_of_a_subframe_do_not_count_from_its_middle_without_a_word(tmp_path, image):
     for cards, count in (({"LTV1": -FIRST[0], "LTV2": -FIRST[1]}, 1), ({}, 0)):
         path, place, _ = subframe(tmp_path, image, **cards)
-        notes = note_axis(ImageInput.of(path, {"catalogue": place}).open(16))
+        notes = note_axis(open_observation(ImageInput.of(path, {"catalogue": place}), 16))
         assert len(notes) == count and all("x 150, y 170 of the detector" in n for n in notes)
 
 

@@ -15,8 +15,9 @@ from photutils.psf import GriddedPSFModel
 from command_line import printed, psfdae, refused
 from psfdae import Error, load_model
 from psfdae.denoise.bundle import name_foreign_format
+from psfdae.denoise.field_models import load_field
 from psfdae.psf import exchange
-from psfdae.psf.exchange import PsfexField, load_field
+from psfdae.psf.exchange import PsfexField
 from psfdae.psf.interface import FieldPsfs, PredictionError
 
 galsim = pytest.importorskip("galsim")

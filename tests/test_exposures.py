@@ -18,6 +18,7 @@ from psfdae.methods.field_spline import deformations
 from psfdae.psf.wings import Wings
 from psfdae.report.validation import validate
 from psfdae.training.exposures import exposure, for_exposures
+from psfdae.training.from_image import collect_stars
 from psfdae.training.settings import from_words
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -230,7 +231,7 @@ def test_the_sky_of_a_training_is_that_of_the_typical_star(night):
     folder, _ = night
     sources = [ImageInput(folder / f"{name}.fits", detect=5.0) for name in ("rich", "poor")]
     sources[1] = replace(sources[1], gain=3.0)
-    stars = Stars.of(sources, from_words(["framing.stamp_px=10"]))
+    stars = collect_stars(sources, from_words(["framing.stamp_px=10"]))
     sky = [part.settings.noise.background_photons for part in stars.exposures]
     assert sky[1] == pytest.approx(9 * sky[0], rel=0.05)
     assert stars.settings.noise.background_photons == sky[0] == pytest.approx(SKY + 9, rel=0.05)

@@ -6,6 +6,7 @@ import pytest
 import psfdae
 from psfdae.base.errors import Error
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.source_size import measure_size
 from psfdae.image.stamps import StarFlag
 from psfdae.photometry.crowded import photometry
@@ -18,7 +19,9 @@ CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
 
 def opened(model, image, place):
     """The stars of an image, for a model."""
-    return ImageInput(image, catalogue=place, **CAMERA).open(model.stamp_px, model.margin_px)
+    return open_observation(
+        ImageInput(image, catalogue=place, **CAMERA), model.stamp_px, model.margin_px
+    )
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +129,7 @@ def test_stated_size_is_taken_as_it_is():
 @pytest.mark.parametrize("kind", ["wide_stars", "rings"])
 def test_large_stars_are_found_as_one_source_each(kind, request):
     image, place = request.getfixturevalue(kind)
-    detected = ImageInput(image, detect=5.0).open(16).positions
+    detected = open_observation(ImageInput(image, detect=5.0), 16).positions
     assert len(detected) == len(place)
     off = np.hypot(*(detected[:, None] - place).T).min(axis=1)
     assert off.max() < 1.5

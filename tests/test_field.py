@@ -18,13 +18,13 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.denoise.bundle import read_bundle, write_bundle
-from psfdae.denoise.star_model import PredictionError
 from psfdae.methods.field import FieldMixture, stars_of_fit
 from psfdae.methods.field_law import PosteriorLimits
 from psfdae.methods.field_nodes import node_step
 from psfdae.methods.field_posterior import log_node_prior
 from psfdae.methods.field_search import fit_field
 from psfdae.methods.interface import TrainingSet
+from psfdae.psf.interface import PredictionError
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import measure_shapes
 from psfdae.stars.noise import NoiseModel

@@ -25,6 +25,7 @@ from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import locked_folder
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
@@ -56,7 +57,7 @@ def made(training):
 
 @pytest.fixture(scope="module")
 def candidates(training, config):
-    observation = ImageInput(training.image, catalogue=training.catalogue).open(16, 8)
+    observation = open_observation(ImageInput(training.image, catalogue=training.catalogue), 16, 8)
     return collect(observation, config.calibration_stars, config.framing)
 
 
@@ -117,7 +118,9 @@ def test_what_the_list_says_against_a_star_counts(training, candidates, config, 
     listed.loc[good[:4], "FLAGS"] = [1, 2, 7, 8]
     listed.loc[good[4], "X_IMAGE"] = np.nan
     listed.drop(columns=["ra", "dec"]).to_csv(tmp_path / "stars.csv", index=False)
-    observation = ImageInput(training.image, catalogue=tmp_path / "stars.csv").open(16, 8)
+    observation = open_observation(
+        ImageInput(training.image, catalogue=tmp_path / "stars.csv"), 16, 8
+    )
     verdict = collect(observation, config.calibration_stars, config.framing).verdict
     assert verdict[good].tolist() == [
         *("good", "blended", "saturated", "incomplete", "no position"),

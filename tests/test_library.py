@@ -14,7 +14,7 @@ import pytest
 import psfdae
 from docs_pages import blocks, read
 from image_training import FIELD, MIXTURE, SIZES, few_draws
-from psfdae.denoise.star_model import PsfModel
+from psfdae.api import PsfModel
 from psfdae.methods import method
 from psfdae.training.calibration import COVERAGE
 from psfdae.training.settings import DATASET_CHOICE, from_words, of_config, settings_model

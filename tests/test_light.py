@@ -7,12 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import psfdae
+from psfdae.denoise.field_models import load_field
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_law import FieldSettings
 from psfdae.photometry import crowded
 from psfdae.photometry.image_photometry import photometry_of_image
-from psfdae.psf.exchange import load_field, write_psfex
+from psfdae.psf.exchange import write_psfex
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.wings import Wings
 from psfdae.training import neighbours

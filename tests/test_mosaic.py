@@ -15,7 +15,8 @@ from psfdae.commands import mosaic
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
+from psfdae.image.opening import open_observation
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars import example
 
@@ -76,16 +77,16 @@ def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path
 
 def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
     image, catalogue = ccds
-    stated = mosaic.options_by_image(image, ImageStatements(catalogue=catalogue, gain=2.0))
+    stated = mosaic.options_by_image(image, ImageOptions(catalogue=catalogue, gain=2.0))
     assert {name: of.extension for name, of in stated.items()} == NUMBERS
     for k in (1, 2):
         of = stated[f"CCD{k}"]
         assert of.gain == 2.0
-        opened = ImageInput(image, **vars(of)).open(4)
+        opened = open_observation(ImageInput(image, **vars(of)), 4)
         assert opened.count == 5
         assert next(opened.chunks(9)).id.tolist() == [10 * k + n for n in range(5)]
     # The list reaches beyond an image, which alone keeps and flags all of them.
-    assert ImageInput(image, catalogue=catalogue, extension=1).open(4).count == 10
+    assert open_observation(ImageInput(image, catalogue=catalogue, extension=1), 4).count == 10
 
 
 def twice(word):

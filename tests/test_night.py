@@ -15,9 +15,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from psfdae import api
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae.denoise import star_model as psf_model
 from psfdae_paper.evaluation.night import LIMITS, night_page, read_night, with_verdicts
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,
@@ -276,7 +276,7 @@ def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch
         opened.append(path.name.removesuffix(".psf.safetensors"))
         return SimpleNamespace(image_px=(300, 200), on_pixels=lambda _: np.ones((5, 8, 8)))
 
-    monkeypatch.setattr(psf_model, "load_model", load)
+    monkeypatch.setattr(api, "load_model", load)
     write_night_page(out, tmp_path / "images", tmp_path / "night.html")
     by_size = sorted(rows, key=lambda row: row["fwhm_px_centre"])
     middle = by_size[len(rows) // 2]

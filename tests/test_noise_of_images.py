@@ -11,6 +11,7 @@ import psfdae
 from image_training import few_draws
 from psfdae.image.detection import sky_of
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.sky_level import noise_correlation
 from small_field import CAMERA, GAIN, READ, SKY, drawn, field, moffat, table
 
@@ -86,7 +87,9 @@ def test_detection_and_noise_maps_do_not_depend_on_the_unit(model, image, option
             noise_map = {kind: (sigma * factor) ** power}
             stars = model.photometry(image * factor, **options, **noise_map)
             fluxes.append(np.array(stars["flux"]) / factor)
-            opened = ImageInput(image * factor, **options, **noise_map).open(stamp_px=16)
+            opened = open_observation(
+                ImageInput(image * factor, **options, **noise_map), stamp_px=16
+            )
             gains.append(opened.gain * factor)
     assert np.ptp(fluxes, axis=0).max() < 1e-4 * np.max(fluxes)
     assert gains == pytest.approx([GAIN] * len(gains), rel=0.1)
@@ -163,7 +166,7 @@ def test_whole_counts_have_the_noise_of_the_sky_and_of_rounding(options, image, 
     scale = sigma / np.sqrt(SKY / GAIN + (READ / GAIN) ** 2)
     drift = np.linspace(0.0, 1.0, image.shape[1])
     whole = np.round(image * scale + drift) * unit
-    observation = ImageInput(whole, **options).open(stamp_px=16, margin=8)
+    observation = open_observation(ImageInput(whole, **options), stamp_px=16, margin=8)
     sky, expected = observation.sky(), unit * np.hypot(sigma, 12**-0.5)
     assert np.median(sky.noise) == pytest.approx(expected, rel=0.2)
     level = sky.level - unit * (SKY * scale + drift)

@@ -18,6 +18,7 @@ from image_training import few_draws
 from psfdae import StarFlag, load_model
 from psfdae.denoise.bundle import read_bundle, write_bundle
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
 from psfdae.image.selection_advice import saturation_advice
 from psfdae.image.stamps import cut
@@ -160,7 +161,9 @@ def collected(pixels, sky, folder):
     fits.PrimaryHDU(pixels.astype(np.float32)).writeto(path)
     config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
-    return path, collect(ImageInput(path, catalogue=sky.list).open(22, 8), stars, config.framing)
+    return path, collect(
+        open_observation(ImageInput(path, catalogue=sky.list), 22, 8), stars, config.framing
+    )
 
 
 def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
@@ -176,7 +179,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     advice = re.search(r"(\d+) stamps have .*saturate=(\S+) ", saturation_advice(candidates))
     count, saturation = int(advice[1]), float(advice[2])
     assert (candidates.verdict == "saturated").sum() <= count
-    observation = ImageInput(path, catalogue=sky.list, saturate=saturation).open(22, 0)
+    observation = open_observation(ImageInput(path, catalogue=sky.list, saturate=saturation), 22, 0)
     flagged = np.concatenate([s.saturated.any(axis=(1, 2)) for s in observation.chunks(64)])
     assert flagged.sum() == count > (candidates.brightest >= saturation).sum()
 

@@ -10,10 +10,12 @@ from scipy.spatial import cKDTree
 
 import psfdae
 from command_line import refused
+from psfdae.api import Stars
 from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict, completed
 from psfdae.image.sky_level import SkyStructure, noise_correlation, sky_level, sky_steps
 from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
@@ -23,7 +25,6 @@ from psfdae.photometry import crowded
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.training.fitting import fitted_to
 from psfdae.training.neighbours import _Field
-from psfdae.training.stars import Stars
 from small_field import CAMERA, SKY, drawn, moffat, noisy
 
 SIDE = 320
@@ -102,7 +103,9 @@ def test_a_listed_cosmic_ray_is_flagged_sharp(clean):
     dirty[150, 165] += 5000.0
     assert np.hypot(*(place - [165, 150]).T).min() > 8
     listed = np.concatenate([place, [[165, 150]]])
-    (stamps,) = ImageInput(dirty, catalogue=listed, origin=0, **CAMERA).open(16, 2).chunks(500)
+    (stamps,) = open_observation(
+        ImageInput(dirty, catalogue=listed, origin=0, **CAMERA), 16, 2
+    ).chunks(500)
     sharp = (stamps.flags & psfdae.StarFlag.SHARP) > 0
     assert sharp.tolist() == [False] * len(place) + [True]
 
@@ -130,10 +133,13 @@ def test_an_image_that_was_cut_off_says_its_saturation(clean):
     unsaid = {key: value for key, value in CAMERA.items() if key != "saturate"}
     image = clean[0].copy()
     image[::40, ::40] = 1e5  # a value for bad pixels is no saturation
-    assert ImageInput(image, catalogue=clean[1], origin=0, **unsaid).open(16).saturate is None
-    observation = ImageInput(
-        np.minimum(clean[0], 3000.0), catalogue=clean[1], origin=0, **unsaid
-    ).open(16)
+    assert (
+        open_observation(ImageInput(image, catalogue=clean[1], origin=0, **unsaid), 16).saturate
+        is None
+    )
+    observation = open_observation(
+        ImageInput(np.minimum(clean[0], 3000.0), catalogue=clean[1], origin=0, **unsaid), 16
+    )
     assert observation.saturate == 3000.0
     assert "exactly the largest value, 3000 counts: taken as saturated" in observation.summary()
 

@@ -19,6 +19,7 @@ from psfdae.denoise import prediction as writer
 from psfdae.denoise.denoiser import SNR_TOLERANCE
 from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
 from workflow_runs import ROOT
 
@@ -90,7 +91,9 @@ def test_image_and_catalogue(folder, field_psfs, shipped):
     truth = Table.read(folder / "stars.csv")
     assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
     source = ImageInput(folder / "image.fits", catalogue=folder / "stars.csv")
-    ((_, prediction),) = shipped.stream(source.open(shipped.stamp_px, shipped.margin_px))
+    ((_, prediction),) = shipped.stream(
+        open_observation(source, shipped.stamp_px, shipped.margin_px)
+    )
     rows = prediction.to_table()
     assert rows.colnames == table.colnames and {"ra", "dec"} < {*rows.colnames}
     for name in rows.colnames:
@@ -144,9 +147,9 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     files = []
     for rows, threads in ((1024, 1), (256, 3)):
-        monkeypatch.setattr(stage.PsfModel, "max_stars_read", rows)
+        monkeypatch.setattr(stage.StarModel, "max_stars_read", rows)
         out = folder / f"rows{rows}_{threads}.fits"
-        statements = stage.ImageStatements()
+        statements = stage.ImageOptions()
         stage.predict_command(folder / "cube.fits", statements, threads=threads, out=out)
         files.append(out.read_bytes())
     assert files[0] == files[1]
@@ -193,6 +196,6 @@ def test_page_lists_all_flags_and_columns():
         assert f"`{name}`" in all_text, name
     for extension, _ in writer.CUBES.values():
         assert f"| `{extension}` |" in text
-    assert f"by up to {stage.PsfModel.margin_px} px" in text
+    assert f"by up to {stage.StarModel.margin_px} px" in text
     assert f"more than {100 * SCALE_TOLERANCE:g} %" in text
     assert f"1/{SNR_TOLERANCE:g} of the least" in text

@@ -9,9 +9,9 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import PredictionError, StarFlag
+from psfdae.api import PsfModel
 from psfdae.denoise import denoiser as restoration
 from psfdae.denoise.prediction import CUBES
-from psfdae.denoise.star_model import PsfModel
 from psfdae.image.stamps import cut
 from psfdae.methods.interface import Packing
 

@@ -16,6 +16,7 @@ from image_training import few_draws
 from psfdae import Error, StarFlag, Stars, fit
 from psfdae.image.catalogue import as_catalogue, read_catalogue
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from small_field import CAMERA, TANGENT, field, header, stetson, table, write
 
 
@@ -37,7 +38,7 @@ def path(tmp_path_factory, image):
 
 
 def positions(image, catalogue, **stated):
-    return ImageInput(image, catalogue=catalogue, **stated).open(16).positions
+    return open_observation(ImageInput(image, catalogue=catalogue, **stated), 16).positions
 
 
 # Lists in Python.
@@ -104,7 +105,7 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
     listed = table(place, 1, ("XWIN_IMAGE", "YWIN_IMAGE"))
     listed["NUMBER"] = np.arange(len(place)) + 100
     listed.write(tmp_path / "s.vot", format="votable")
-    observation = ImageInput(image, catalogue=tmp_path / "s.vot").open(16)
+    observation = open_observation(ImageInput(image, catalogue=tmp_path / "s.vot"), 16)
     np.testing.assert_allclose(observation.positions, place)
     assert next(observation.chunks(100)).id[0] == 100
 
@@ -113,7 +114,7 @@ def test_a_votable_has_positions_and_numbers(tmp_path, image, place):
 def test_lists_that_count_from_1(tmp_path, image, place, form):
     listed = [(k + 5, x + 1, y + 1) for k, (x, y) in enumerate(place)]
     form(listed, tmp_path / "s.als")
-    observation = ImageInput(image, catalogue=tmp_path / "s.als").open(16)
+    observation = open_observation(ImageInput(image, catalogue=tmp_path / "s.als"), 16)
     np.testing.assert_allclose(observation.positions, place, atol=1e-3)
     assert [int(k) for k in next(observation.chunks(100)).id] == [k for k, _, _ in listed]
 
@@ -267,7 +268,7 @@ def test_other_formats_are_named_or_ask_for_names(tmp_path, image, content, mess
 
 def test_the_stars_say_the_origin_of_plain_columns(tmp_path, image, place):
     for origin in (0, 1):
-        observation = ImageInput(image, catalogue=table(place, origin)).open(16)
+        observation = open_observation(ImageInput(image, catalogue=table(place, origin)), 16)
         np.testing.assert_allclose(observation.positions, place)
         assert f"count from {origin}" in observation.summary()
 

@@ -10,6 +10,7 @@ from astropy.table import Table
 import psfdae
 from command_line import printed
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
 from psfdae.photometry.crowded import photometry, star_flags
@@ -133,7 +134,9 @@ def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp
     assert (rows["flags"] == 0).mean() > 0.9
     # As one star after the other is measured by `predict`, within the errors of both.
     photometry = next(
-        models[0].stream(ImageInput(tmp_path / "i.fits", catalogue=place).open(16, 2), threads=1)
+        models[0].stream(
+            open_observation(ImageInput(tmp_path / "i.fits", catalogue=place), 16, 2), threads=1
+        )
     )[1]
     off = np.array(rows["flux"]) - photometry.flux_total
     within_1_sigma, two = within(off, np.hypot(rows["flux_error"], photometry.flux_total_error))

@@ -8,11 +8,12 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 import psfdae
+from psfdae.api import Stars
 from psfdae.base.errors import Error
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict
-from psfdae.training.stars import Stars
 from small_field import GAIN, READ, drawn, moffat, noisy, ring
 
 CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
@@ -180,7 +181,7 @@ def test_a_time_series_is_no_cube_of_stamps(side, count, has_middle):
     with pytest.raises(ObservationError, match="time series"):
         Stars.from_image(cube, **CAMERA)
     # A list says that each plane is a star.
-    assert ImageInput(cube, **CAMERA).open(16, 4).count == count
+    assert open_observation(ImageInput(cube, **CAMERA), 16, 4).count == count
 
 
 @pytest.mark.parametrize("kind", ["different stars", "one star", "rings"])
@@ -192,7 +193,7 @@ def test_stamps_of_stars_are_no_time_series(kind):
             place = np.concatenate([place, rng.uniform(0, 63, (3, 2))])
         flux = np.exp(rng.uniform(10.5, 12.5, len(place)))
         cube.append(noisy(drawn(profile, place, flux, 64), rng))
-    ImageInput(np.array(cube), **CAMERA).open(16, 8).check_planes()
+    open_observation(ImageInput(np.array(cube), **CAMERA), 16, 8).check_planes()
 
 
 # Colours.

@@ -143,7 +143,7 @@ def inputs(tmp_path_factory):
         once(patch, predict, "open_for_model")
         once(patch, wavefront, "measure_wavefronts")
         once(patch, from_stars, "fitted_to", "pack_model", "for_exposures", "validate")
-        patch.setattr(from_stars.Stars, "of", once_of(from_stars.Stars.of))
+        patch.setattr(from_stars, "collect_stars", once_of(from_stars.collect_stars))
         yield folder
 
 

@@ -29,30 +29,29 @@ from psfdae.commands import terminal
 progress.show_with(terminal.bar)
 
 if TYPE_CHECKING:
+    from psfdae.api import PsfModel, Stars, fit, load_model
     from psfdae.base.errors import Error
     from psfdae.denoise.prediction import Prediction
-    from psfdae.denoise.star_model import PsfModel, load_model
     from psfdae.image.detected_stars import detect
     from psfdae.image.stamps import StarFlag
     from psfdae.psf.interface import PredictionError
-    from psfdae.report.validation import Report, validate
+    from psfdae.report.report import Report
+    from psfdae.report.validation import validate
     from psfdae.sensing.results import Wavefronts, wavefront
     from psfdae.telescope.settings import read_telescope
-    from psfdae.training.fitting import fit
-    from psfdae.training.stars import Stars
 
 _MODULES = {
     "Error": "base.errors",
     "Prediction": "denoise.prediction",
     "PredictionError": "psf.interface",
-    "PsfModel": "denoise.star_model",
-    "Report": "report.validation",
+    "PsfModel": "api",
+    "Report": "report.report",
     "StarFlag": "image.stamps",
-    "Stars": "training.stars",
+    "Stars": "api",
     "Wavefronts": "sensing.results",
     "detect": "image.detected_stars",
-    "fit": "training.fitting",
-    "load_model": "denoise.star_model",
+    "fit": "api",
+    "load_model": "api",
     "read_telescope": "telescope.settings",
     "validate": "report.validation",
     "wavefront": "sensing.results",

@@ -36,6 +36,7 @@ from scipy.spatial import cKDTree
 
 from psfdae import load_model
 from psfdae.image.image_input import ImageInput
+from psfdae.image.opening import open_observation
 from psfdae.photometry import crowded
 from psfdae_paper.source import git_commit
 
@@ -209,7 +210,7 @@ class TrueField:
 
 def with_truth(stem: str, catalogue: str) -> None:
     """The catalogue of `psfdae photometry --detect` with the true PSF."""
-    observation = ImageInput(Path(f"{stem}.fits"), detect=5.0).open(TrueField.stamp_px)
+    observation = open_observation(ImageInput(Path(f"{stem}.fits"), detect=5.0), TrueField.stamp_px)
     crowded.photometry(TrueField(), observation).stars.write(catalogue, overwrite=True)
 
 
@@ -232,7 +233,7 @@ def apertures(stem: str, table: str, bundle: str) -> None:
     """Compare aperture corrections with the true ones, at places over the field."""
     model = load_model(bundle)
     source = ImageInput(Path(f"{stem}.fits"), detect=5.0)
-    measured = crowded.photometry(model, source.open(model.info.stamp_px))
+    measured = crowded.photometry(model, open_observation(source, model.info.stamp_px))
     side = 2 * HALF_PX[1] + 1
     axis = (np.arange(side * INTEGRATED) + 0.5) / INTEGRATED - 0.5 - side // 2
     shape = (side, INTEGRATED) * 2

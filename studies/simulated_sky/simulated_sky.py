@@ -120,7 +120,7 @@ def places(
     """
     from astropy.io import fits
 
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
 
     model, table, npz = load_model(bundle), read_table(selection), np.load(truth)
     test, side = np.flatnonzero(table["part"] == "held out"), model.info.stamp_px
@@ -169,7 +169,7 @@ def errors(
     `flux` and `psf` are the parts of fluxes and pixels within the stated errors, with standard
     errors clustered by star; `flux_pull` is what 68.27 % of the errors of fluxes are below.
     """
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
     from psfdae.methods.metrics import clustered_mean
 
     model, npz, rows = load_model(bundle), np.load(truth), []

@@ -101,7 +101,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     many passes as threads beside each other. Then the memory of the prediction in MB,
     interpreter and libraries included.
     """
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
@@ -170,7 +170,7 @@ def poppy(
 
 def bundle_errors(bundle, truth, config):
     """Errors of a bundle on noise-free stars of flux 1, a row for each noise level."""
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
 
     model, noise = (
         load_model(bundle),
@@ -250,9 +250,9 @@ def refuse(bundle, stars):
 
 def covered(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
+    from psfdae.api import PsfModel
     from psfdae.denoise.bundle import estimator
     from psfdae.denoise.error_model import brightest
-    from psfdae.denoise.star_model import PsfModel
     from psfdae.training.calibration import calibrated
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
@@ -305,7 +305,7 @@ def outliers(
     companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as
     wide as the mean star.
     """
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
 
     product = star_sets.read_stars(stars, "realisation")
     require(stars, product.config, STARS, config)

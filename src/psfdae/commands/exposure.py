@@ -8,14 +8,14 @@ from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.denoise.bundle import SUFFIX
-from psfdae.denoise.star_model import load_model
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.denoise.star_model import StarModel
+from psfdae.image.image_input import ImageInput, ImageOptions
 
 
 @command("exposure")
 def exposure_command(
     image: Annotated[File, {"argument": True}],
-    options: ImageStatements,
+    options: ImageOptions,
     overwrite: bool = False,
     *,
     model: File,
@@ -37,7 +37,7 @@ def exposure_command(
     # Refuse wrong options and files that exist before anything is computed.
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), model), out, overwrite=overwrite)
-    loaded = load_model(model)
+    loaded = StarModel.load(model)
 
     from psfdae.training.exposures import exposure as adapt_to_exposure
 

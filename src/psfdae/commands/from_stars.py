@@ -27,7 +27,7 @@ from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_imag
 from psfdae.commands.predict import write_list
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.image.errors import ObservationError
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import write_table
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
@@ -42,6 +42,7 @@ from psfdae.training.fitting import (
     pack_model,
     worth_trying,
 )
+from psfdae.training.from_image import collect_stars
 from psfdae.training.settings import (
     DATASET_CHOICE,
     Settings,
@@ -49,7 +50,7 @@ from psfdae.training.settings import (
     of_config,
     with_keywords,
 )
-from psfdae.training.stars import Stars
+from psfdae.training.stars import ImageStars
 
 
 class FolderError(Error, RuntimeError):
@@ -112,7 +113,7 @@ class ModelFiles:
 def from_stars(
     config: Settings | Mapping[str, Any],
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
-    options: ImageStatements,
+    options: ImageOptions,
     all_extensions: bool = False,
     name: str | None = None,
     licence: str = "not stated",
@@ -200,7 +201,7 @@ def from_stars(
 
 def next_command(
     image: tuple[Path, ...],
-    options: ImageStatements,
+    options: ImageOptions,
     all_extensions: bool,
     name: str | None,
     out: Path,
@@ -352,7 +353,7 @@ def write_model(
         A sentence on the error of the model.
     """
     # Choose bright stars without neighbours, and cut them out.
-    stars = Stars.of(sources, settings)
+    stars = collect_stars(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
     # What the stars are, and why others are not used: lists, and the product of all later steps.
     for image_stars in stars.images:
@@ -407,7 +408,7 @@ def write_model(
 
 
 def fit_methods(
-    stars: Stars, files: ModelFiles, methods: Sequence[type[Method]]
+    stars: ImageStars, files: ModelFiles, methods: Sequence[type[Method]]
 ) -> dict[str, Method]:
     """Fit methods to the training stars, write each fit to its file, and return them by name."""
     fitted: dict[str, Method] = {}

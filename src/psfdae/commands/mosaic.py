@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING, Any
 from psfdae.base.errors import Error, words_of_a_command
 from psfdae.base.threads import available_cores
 from psfdae.commands.cli import refusal
+from psfdae.image.catalogue import require_sky
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.image.positions import require_sky
 
 if TYPE_CHECKING:
-    from psfdae.image.image_input import ImageStatements
+    from psfdae.image.image_input import ImageOptions
 
 
 class MosaicError(Error, RuntimeError):
     """Failure for some images of a file; the others are done."""
 
 
-def options_by_image(path: Path, options: ImageStatements) -> dict[str, ImageStatements]:
+def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOptions]:
     """Return the options of each image of a file by the image's name (`science_images`).
 
     A star list is that of all images: each image takes the stars that are on it.

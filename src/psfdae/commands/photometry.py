@@ -10,16 +10,16 @@ from psfdae.base.files import rename_together, write_fits
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.denoise.field_models import load_field
+from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import SUFFIXES, write_table
 from psfdae.photometry.image_photometry import PhotometryError, photometry_of_image
-from psfdae.psf.exchange import load_field
 
 
 @command("photometry")
 def photometry_command(
     image: Annotated[File, {"argument": True}],
-    options: ImageStatements,
+    options: ImageOptions,
     zero_point: float | None = None,
     reference: File | None = None,
     magnitude_column: str = "mag",

@@ -22,9 +22,9 @@ from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_imag
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.denoise.image_prediction import notes_on_model, offsets_from_list, open_for_model
 from psfdae.denoise.prediction import prediction_file
-from psfdae.denoise.star_model import PsfModel, load_model
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.fits_file import Card
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag
@@ -41,7 +41,7 @@ def write_list(observation: Observation, path: Path) -> None:
 @command("predict")
 def predict_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
-    options: ImageStatements,
+    options: ImageOptions,
     all_extensions: bool = False,
     flux_column: str | None = None,
     background_column: str | None = None,
@@ -104,7 +104,7 @@ def predict_command(
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
     bundle = bundle_of_image(model, source.name)
     check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
-    loaded = load_model(bundle)
+    loaded = StarModel.load(bundle)
     observation = open_for_model(loaded, source, fixed_positions)
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
@@ -186,7 +186,7 @@ def check_targets(
 
 
 def write_prediction(
-    model: PsfModel,
+    model: StarModel,
     source: ImageInput,
     observation: Observation,
     out: Path,

@@ -11,8 +11,8 @@ import numpy as np
 from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
+from psfdae.denoise.field_models import load_field
 from psfdae.psf import exchange
-from psfdae.psf.exchange import load_field
 from psfdae.psf.interface import FieldPsfs, PredictionError
 
 

@@ -20,8 +20,9 @@ from psfdae.commands.predict import check_targets, write_list
 from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.detector_frame import find_offset
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.observation import Observation
+from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import central_pixel
 from psfdae.sensing.output import report_lines, wavefront_hdus
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 @command("wavefront")
 def wavefront_command(
     stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
-    options: ImageStatements,
+    options: ImageOptions,
     telescope: File,
     stamp_px: Annotated[int, click.IntRange(8, 64)] = 16,
     axis: Annotated[tuple[float, float] | None, {"type": (float, float)}] = None,
@@ -80,7 +81,7 @@ def wavefront_command(
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
     check_targets((*source.files(), telescope), out, plot, list_path, overwrite=overwrite)
     optics = read_telescope(telescope)
-    observation = source.open(stamp_px)
+    observation = open_observation(source, stamp_px)
     check_scale(observation, optics)
     field_deg = field_angles(observation, source.catalogue, optics, axis)
     notes = note_axis(observation) if axis is None else []

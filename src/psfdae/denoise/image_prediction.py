@@ -1,4 +1,4 @@
-"""Prediction of the stars of an image: what the command `predict` and `PsfModel` have in common.
+"""Prediction of the stars of an image, for the command `predict` and for `psfdae.PsfModel`.
 
 In go a model, and an image with its star list; out come an observation whose pixels are those of
 the model, and sentences on what limits the trust in the predictions.
@@ -7,110 +7,32 @@ the model, and sentences on what limits the trust in the predictions.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from pydantic import PositiveInt
 
-from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import call, keyword
 from psfdae.denoise.prediction import Prediction
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.camera import other_instruments
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
+from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import Stamps, StarFlag
-from psfdae.photometry.image_photometry import CAUSES
 from psfdae.psf.interface import PredictionError
 
-if TYPE_CHECKING:
-    from psfdae.denoise.star_model import PsfModel
-    from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
-
-
-class WholeImages:
-    """Calls of a `PsfModel` that take a whole image, as the commands of the same names do."""
-
-    @check_arguments
-    def predict_image(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        fixed: bool = False,
-        threads: PositiveInt | None = None,
-        **statements: Any,
-    ) -> Prediction:
-        """Return the PSFs of the stars of an image, as the command `psfdae predict` does.
-
-        Parameters
-        ----------
-        image : path-like, array, NDData, HDU or HDUList
-            FITS image, or cube of stamps.
-        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list, as `Stars.from_image` takes it.
-        fixed : bool
-            Its centres are exact, for models that measure centres (field).
-        threads : int, optional
-            By default, all cores.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
-            `background_column` of the list.
-
-        Returns
-        -------
-        Prediction
-            One row per star; `notes` has sentences on the image and its list.
-
-        Raises
-        ------
-        Error
-            If the image or its list cannot be used, or its pixels are not those of the model.
-        """
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return predict_stars(cast("PsfModel", self), source, threads, fixed)
-
-    @check_arguments
-    def adapt(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        name: str | None = None,
-        **statements: Any,
-    ) -> PsfModel:
-        """Return this model adapted to another exposure, as `psfdae exposure` does.
-
-        The stars of the exposure show how its PSF differs from that of the model; ten may be
-        enough.
-
-        Parameters
-        ----------
-        image, catalogue, **statements : as those of `predict_image`
-        name : str, optional
-            Name of the new model, by default that of the image.
-
-        Raises
-        ------
-        Error
-            If this is no model of a field, or the image has too few bright stars.
-        """
-        from psfdae.training.exposures import exposure
-
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return exposure(cast("PsfModel", self), source, name or source.name)[0]
+CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
+"""Possible causes if all stars are unlike the training stars."""
 
 
 def predict_stars(
-    model: PsfModel, source: ImageInput, threads: int | None, fixed: bool
+    model: StarModel, source: ImageInput, threads: int | None, fixed: bool
 ) -> Prediction:
     """Return the predictions of all stars of an image, with sentences on what limits them.
 
     Parameters
     ----------
-    model : PsfModel
+    model : StarModel
     source : ImageInput
         The image with its list, and what is stated about it.
     threads : int or None
@@ -140,7 +62,7 @@ def predict_stars(
     return replace(prediction, notes=tuple(filter(None, notes)))
 
 
-def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> Observation:
+def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) -> Observation:
     """Open an image whose pixels must be those of a model.
 
     Raises
@@ -149,7 +71,7 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
         If its pixel scale is another one, or not known; or if listed centres are exact (`fixed`),
         and there is no list, or the model measures no centres.
     """
-    observation = source.open(model.info.stamp_px, model.margin_px)
+    observation = open_observation(source, model.info.stamp_px, model.margin_px)
     if model.info.source == "stars":
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assuming()
@@ -164,7 +86,7 @@ def open_for_model(model: PsfModel, source: ImageInput, fixed: bool = False) -> 
     return observation
 
 
-def notes_on_model(model: PsfModel, observation: Observation, unlike_count: int) -> list[str]:
+def notes_on_model(model: StarModel, observation: Observation, unlike_count: int) -> list[str]:
     """Return sentences on what limits the trust in predictions of an image.
 
     They are on another frame or instrument than the training's, on stars unlike the training's
@@ -216,7 +138,7 @@ def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) ->
     return np.where(unclear[:, None], np.nan, offset)
 
 
-def other_instrument(model: PsfModel, observation: Observation) -> str:
+def other_instrument(model: StarModel, observation: Observation) -> str:
     """Describe how an image's telescope, camera or filter differs from the training image.
 
     The colours of the star lists count as well, where the image's list has any.

@@ -1,4 +1,4 @@
-"""`PsfModel`: a model of the PSF, with the call that restores stars.
+"""`StarModel`: a model of the PSF, with the call that restores stars.
 
 A stamp, or an image with its star list, goes in; a `Prediction` with PSFs, their errors, fluxes and
 flags comes out. What happens between is in `psfdae.denoise.denoiser`.
@@ -22,7 +22,6 @@ from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.denoise.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.denoise.denoiser import Restorer
-from psfdae.denoise.image_prediction import WholeImages
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.stamp_arrays import stamps_of_arrays
 from psfdae.image.detector_frame import find_offset
@@ -39,45 +38,13 @@ SCALE_TOLERANCE = 0.02
 """Relative difference of pixel scales up to which they are the same."""
 
 
-@check_arguments
-def load_model(path: str | Path | None = None) -> PsfModel:
-    """A trained model, ready to predict the PSFs of stars.
-
-    Parameters
-    ----------
-    path : path-like, optional
-        Model bundle (`.psf.safetensors`); by default the one that comes with the package.
-
-    Raises
-    ------
-    BundleError
-        If the file is missing, damaged, of a newer format, or no model bundle.
-    PredictionError
-        If it describes a telescope.
-    MissingExtraError
-        If the model is a network and torch is not installed.
-
-    Examples
-    --------
-    >>> psfdae.load_model()
-    PsfModel('wfsat', 16×16 px of 0.1", S/N 3.3 … 1.1e+03)
-    """
-    if path is not None and Path(path).suffix in (".yaml", ".yml"):
-        wavefront = call("psfdae.wavefront", f"psfdae wavefront INPUT --telescope {path}")
-        raise PredictionError(
-            f"{path}: describes a telescope, and is no model; {wavefront} measures the wavefronts "
-            "of its stars, and gives their PSFs"
-        )
-    return PsfModel(read_bundle(None if path is None else Path(path)))
-
-
-class PsfModel(WholeImages, FieldPsfs):
+class StarModel(FieldPsfs):
     """Fitted method with all that it takes to restore stars: photometry, errors and limits.
 
     Parameters
     ----------
     bundle : Bundle
-        `load_model` reads one from a file.
+        `load` reads one from a file.
     method : Method, optional
         The method of its arrays; by default it is unpacked from them.
 
@@ -89,7 +56,7 @@ class PsfModel(WholeImages, FieldPsfs):
     >>> model.psf_at(150.0, 150.0, oversampling=1).shape
     (16, 16)
     >>> model.save("image.psf.safetensors")
-    >>> psfdae.load_model("image.psf.safetensors").info.training_stars
+    >>> StarModel.load("image.psf.safetensors").info.training_stars
     29
     """
 
@@ -104,6 +71,27 @@ class PsfModel(WholeImages, FieldPsfs):
         self.restorer = Restorer(bundle, estimator(bundle) if method is None else method)
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Self:
+        """Read a model from its file, by default the one that comes with the package.
+
+        Raises
+        ------
+        BundleError
+            If the file is missing, damaged, of a newer format, or not a model.
+        PredictionError
+            If it describes a telescope.
+        MissingExtraError
+            If the model is a network and torch is not installed.
+        """
+        if path is not None and Path(path).suffix in (".yaml", ".yml"):
+            wavefront = call("psfdae.wavefront", f"psfdae wavefront INPUT --telescope {path}")
+            raise PredictionError(
+                f"{path}: describes a telescope, and is no model; {wavefront} measures the "
+                "wavefronts of its stars, and gives their PSFs"
+            )
+        return cls(read_bundle(None if path is None else Path(path)))
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle and copy the bundle alone, from which all else is made."""
         return type(self), (self.bundle,)
@@ -111,7 +99,7 @@ class PsfModel(WholeImages, FieldPsfs):
     def __repr__(self) -> str:
         info = self.info
         return (
-            f"PsfModel({info.name!r}, {info.stamp_px}×{info.stamp_px} px of "
+            f"{type(self).__name__}({info.name!r}, {info.stamp_px}×{info.stamp_px} px of "
             f'{info.pixel_scale_arcsec:g}", S/N {info.snr_min:.3g} … {info.snr_max:.3g})'
         )
 
@@ -124,7 +112,7 @@ class PsfModel(WholeImages, FieldPsfs):
         left_out |= {"Noise-equivalent area", "Flagged as unlike"}
         facts = model_facts(self.bundle).items()
         rows = [(name, escape(fact)) for name, fact in facts if name not in left_out]
-        tables = [html_table(["PsfModel", self.name], rows)]
+        tables = [html_table([type(self).__name__, self.name], rows)]
         # Errors of the test stars, if there were any.
         if (errors := error_table(self.info)) is not None:
             tables.append(html_table(errors.colnames, [tuple(row) for row in errors]))

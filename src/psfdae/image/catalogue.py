@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from psfdae.base.errors import did_you_mean
+from psfdae.base.errors import did_you_mean, keyword
 from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.list_formats import read_list_table
@@ -414,3 +414,22 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
                 table[name] = np.where(mask if mask is not None else False, np.nan, values)
             table.remove_column(sky[0])
     return Catalogue(path, table)
+
+
+def require_sky(stars: StarList, purpose: str) -> None:
+    """Refuse a star list of several images that has no sky coordinates.
+
+    Parameters
+    ----------
+    stars : path-like, table or positions
+        The list (`as_catalogue`).
+    purpose : str
+        What needs sky coordinates, for the message.
+    """
+    table = as_catalogue(stars)
+    if not table.positions().sky:
+        raise ObservationError(
+            table.path,
+            f"{purpose} takes a list with sky coordinates, or {keyword('detect', True)}: pixels "
+            "do not say which image they are of",
+        )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
 from psfdae.base.arguments import check_arguments
-from psfdae.image.image_input import ImageInput
+from psfdae.image.image_input import ImageInput, PixelKeywords
+from psfdae.image.opening import open_observation
 from psfdae.image.tables import star_table
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @check_arguments
-def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
+def detect(image: Image, threshold: float = 5.0, **options: Unpack[PixelKeywords]) -> QTable:
     """Find the stars of an image.
 
     Parameters
@@ -26,9 +27,9 @@ def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
         FITS image. Mask, uncertainty, unit, WCS and meta of CCDData and NDData are used.
     threshold : float
         Detection limit in σ above the sky.
-    **statements
-        Statements on the image, such as `mask`, `extension` or `gain`, named and explained in
-        `psfdae.image.image_input.ImageStatements`.
+    **options
+        Options of the image, such as `mask`, `extension` or `gain`, named and explained in
+        `psfdae.image.image_input.ImageOptions`.
 
     Returns
     -------
@@ -49,7 +50,9 @@ def detect(image: Image, threshold: float = 5.0, **statements: Any) -> QTable:
     (36, ['id', 'x', 'y', 'flux_iso', 'background'])
     """
     # Stamps are not needed here: the least side that an image may have.
-    observation = ImageInput.of(image, {**statements, "detect": threshold}).open(stamp_px=8)
+    observation = open_observation(
+        ImageInput.of(image, {**options, "detect": threshold}), stamp_px=8
+    )
     assert observation.detections is not None
     stars = observation.detections.table
     # SExtractor's X_IMAGE counts from 1.

@@ -1,7 +1,8 @@
-"""Statements on an image and its stars, once for the command line and for Python.
+"""Options of an image and its stars, once for the command line and for Python.
 
 An option of `psfdae predict`, a keyword of `psfdae.Stars.from_image` and a row of a table on the
-pages are fields of `ImageStatements`. `ImageInput` adds the image, and opens it.
+pages are fields of `ImageOptions`. `ImageInput` adds the image, which
+`psfdae.image.opening.open_observation` opens.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
 
@@ -19,17 +20,16 @@ from psfdae.base.arguments import check_values
 from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.options import Extension, File
 from psfdae.image.camera import HEADER_KEYS
+from psfdae.image.catalogue import require_sky
 from psfdae.image.containers import as_image, in_unit
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import PlainFile
-from psfdae.image.positions import require_sky
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import Image
-    from psfdae.image.observation import Observation
 
     Number: TypeAlias = float | Quantity
 else:
@@ -41,8 +41,8 @@ Layer: TypeAlias = Extension | Path | np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageStatements:
-    """Statements on an image and its stars; each goes before what the header says.
+class ImageOptions:
+    """Options of an image and its stars; each overrides the FITS header.
 
     The text beside the type of a field is the help of its option, and its meaning in Python. There,
     `catalogue` takes all that `psfdae.image.catalogue.as_catalogue` does, `detect` also the
@@ -96,8 +96,34 @@ class ImageStatements:
         return 5.0 if self.given_threshold is None else self.given_threshold
 
 
+class PixelKeywords(TypedDict, total=False):
+    """Keywords of `psfdae.detect`: `ImageOptions` without star list and search."""
+
+    on_image: bool
+    pixel_scale_arcsec: Number | None
+    origin: Literal[0, 1] | None
+    extension: Extension | None
+    mask: Layer | None
+    bad_bits: int | None
+    weight: Layer | None
+    variance: Layer | None
+    error: Layer | None
+    gain: Number | None
+    read_noise: Number | None
+    saturate: Number | None
+    colour_column: str | None
+    accept_offset: bool
+
+
+class ImageKeywords(PixelKeywords, total=False):
+    """Keywords of the public calls on an image: `ImageOptions` without the star list."""
+
+    detect: bool | float
+    threshold: float | None
+
+
 @dataclass(frozen=True)
-class ImageInput(ImageStatements):
+class ImageInput(ImageOptions):
     """FITS file with stars, or an array, and what is stated about it.
 
     Attributes
@@ -211,33 +237,3 @@ class ImageInput(ImageStatements):
                 typed = keyword(name, number)
                 raise ObservationError(self.path, f"{typed}: expected a number above 0")
         return dict(zip(HEADER_KEYS, numbers.values(), strict=True))
-
-    def open(self, stamp_px: int, margin: int = 0) -> Observation:
-        """Check all that can be checked without reading pixels, and describe the stars.
-
-        Pixels are read to find stars, and where there is a map of noise.
-
-        Parameters
-        ----------
-        stamp_px : int
-            Side of the stamps.
-        margin : int
-            Pixels around each of them; those of a cube get as many of these as they have.
-
-        Raises
-        ------
-        ObservationError
-            If the image, its list or a statement cannot be used; one line that names the file.
-        """
-        from psfdae.image.opening import open_observation
-
-        # Ranges of whole numbers.
-        if stamp_px < 1:
-            raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
-        if margin < 0:
-            raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
-        # A mask has up to 63 bits and a sign.
-        if self.bad_bits is not None and not 0 < self.bad_bits < 2**63:
-            typed = keyword("bad_bits", self.bad_bits)
-            raise ObservationError(self.path, f"{typed}: expected 1 to 2**63 - 1")
-        return open_observation(self, stamp_px, margin)

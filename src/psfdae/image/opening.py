@@ -28,6 +28,7 @@ from psfdae.image.camera import (
 from psfdae.image.catalogue import Catalogue, as_catalogue
 from psfdae.image.errors import ObservationError, shorten, silent
 from psfdae.image.fits_file import ImageFile, find_image
+from psfdae.image.image_input import ImageInput
 from psfdae.image.layers import Layers, find_layers, with_photons
 from psfdae.image.observation import ListedStars, Observation
 from psfdae.image.positions import (
@@ -41,23 +42,35 @@ from psfdae.image.stamps import StarFlag, raise_flag
 
 if TYPE_CHECKING:
     from psfdae.image.detection import Sky
-    from psfdae.image.image_input import ImageInput
 
 
-def open_observation(source: ImageInput, stamp_px: int, margin: int) -> Observation:
+def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Observation:
     """Return the stars of an image, with all that its file, its list and the user say of them.
+
+    Pixels are read to find stars, and where there is a map of noise.
 
     Parameters
     ----------
     source : ImageInput
-    stamp_px, margin : int
-        Side of the stamps, and pixels around each.
+        The image, its star list and options.
+    stamp_px : int
+        Side of the stamps.
+    margin : int
+        Pixels around each stamp; those of a cube get as many of these as they have.
 
     Raises
     ------
     ObservationError
-        If the image, its list or a statement cannot be used.
+        If the image, its list or an option cannot be used; one line that names the file.
     """
+    # Ranges of whole numbers; a mask has up to 63 bits and a sign.
+    if stamp_px < 1:
+        raise ObservationError(source.path, f"stamp size {stamp_px}, expected at least 1 pixel")
+    if margin < 0:
+        raise ObservationError(source.path, f"margin {margin}, expected at least 0 pixels")
+    if source.bad_bits is not None and not 0 < source.bad_bits < 2**63:
+        typed = keyword("bad_bits", source.bad_bits)
+        raise ObservationError(source.path, f"{typed}: expected 1 to 2**63 - 1")
     # The image, and whether it is a cube of stamps.
     image = find_image(source.image, source.extension)
     stated_camera = source.camera(image.unit)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psfdae.base.errors import keyword
-from psfdae.image.catalogue import Catalogue, as_catalogue
+from psfdae.image.catalogue import Catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, sky_frame
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
@@ -23,30 +23,10 @@ from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-    from psfdae.image.catalogue import StarList
     from psfdae.image.layers import Layers
 
 SAME_STAR_PX = 0.1
 """Distance below which two rows of a list are one star."""
-
-
-def require_sky(stars: StarList, purpose: str) -> None:
-    """Refuse a star list of several images that has no sky coordinates.
-
-    Parameters
-    ----------
-    stars : path-like, table or positions
-        The list (`as_catalogue`).
-    purpose : str
-        What needs sky coordinates, for the message.
-    """
-    table = as_catalogue(stars)
-    if not table.positions().sky:
-        raise ObservationError(
-            table.path,
-            f"{purpose} takes a list with sky coordinates, or {keyword('detect', True)}: pixels "
-            "do not say which image they are of",
-        )
 
 
 def positions_in_image(

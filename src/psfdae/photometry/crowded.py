@@ -22,20 +22,14 @@ from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.photometry.joint_fit import JointFit, chains, fit_stars, pairs_within
 from psfdae.photometry.matched_filter import find_stars
 from psfdae.photometry.photon_noise import pixel_error
+from psfdae.photometry.wings_fit import StarFluxes, add_model_errors, around_stars
 from psfdae.psf.grid import PsfGrid
-from psfdae.psf.wings import (
-    StarFluxes,
-    Wings,
-    add_model_errors,
-    aperture_correction,
-    around_stars,
-    outer_shares,
-)
+from psfdae.psf.interface import FieldPsfs, aperture_correction
+from psfdae.psf.wings import Wings, outer_shares
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from psfdae.psf.interface import FieldPsfs
 
 MAX_CHI2_RATIO = 2.5
 """Median χ² of an image's bright stars, over that of the training, from which all are flagged."""

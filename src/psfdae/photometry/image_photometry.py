@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import Error, keyword, warn
+from psfdae.denoise.image_prediction import CAUSES
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.image_input import ImageInput
+from psfdae.image.observation import Observation
+from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.image.tables import star_table
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.photon_noise import with_measured_gain
+from psfdae.psf.interface import FieldPsfs
 
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
@@ -31,13 +34,6 @@ if TYPE_CHECKING:
     from astropy.wcs import WCS
 
     from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
-    from psfdae.image.observation import Observation
-    from psfdae.psf.interface import FieldPsfs
-
-
-CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
-"""Possible causes if all stars are unlike the training stars."""
 
 
 class PhotometryError(Error, ValueError):
@@ -74,70 +70,6 @@ class ImagePhotometry:
 
         pixels, unit = self.measured.residual.astype(np.float32), self.table["flux"].unit
         return CCDData(pixels, unit=unit, wcs=self.wcs)
-
-
-class ImageFluxes:
-    """Photometry of a whole image, for all models that know the PSF at every place."""
-
-    @check_arguments
-    def photometry(
-        self,
-        image: Image,
-        catalogue: StarList | None = None,
-        *,
-        zero_point: float | None = None,
-        reference: StarList | None = None,
-        magnitude_column: str = "mag",
-        **statements: Any,
-    ) -> QTable:
-        """Measure the fluxes of all stars of an image, overlapping ones together.
-
-        It is the table that the command `psfdae photometry` writes.
-
-        Parameters
-        ----------
-        image : path-like, array, NDData, HDU or HDUList
-            The image that the model learnt from, or another one with the same PSF.
-        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list; no other stars are looked for.
-        zero_point : float, optional
-            Magnitude of a flux of 1.
-        reference : as `catalogue`, optional
-            Star list with magnitudes, which give the zero point.
-        magnitude_column : str
-            Column of the reference with the magnitudes.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`.
-
-        Returns
-        -------
-        QTable
-            A row for each star, with units.
-
-        Raises
-        ------
-        Error
-            If the image or a list cannot be used, or the model knows no PSF of a place.
-        """
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        model = cast("FieldPsfs", self)
-        return photometry_of_image(model, source, zero_point, reference, magnitude_column).table
-
-    def residual(
-        self, image: Image, catalogue: StarList | None = None, **statements: Any
-    ) -> CCDData:
-        """Return an image without its sky and stars, which are measured as by `photometry`.
-
-        `psfdae.photometry.image_photometry.photometry_of_image` gives table and residual of one
-        measurement.
-
-        Parameters
-        ----------
-        image, catalogue, **statements : as those of `photometry`
-        """
-        source = ImageInput.of(image, {**statements, "catalogue": catalogue})
-        return photometry_of_image(cast("FieldPsfs", self), source).residual
 
 
 def photometry_of_image(
@@ -192,7 +124,7 @@ def photometry_of_image(
     # The model must know the PSF at every place (`field_range` refuses others), and have pixels
     # as large as those of the image.
     model.field_range()
-    observation = opened or source.open(model.stamp_px).assuming()
+    observation = opened or open_observation(source, model.stamp_px).assuming()
     if observation.shape is None:
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
@@ -202,7 +134,7 @@ def photometry_of_image(
     magnitudes = scatter = None
     if reference is not None:
         stars = replace(source, catalogue=reference, origin=origin, detect=False, on_image=False)
-        positions = stars.open(model.stamp_px).positions
+        positions = open_observation(stars, model.stamp_px).positions
         assert positions is not None  # of an image
         star_list = as_catalogue(reference)
         magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)

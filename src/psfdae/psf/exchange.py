@@ -21,28 +21,10 @@ import numpy as np
 from psfdae.base.errors import keyword
 from psfdae.base.files import atomic_path, sha256_of, write_fits
 from psfdae.base.version import __version__
-from psfdae.denoise.bundle import name_foreign_format
-from psfdae.denoise.star_model import load_model
 from psfdae.image.errors import ascii_line, reading
 from psfdae.image.fits_file import BLOCK_BYTES, Card, find_image, open_hdus, open_pixels, plain_file
 from psfdae.psf.interface import FieldPsfs, PredictionError
 from psfdae.stars.moments import measure_shapes
-
-
-def load_field(path: Path) -> FieldPsfs:
-    """Return the PSF over an image from a bundle of psfdae, or from a file of another program.
-
-    These are .psf of PSFEx, STDPSF, and grids of STPSF and photutils.
-
-    Raises
-    ------
-    Error
-        If the file cannot be read or is something else.
-    """
-    kind = name_foreign_format(path)
-    if kind == "PSFEx":
-        return PsfexField(path)
-    return GridField(path) if kind in ("STDPSF", "STPSF") else load_model(path)
 
 
 class FieldFile(FieldPsfs):

@@ -11,14 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.bright_stars import magnitude
-
-if TYPE_CHECKING:
-    from psfdae.psf.interface import FieldPsfs
 
 
 @dataclass(frozen=True)

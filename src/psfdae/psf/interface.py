@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias
+from typing import Annotated, Protocol, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field
 
-from psfdae.base.arguments import check_arguments, real_numbers
+from psfdae.base.arguments import ArgumentError, check_arguments, real_numbers
 from psfdae.base.errors import Error
-from psfdae.photometry.image_photometry import ImageFluxes
+from psfdae.image.observation import Observation
+from psfdae.psf.wings import Wings, outer_shares
 from psfdae.stars.moments import measure_shapes
-
-if TYPE_CHECKING:
-    from photutils.psf import GriddedPSFModel
-
-    from psfdae.image.observation import Observation
-    from psfdae.psf.wings import Wings
 
 
 class _Array(Protocol):
@@ -52,7 +46,7 @@ class PredictionError(Error, ValueError):
     """
 
 
-class FieldPsfs(ImageFluxes, ABC):
+class FieldPsfs(ABC):
     """PSF at every position of an image, and quantities that follow from it.
 
     Attributes
@@ -249,8 +243,6 @@ class FieldPsfs(ImageFluxes, ABC):
         PredictionError
             As `psf_at`.
         """
-        from psfdae.psf.wings import aperture_correction
-
         return aperture_correction(self, self.wings, x, y, radius_px)
 
     @check_arguments
@@ -267,53 +259,31 @@ class FieldPsfs(ImageFluxes, ABC):
         x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
         return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
-    @check_arguments
-    def to_photutils(self, nodes: NodeCount = 9, oversampling: Oversampling = 4) -> GriddedPSFModel:
-        """Return the field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
 
-        Its PSFs have an odd number of values along an axis.
+def aperture_correction(
+    model: FieldPsfs, wings: Wings | None, x: float, y: float, radius_px: float
+) -> float:
+    """Return the whole flux of a star at (x, y), in px from 0, over that in an aperture about it.
 
-        Parameters
-        ----------
-        nodes : int
-            Positions along either axis, over the field of the training stars.
-        oversampling : int
-            Values per pixel and axis.
+    The aperture has parts of the pixels at its edge, as photutils' `CircularAperture`.
 
-        Raises
-        ------
-        PredictionError
-            As `psf_at`.
-        """
-        from astropy.nddata import NDData
-
-        from psfdae.psf.grid import PsfGrid
-
-        # photutils takes PSFs on a regular grid, x changing fastest, and interpolates between them.
-        grid = PsfGrid.of(self, nodes, oversampling)
-        positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
-        meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
-        model_class = grid_class(f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}")
-        return model_class(NDData(grid.psfs.reshape(-1, *grid.psfs.shape[2:]), meta=meta))
-
-
-@cache
-def grid_class(name: str) -> type[GriddedPSFModel]:
-    """Return a class of photutils' `GriddedPSFModel` with a name of its own.
-
-    photutils 3.0 fits groups with the first model of a class, so that each model has its class.
+    Raises
+    ------
+    ValueError
+        If the radius is not above 0, or beyond the wings, or half the stamp without wings.
     """
-    from photutils.psf import GriddedPSFModel
+    from photutils.aperture import CircularAperture
 
-    # A class that is made at run time is pickled as its name.
-    return type(name, (GriddedPSFModel,), {"__reduce__": reduce_grid})
-
-
-def reduce_grid(grid: GriddedPSFModel) -> tuple[Any, ...]:
-    """Return what pickle stores of a grid: how to make one without values, and its values."""
-    return blank_grid, (type(grid).__name__,), vars(grid)
-
-
-def blank_grid(name: str) -> GriddedPSFModel:
-    """Return an object of the class `grid_class(name)` without values, for unpickling."""
-    return object.__new__(grid_class(name))
+    radius_max = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
+    if not 0 < radius_px <= radius_max:
+        raise ArgumentError(f"radius_px {radius_px} px, expected above 0 up to {radius_max:g}")
+    # Light of the PSF in the aperture, about the star's place in the stamp.
+    psf = model.psf_at(x, y, 1)
+    middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2
+    inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
+    if wings is None:
+        return 1.0 / inside
+    # All light over that in the aperture, each with the wings of this PSF.
+    scale = float(wings.scale(outer_shares(model.on_pixels, np.array([[x, y]])))[0])
+    all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
+    return (1.0 + all_wings) / (inside + inner_wings)

@@ -20,12 +20,12 @@ from psfdae.training.star_sets import field_positions, own_noise, star_area
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from psfdae.denoise.star_model import PsfModel
-    from psfdae.training.stars import Stars
+    from psfdae.denoise.star_model import StarModel
+    from psfdae.training.stars import ImageStars
 
 
 def measure_photometry(
-    model: PsfModel, stars: Stars, restored: Mapping[float, Mapping[str, np.ndarray]]
+    model: StarModel, stars: ImageStars, restored: Mapping[float, Mapping[str, np.ndarray]]
 ) -> Table:
     """Measure held-out stars of flux 1 at each noise level λ, from their stamps and places alone.
 
@@ -34,8 +34,8 @@ def measure_photometry(
 
     Parameters
     ----------
-    model : PsfModel
-    stars : Stars
+    model : StarModel
+    stars : ImageStars
     restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Degraded images (`noisy`) by noise level λ.
 

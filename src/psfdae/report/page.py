@@ -7,27 +7,20 @@ errors, photometry, the field, residuals, sizes and shapes, χ², and the stars 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from io import BytesIO
-from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.figures import as_png
-from psfdae.image.selection import Verdict
-from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import html_table
-from psfdae.report.checks import Check, check_stars, method_labels
-from psfdae.report.figures import chi2_figure, error_maps, errors_figure, shapes_figure
+from psfdae.report.checks import Check, method_labels
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from matplotlib.figure import Figure
-
-    from psfdae.report.validation import Report
 
 
 def checks_html(rows: Sequence[Check]) -> str:
@@ -41,67 +34,6 @@ def checks_html(rows: Sequence[Check]) -> str:
     words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
     cells = [(escape(a), escape(b), words[bool(is_passed)]) for a, b, is_passed in rows]
     return html_table(("check", "result", ""), cells)
-
-
-def quality_page(
-    report: Report,
-    stars: Mapping[str, np.ndarray],
-    degraded_rows: np.ndarray,
-    field_map: Figure | None,
-    residuals: Figure | None,
-) -> str:
-    """Return the report page as HTML.
-
-    Parameters
-    ----------
-    report : Report
-    stars : mapping of str to ndarray, shape (n,)
-        Columns of the prediction of all stars, and `verdict` and `part` of `selection.csv`.
-    degraded_rows : ndarray of int
-        Star of each held-out image in `report.restored`.
-    field_map : Figure, optional
-        Map of the PSF, if the stars have positions.
-    residuals : Figure, optional
-        Residuals of bright held-out stars (`residual_strip`), if there are any.
-    """
-    # The method of the model, and held-out stars as it restores them.
-    name, images = type(report.model.method).name, report.restored_by_snr
-    # Checks of all stars come before the number of stars held out.
-    *checks, held_out_check = report.checks()
-    # Sentences on the fit, and on the image and its list.
-    facts = report.model.method.facts().values()
-    notes = [line for note in report.stars.notes for line in note.splitlines()]
-    # A star has one verdict, and may have several flags.
-    verdicts, flags = stars["verdict"], stars["flags"]
-    verdict_counts = [(v, int((verdicts == v).sum())) for v in Verdict]
-    flag_counts = [(f.name or "", int(((flags & int(f)) > 0).sum())) for f in StarFlag]
-    unflagged = ("none", str(int((flags == 0).sum())))
-    template = Path(__file__).with_name("report.html").read_text(encoding="utf-8")
-    return Template(template).substitute(
-        title=escape(report.model.info.name),
-        image=escape(report.stars.observation.path.name),
-        summary=escape(str(report)),
-        checks=checks_html([*checks, *check_stars(stars), held_out_check]),
-        errors=_errors_table(report.table, name),
-        truth_mse=f"{report.table['truth_mse'][0]:.1e}",
-        errors_figure=image_tag(errors_figure(report.table, name)),
-        strip=image_tag(report.strip_png),
-        photometry=_photometry_table(report.photometry),
-        facts="".join(f"<p>{escape(fact)}.</p>\n" for fact in facts),
-        field_map=image_tag(field_map) if field_map else "<p>The stars have no positions.</p>",
-        error_maps=image_tag(error_maps(images)),
-        residuals=image_tag(residuals) if residuals else "",
-        shapes=image_tag(shapes_figure(stars, degraded_rows, images)),
-        chi2=image_tag(chi2_figure(stars)),
-        verdicts=html_table(
-            ("selection for the training", "stars"),
-            [(escape(verdict), str(count)) for verdict, count in verdict_counts if count],
-        ),
-        flags=html_table(
-            ("flag", "stars"), [*((f, str(count)) for f, count in flag_counts if count), unflagged]
-        ),
-        notes="".join(f"<li>{escape(line)}</li>\n" for line in notes),
-    )
 
 
 def image_tag(picture: Figure | bytes) -> str:
@@ -124,7 +56,7 @@ def image_tag(picture: Figure | bytes) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(small.getvalue()).decode()}">'
 
 
-def _errors_table(errors: Table, model_method: str) -> str:
+def errors_table(errors: Table, model_method: str) -> str:
     """Return the HTML table of MSE with standard errors: rows are methods, columns S/N.
 
     Parameters
@@ -146,7 +78,7 @@ def _errors_table(errors: Table, model_method: str) -> str:
     return html_table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows)
 
 
-def _photometry_table(photometry: Table) -> str:
+def photometry_table(photometry: Table) -> str:
     """Return the HTML table of photometry of held-out stars, given nothing but their stamps.
 
     `photometry` has the columns of `found.csv`.

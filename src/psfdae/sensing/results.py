@@ -20,7 +20,7 @@ from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
 from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
-from psfdae.sensing.summary import nearest_modes, summarise_modes, wavefront_table
+from psfdae.sensing.summary import nearest_modes, summarise_modes
 from psfdae.telescope.field import Terms, telescope_model, terms_of
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
@@ -415,3 +415,47 @@ class Wavefronts:
         - place, flux and sky with errors, as in `measured`.
         """
         return wavefront_table(self)
+
+
+def wavefront_table(wavefronts: Wavefronts) -> Table:
+    """Return the table with a row for every star and mode; see `Wavefronts.table`."""
+    from astropy.table import Column, Table
+
+    # Rows of the summary, then one for each star without usable pixels, ordered by star.
+    summary, stamps = wavefronts.summary, wavefronts.stamps
+    star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), wavefronts.star))
+    unusable = np.full(star.size - summary["star"].size, np.nan)
+    order = np.argsort(star, kind="stable")
+    star = star[order]
+
+    def completed(values: np.ndarray) -> np.ndarray:
+        # Values of the summary, and NaN for stars that it has not.
+        return np.append(values, unusable)[order]
+
+    columns: list[tuple[str, np.ndarray, str | None]] = [
+        ("id", stamps.id[star], None),
+        # Number of the mode: rows since the first one of the star.
+        ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
+        ("probability", completed(summary["probability"]), None),
+        ("explained", wavefronts.explained[star], None),
+        ("chi2", wavefronts.chi2[star], None),
+        ("snr", wavefronts.snr[star], None),
+        ("x_deg", wavefronts.field_deg[star, 0], "deg"),
+        ("y_deg", wavefronts.field_deg[star, 1], "deg"),
+    ]
+    for k, name in enumerate(wavefronts.terms.names):
+        # Coefficients with the standard deviation of their mode.
+        error = np.sqrt(summary["covariance"][:, k, k])
+        columns.append((name, completed(summary["mean"][:, k]), "wave"))
+        columns.append((f"{name}_error", completed(error), "wave"))
+    # The RMS is that of the whole posterior, the same for all modes of a star.
+    for name, waves in zip(("rms", "rms_error"), wavefronts.rms, strict=True):
+        columns.append((name, wavefronts.wavelength_nm * waves[star], "nm"))
+    for name, values in wavefronts.measured().items():
+        columns.append((name, values[star], "pix" if name[0] in "xy" else None))
+    table = Table()
+    for name, values, unit in columns:
+        # A wave is no unit of the FITS standard; the description has it.
+        fits_unit = None if unit == "wave" else unit
+        table[name] = Column(values, unit=fits_unit, description=unit)
+    return table

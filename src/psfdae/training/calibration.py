@@ -28,7 +28,7 @@ from psfdae.denoise.error_model import (
     mahalanobis,
 )
 from psfdae.denoise.flux_model import FluxModel
-from psfdae.denoise.star_model import PsfModel
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.stamps import StarFlag
 from psfdae.methods.interface import Method
 from psfdae.training.star_sets import HeldOutStars, ModelStars
@@ -191,12 +191,12 @@ def calibrated(
         measured=bundle.errors.measured,
     )
     # With other noise, factors of these errors where flux, sky or noise are estimated.
-    model = PsfModel(replace(bundle, errors=calibration), fitted)
+    model = StarModel(replace(bundle, errors=calibration), fitted)
     rng = stream(seed, "noise", "calibration", "scales")
     return replace(bundle, errors=with_case_scales(model, stars, rng)), errors
 
 
-def with_case_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) -> ErrorModel:
+def with_case_scales(model: StarModel, stars: HeldOutStars, rng: np.random.Generator) -> ErrorModel:
     """Return the errors of a model with what noise, flux, sky and brightness do to them.
 
     No training must have seen the stars: where noise is far below the errors that a method makes
@@ -222,7 +222,7 @@ def with_case_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Genera
 
 
 def _scales_at(
-    model: PsfModel, stars: HeldOutStars, node: float, rng: np.random.Generator
+    model: StarModel, stars: HeldOutStars, node: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return what the cases do to the errors of noisy test stars of one noise.
 
@@ -276,7 +276,7 @@ def _scales_at(
     return noise, scale, flux_scale
 
 
-def with_training_stars(model: PsfModel, stars: ModelStars) -> Bundle:
+def with_training_stars(model: StarModel, stars: ModelStars) -> Bundle:
     """Return the bundle of a model with limits of outliers that training stars are not beyond.
 
     The noise of a training star is in the axes of the training, along which a star of the same
@@ -285,7 +285,7 @@ def with_training_stars(model: PsfModel, stars: ModelStars) -> Bundle:
 
     Parameters
     ----------
-    model : PsfModel
+    model : StarModel
     stars : ModelStars
         Those of a simulation change nothing: they have no noise.
     """
@@ -312,7 +312,7 @@ def with_training_stars(model: PsfModel, stars: ModelStars) -> Bundle:
     return replace(bundle, errors=errors)
 
 
-def with_model_errors(model: PsfModel, fitted: Method, seed: int) -> Bundle:
+def with_model_errors(model: StarModel, fitted: Method, seed: int) -> Bundle:
     """Return the bundle of a model with the errors of measured stars that the model makes.
 
     Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
@@ -371,7 +371,7 @@ def with_misfit(
     for misfit in misfits:
         # The same stars with another idea of the noise of the flux's estimate.
         tried_info = info.model_copy(update={"misfit": misfit})
-        model = PsfModel(replace(bundle, info=tried_info), fitted)
+        model = StarModel(replace(bundle, info=tried_info), fitted)
         logs = []
         for images, star in noisy:
             prediction = model.predict(images)

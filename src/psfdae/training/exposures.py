@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from psfdae.base.errors import warn
 from psfdae.base.version import __version__
 from psfdae.denoise.bundle import creation_date
 from psfdae.denoise.image_prediction import other_instrument
-from psfdae.denoise.star_model import PsfModel
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
+from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
 from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
@@ -22,10 +24,12 @@ from psfdae.stars.bright_stars import BrightStars
 from psfdae.training.packing import checksum
 from psfdae.training.settings import of_config
 from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
-from psfdae.training.stars import Stars
+from psfdae.training.stars import ImageStars
+
+Model = TypeVar("Model", bound=StarModel)
 
 
-def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, str]:
+def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     """Adapt a model to the bright stars of another exposure of the same camera.
 
     The PSF at a position changes from that of `model` by as much as cross-validation with the stars
@@ -34,7 +38,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
 
     Parameters
     ----------
-    model : PsfModel
+    model : StarModel
         Model of the method field, trained on an exposure with many stars.
     source : ImageInput
         The other exposure, and what is stated about it.
@@ -43,7 +47,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
 
     Returns
     -------
-    model : PsfModel
+    model : StarModel
     message : str
         Remarks on the image and its list, the number of stars, and a difference of telescope,
         camera or filter; one line each.
@@ -77,7 +81,7 @@ def exposure(model: PsfModel, source: ImageInput, name: str) -> tuple[PsfModel, 
     # Its bright stars, chosen as those of the training, but few are enough.
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
-    observation = source.open(info.stamp_px, calibration.margin_px).assuming()
+    observation = open_observation(source, info.stamp_px, calibration.margin_px).assuming()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
@@ -121,19 +125,19 @@ def note_empty_quarters(low: np.ndarray, high: np.ndarray, position: np.ndarray)
     return [f"{note}: the change of the PSF is not measured there"] if empty else []
 
 
-def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
+def for_exposures(model: Model, stars: ImageStars) -> dict[str, Model]:
     """Adapt a model of several exposures to each of them.
 
     Parameters
     ----------
-    model : PsfModel
+    model : StarModel
         Model that `psfdae.fit` made of the stars of all exposures.
-    stars : Stars
+    stars : ImageStars
         Stars of several images.
 
     Returns
     -------
-    dict of str to PsfModel
+    dict of str to StarModel
         Adapted models, by the images' names without suffix; `model` itself where its method knows
         no field, or an image has fewer than 5 bright stars.
     """
@@ -146,15 +150,15 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
     return models
 
 
-def adapted_to_stars(model: PsfModel, stars: Stars) -> PsfModel:
+def adapted_to_stars(model: Model, stars: ImageStars) -> Model:
     """Adapt a model to the stars of one other image, without those that are held out for a test.
 
     Parameters
     ----------
-    model : PsfModel
+    model : StarModel
         Model of the method field, with stamps as large as those of the stars, that was not adapted
         itself.
-    stars : Stars
+    stars : ImageStars
         Bright stars of the other image.
     """
     model, train = model.to_image_frame(stars.observation)[0], stars.split.train
@@ -163,10 +167,10 @@ def adapted_to_stars(model: PsfModel, stars: Stars) -> PsfModel:
     # The checksum of the stars that were learnt from shows a test that it saw no other.
     learnt = checksum(stars.product["realisation"][train], stars.product[stars.reference][train])
     info = adapted.info.model_copy(update={"training_sha256": learnt})
-    return PsfModel(replace(adapted.bundle, info=info))
+    return type(model)(replace(adapted.bundle, info=info))
 
 
-def _adapt(model: PsfModel, observation: Observation, bright: BrightStars, name: str) -> PsfModel:
+def _adapt(model: Model, observation: Observation, bright: BrightStars, name: str) -> Model:
     """Return a copy of a model with the field of an exposure, and a description that says so."""
     info, training, field = model.info, model.info.config["stars"], model.method
     assert isinstance(field, FieldMixture)
@@ -193,4 +197,4 @@ def _adapt(model: PsfModel, observation: Observation, bright: BrightStars, name:
         "config": info.config | {"stars": training | image},
     }
     info = info.model_copy(update=description)
-    return PsfModel(replace(model.bundle, info=info, weights=weights))
+    return type(model)(replace(model.bundle, info=info, weights=weights))

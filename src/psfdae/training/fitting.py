@@ -8,12 +8,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import needed_by
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
 from psfdae.base.threads import fixed_threads
-from psfdae.denoise.star_model import PsfModel
+from psfdae.denoise.star_model import StarModel
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.methods.fit_files import described_by
@@ -25,50 +24,21 @@ from psfdae.training.packing import model_of, with_wings
 from psfdae.training.settings import with_keywords
 from psfdae.training.star_choice import ENOUGH_STARS
 from psfdae.training.star_sets import field_positions, fit_apart, noise_model
-from psfdae.training.stars import Stars
+from psfdae.training.stars import ImageStars
 
 Kind = TypeVar("Kind", bound=Method)
 
 
-@check_arguments
-def fit(
-    stars: Stars,
-    method: str | None = None,
-    *,
-    name: str | None = None,
-    licence: str = "not stated",
-    **settings: object,
-) -> PsfModel:
+def fit_model(
+    stars: ImageStars,
+    method: str | None,
+    name: str | None,
+    licence: str,
+    settings: Mapping[str, object],
+) -> StarModel:
     """Train a model on the bright stars of images, without those that are held out.
 
-    Parameters
-    ----------
-    stars : Stars
-    method : str, optional
-        "gmm", "field" or "dae"; by default, of the methods in the settings, the one with the
-        smallest error on validation stars, or "field" where stars are few.
-    name : str, optional
-        Name of the model; by default the image's.
-    licence : str
-        Licence of the model.
-    **settings
-        Keys of the method's settings, such as `orders=[0, 1, 2]` for "field".
-
-    Returns
-    -------
-    PsfModel
-        `save` writes it to a file.
-
-    Raises
-    ------
-    Error
-        If the method's fits cannot be saved as a model, a package is missing, or a setting is
-        wrong.
-
-    Examples
-    --------
-    >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
-    PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
+    Parameters are those of `psfdae.fit`; `settings` are the settings of the method.
     """
     # Candidates: the stated method, or all of the settings of which one becomes the model.
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
@@ -85,7 +55,7 @@ def fit(
     return pack_model(stars, fits[chosen_name], name or stars.name, licence)
 
 
-def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
+def worth_trying(stars: ImageStars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
     """Return the methods that may become the model: for few stars, "field" alone.
 
     Too few stars are left to choose a method by validation, and only the method "field" falls back
@@ -102,12 +72,12 @@ def makes_models(name: str) -> bool:
     return kind.storage is not None and kind.packing is not None
 
 
-def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
+def fitted_to(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
     """Fit a method to the stars that are not held out.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
     kind : type of Method
     checkpoint : Path, optional
         File for the state of a long fit, from which it goes on if it was interrupted.
@@ -123,25 +93,25 @@ def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) ->
         return kind.fit(data, **kind.settings(stars.settings))
 
 
-def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
+def described(stars: ImageStars, kind: type[Method]) -> dict[str, Any]:
     """Return the settings that determine a fit, for the description of its product and model.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
     kind : type of Method
         The fitted method, whose groups of settings count beside split and truth.
     """
     group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
-    return described_by(kind, group_settings, Stars.split_kind, Stars.reference)
+    return described_by(kind, group_settings, ImageStars.split_kind, ImageStars.reference)
 
 
-def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
+def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
     """Choose the method with the smallest error on validation stars, unseen by what is judged.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
     fits : mapping of str to Method
         Fits to these stars, by name of the method.
 
@@ -179,14 +149,14 @@ def choose_method(stars: Stars, fits: Mapping[str, Method]) -> tuple[str, dict[s
     return min(errors, key=errors.__getitem__), errors
 
 
-def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
+def pack_model(stars: ImageStars, fitted: Method, name: str, licence: str) -> StarModel:
     """Return the model of a fit with its errors on held-out stars, and with wings.
 
     Wings are there if the method knows the field, and an image shows any.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
     fitted : Method
         Fit to these stars.
     name, licence : str
@@ -197,7 +167,7 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
     description = described(stars, type(fitted))
     with fixed_threads(settings.evaluation.threads):
         model = model_of(
-            fitted, stars.product, Stars.reference, settings, description, name, licence
+            fitted, stars.product, ImageStars.reference, settings, description, name, licence
         )
         if not fitted.knows_field or stars.observation.shape is None:
             return model
@@ -210,4 +180,4 @@ def pack_model(stars: Stars, fitted: Method, name: str, licence: str) -> PsfMode
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model
-    return PsfModel(with_wings(model.bundle, Wings.joined(wings)), model.method)
+    return StarModel(with_wings(model.bundle, Wings.joined(wings)), model.method)

@@ -23,7 +23,7 @@ from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
 from psfdae.training.fitting import fitted_to
 from psfdae.training.star_residuals import reject_misfits
-from psfdae.training.stars import Stars, stars_of_candidates
+from psfdae.training.stars import ImageStars, stars_of_candidates
 
 
 class _Field(FieldPsfs):
@@ -64,12 +64,12 @@ class _Field(FieldPsfs):
         return self.fitted.psf_at(position, oversampling)
 
 
-def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
+def without_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
     """Choose the bright stars of an image again, with the light of all other stars subtracted.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
         Bright stars of one image. If they were chosen in spite of neighbours that are brighter than
         `neighbour_ratio`, they start a second round.
     neighbour_ratio : float
@@ -77,7 +77,7 @@ def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
 
     Returns
     -------
-    Stars
+    ImageStars
         The stars as they were, with a note that tells why, if their image cannot be fitted.
     """
     # The new choice has the stated limit on neighbours, and a nearer one on their distance.

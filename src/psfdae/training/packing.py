@@ -1,6 +1,6 @@
 """Packing of a fit: a model with its errors on test stars and all that it takes to apply it.
 
-In go a fitted method and the product "stars" that it was fitted to; out comes a `PsfModel`, which
+In go a fitted method and the product "stars" that it was fitted to; out comes a `StarModel`, which
 a bundle keeps. Errors of the model are found in `psfdae.training.calibration`.
 """
 
@@ -22,7 +22,7 @@ from psfdae.base.version import __version__
 from psfdae.denoise.bundle import Bundle, BundleError, creation_date, estimator
 from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.flux_model import FluxModel, signal_to_noise
-from psfdae.denoise.star_model import PsfModel
+from psfdae.denoise.star_model import StarModel
 from psfdae.methods.bundle_info import BundleInfo
 from psfdae.methods.interface import Method
 from psfdae.methods.metrics import all_metrics
@@ -48,7 +48,7 @@ def model_of(
     name: str,
     licence: str,
     largest_mb: float | None = None,
-) -> PsfModel:
+) -> StarModel:
     """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
 
     Parameters
@@ -78,10 +78,10 @@ def model_of(
     rng = stream(config.seed, "noise", "calibration", "misfit")
     bundle = with_misfit(bundle, unpacked, held_out, rng)
     if fitted.knows_field:
-        bundle = with_model_errors(PsfModel(bundle, unpacked), fitted, config.seed)
+        bundle = with_model_errors(StarModel(bundle, unpacked), fitted, config.seed)
     # Errors on test stars; in an image, limits of outliers by its training stars, too.
     bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
-    bundle = with_training_stars(PsfModel(bundle, unpacked), model_stars)
+    bundle = with_training_stars(StarModel(bundle, unpacked), model_stars)
     # Metrics of test stars at the noise levels of the configuration.
     noisy = (
         (level, noisy_test_images(config, stars, model_stars.test, level))
@@ -91,7 +91,7 @@ def model_of(
     metrics = metrics_by_level(unpacked, held_out, noisy, errors, area, data_range)
     settings = {**bundle.info.config, "evaluation": config.evaluation.model_dump()}
     info = bundle.info.model_copy(update={"metrics": metrics, "config": settings})
-    return PsfModel(replace(bundle, info=info), unpacked)
+    return StarModel(replace(bundle, info=info), unpacked)
 
 
 def uncalibrated(

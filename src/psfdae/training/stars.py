@@ -1,10 +1,10 @@
-"""`Stars`: the bright stars of images, some for the training of a model, others for its test."""
+"""`ImageStars`: bright stars of images, some for the training of a model, others for its test."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -15,39 +15,26 @@ import numpy as np
 from psfdae.base.files import Column, Product
 from psfdae.base.rng import stream
 from psfdae.base.settings import Noise
-from psfdae.image.containers import as_images
-from psfdae.image.errors import ObservationError
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
-from psfdae.image.selection import Candidates, Verdict
+from psfdae.image.selection import Candidates
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
-from psfdae.training.settings import Settings, settings_model, with_keywords
-from psfdae.training.star_choice import (
-    ENOUGH_STARS,
-    MIN_STARS_WITH_ERROR,
-    choose_bright_stars,
-    few_stars_notes,
-    require_one_camera,
-    require_unique_names,
-)
-from psfdae.training.star_residuals import reject_misfits
+from psfdae.training.settings import Settings
 from psfdae.training.star_sets import split_stars, training_set
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
     from psfdae.methods.interface import Method, TrainingSet
 
 
 @dataclass(frozen=True, eq=False)
-class Stars:
+class ImageStars:
     """Bright stars of an image, and the images for the training and the test of methods.
 
     Stars of several exposures are one set; `exposures` has those of each.
@@ -66,7 +53,7 @@ class Stars:
         Settings, with the noise levels that follow from the stars.
     notes : sequence of str
         Facts about the camera and the list, and advice on settings.
-    exposures : sequence of Stars
+    exposures : sequence of ImageStars
         The stars of each image, if there are several.
 
     Examples
@@ -84,88 +71,14 @@ class Stars:
     held_out: np.ndarray
     settings: Settings
     notes: Sequence[str]
-    exposures: Sequence[Stars] = ()
+    exposures: Sequence[ImageStars] = ()
     split_kind: ClassVar[str] = "held_out"
     """Kind of the split: all images of a star are in the training, or all are in the test."""
     reference: ClassVar[str] = "realisation"
     """Array of `product` with the truth: the noise-free image of the star itself."""
 
-    @classmethod
-    def from_image(
-        cls, image: Image | Sequence[Image], catalogue: StarList | None = None, **statements: Any
-    ) -> Stars:
-        """Choose the bright stars of an image and make training data of them.
-
-        Parameters
-        ----------
-        image : path-like, array of shape (h, w) or (n, s, s), NDData, HDU, or several of these
-            FITS image, or cube of stamps; or images that are exposures of one camera, of which all
-            that follows is stated alike. Mask, uncertainty, unit, WCS and meta of CCDData and
-            NDData are used, and the mask of a masked array; an HDUList is read as a file is.
-        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list: a file, a table with its columns, or positions (x, y), 0-based; of several
-            images, one with sky coordinates.
-        **statements
-            Statements on the image, named and explained in
-            `psfdae.image.image_input.ImageStatements`, such as `gain=1.5`: `detect` (True, or the
-            threshold in σ), `threshold`, `on_image`, `extension`, `origin`, `mask`, `bad_bits`,
-            `weight`, `variance`, `error`, `pixel_scale_arcsec`, `gain`, `read_noise`, `saturate`,
-            `colour_column`, `accept_offset`. All others are settings, keys of `CalibrationStars`,
-            `Stamp` and `Parts`, or `seed`; such as `snr_min=50` or `stamp_px=24`.
-
-        Raises
-        ------
-        Error
-            If the image or the list cannot be used, or too few stars are bright enough.
-        """
-        images = as_images(image)
-        if not images:
-            raise ObservationError("image", "no image, expected at least one")
-        # Keywords are statements on the image, or else settings.
-        names = {field.name for field in fields(ImageStatements)}
-        settings = {name: value for name, value in statements.items() if name not in names}
-        stated = {name: value for name, value in statements.items() if name in names}
-        # All images are opened with the same statements.
-        source = ImageInput(images[0], catalogue=catalogue, **stated)
-        settings_of_all = with_keywords(settings_model()(), Settings.image_groups, settings)
-        return cls.of(source.of_each(images), settings_of_all)
-
-    @classmethod
-    def of(cls, sources: Sequence[ImageInput], settings: Settings) -> Stars:
-        """Choose the bright stars of images with their options; errors are those of `from_image`.
-
-        A single image must have enough stars itself; of several, all together must.
-        """
-        require_unique_names(sources)
-        calibration = settings.calibration_stars
-        opened: Sequence[Observation] = [
-            source.open(settings.framing.stamp_px, calibration.margin_px).assuming()
-            for source in sources
-        ]
-        for observation in opened:
-            observation.check_planes()
-        require_one_camera(opened)
-        opened, candidates, relaxed, notes = choose_bright_stars(opened, settings)
-        # Bright stars of each image; those of a crowded image again without their neighbours.
-        exposures = []
-        for source, observation, measured in zip(sources, opened, candidates, strict=True):
-            image_candidates = reject_misfits(measured, relaxed, observation.gain)
-            # Of several images, one may have few stars or none.
-            if len(sources) == 1:
-                min_stars = relaxed.calibration_stars.stars_min
-                image_candidates.require(observation.path, min_stars, observation.remarks)
-            stars = stars_of_candidates(source, observation, image_candidates, relaxed)
-            if is_crowded(stars):
-                from psfdae.training.neighbours import without_neighbours
-
-                stars = without_neighbours(stars, calibration.neighbour_ratio)
-            exposures.append(stars)
-        stars = exposures[0] if len(exposures) == 1 else joined_stars(exposures)
-        few_notes = few_stars_notes(stars.candidates.bright.row, stars.held_out)
-        return replace(stars, notes=(*stars.notes, *notes, *few_notes))
-
     @property
-    def images(self) -> Sequence[Stars]:
+    def images(self) -> Sequence[ImageStars]:
         """Stars of each image."""
         return self.exposures or (self,)
 
@@ -223,7 +136,7 @@ class Stars:
         """Default name of a model of these stars: that of the image, or "all" of several."""
         return "all" if self.exposures else self.source.name
 
-    def with_settings(self, settings: Settings) -> Stars:
+    def with_settings(self, settings: Settings) -> ImageStars:
         """Return these stars with other settings of methods."""
         # The images are drawn once for all methods.
         stars = replace(self, settings=settings)
@@ -299,7 +212,7 @@ class Stars:
 
 def stars_of_candidates(
     source: ImageInput, observation: Observation, candidates: Candidates, settings: Settings
-) -> Stars:
+) -> ImageStars:
     """Return the bright stars among the measured stars of an observation.
 
     Parameters
@@ -334,36 +247,17 @@ def stars_of_candidates(
         settings = with_degraded_levels(settings, bright, sky_photons)
     # Every fifth star is held out, evenly over the field.
     held_out = held_out_fields(star_grid(bright.position))
-    return Stars(source, observation, candidates, held_out, settings, tuple(notes))
+    return ImageStars(source, observation, candidates, held_out, settings, tuple(notes))
 
 
-def is_crowded(stars: Stars) -> bool:
-    """Return True if so many bright stars have neighbours that it pays to subtract these.
-
-    Parameters
-    ----------
-    stars : Stars
-        Stars of one image.
-    """
-    # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
-    has_image = stars.observation.shape is not None
-    if not has_image or not np.isfinite(stars.candidates.bright.position).all():
-        return False
-    # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that have
-    # neighbours than stars without, those without are enough.
-    crowded = np.count_nonzero(stars.candidates.verdict == Verdict.CROWDED)
-    enough = max(len(stars), ENOUGH_STARS)
-    return len(stars) >= MIN_STARS_WITH_ERROR and bool(crowded >= enough)
-
-
-def joined_stars(exposures: Sequence[Stars]) -> Stars:
+def joined_stars(exposures: Sequence[ImageStars]) -> ImageStars:
     """Join the stars of several images of one camera, chosen with the same settings.
 
     A star is held out if it is in its own image.
 
     Parameters
     ----------
-    exposures : sequence of Stars
+    exposures : sequence of ImageStars
         The stars of each image, two images or more.
 
     Raises
@@ -386,7 +280,7 @@ def joined_stars(exposures: Sequence[Stars]) -> Stars:
         [image.settings.noise.background_photons for image in exposures],
         [len(image) for image in exposures],
     )
-    return Stars(
+    return ImageStars(
         first.source,
         observation,
         candidates,

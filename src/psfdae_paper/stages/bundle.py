@@ -26,7 +26,7 @@ from psfdae.denoise.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.denoise.star_model import PsfModel
+from psfdae.denoise.star_model import StarModel
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import CONFIG, Method
@@ -210,7 +210,7 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
         info = bundle.info
         weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
         bundle = replace(bundle, weights=weights)
-    model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
+    model, truth, noise = StarModel(bundle), data.images[data.validation], noise_model(config)
     # Flux and sky of the noisy stars are unknown to the model; the PSF of flux 1 is compared with
     # the noise-free star.
     log_errors = []

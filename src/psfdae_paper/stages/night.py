@@ -24,7 +24,7 @@ from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.commands.cli import refusal, typed_values
 from psfdae.denoise.bundle import SUFFIX
-from psfdae.image.image_input import ImageInput, ImageStatements
+from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import write_table
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation.night import (
@@ -37,8 +37,8 @@ from psfdae_paper.evaluation.night import (
 from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
 
 if TYPE_CHECKING:
-    from psfdae.denoise.star_model import PsfModel
-    from psfdae.training.stars import Stars
+    from psfdae.api import PsfModel
+    from psfdae.training.stars import ImageStars
 
 Row = dict[str, object]
 
@@ -54,7 +54,7 @@ def listed_images(text: str) -> list[dict[str, str]]:
     ----------
     text : str
         A list has the column `image` and further ones; those that are named as a field of
-        `ImageStatements` are stated of the image, all are kept.
+        `ImageOptions` are stated of the image, all are kept.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
     listed = text_rows(rows, "image", "name", "reason")
     results: dict[str, Row] = {row["name"]: {**row} for row in listed}
     # Bright stars of the images, by camera, filter and size of stamps, which a model cannot change.
-    groups: dict[tuple[object, ...], dict[str, Stars]] = {}
+    groups: dict[tuple[object, ...], dict[str, ImageStars]] = {}
     for name, row in results.items():
         try:
             if not row["reason"]:
@@ -195,7 +195,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
     out : Path
         HTML page that needs no other file, but links the images' reports.
     """
-    from psfdae.denoise.star_model import load_model
+    from psfdae.api import load_model
 
     night = read_night(table, "name", "verdict", "reason")
     # PSFs over the field of the best, the median and the worst image, by the FWHM in the middle.
@@ -237,17 +237,17 @@ def reason_of(error: Exception, row: Mapping[str, object]) -> str:
     return " ".join(message.removeprefix(f"{row['image']}: ").split())
 
 
-def bright_stars(row: Mapping[str, object]) -> Stars:
+def bright_stars(row: Mapping[str, object]) -> ImageStars:
     """Return the bright stars of an image of the list; without a catalogue they are detected."""
+    from psfdae.training.from_image import collect_stars
     from psfdae.training.settings import settings_model
-    from psfdae.training.stars import Stars
 
-    stated = typed_values(ImageStatements, {name: str(text) for name, text in row.items()})
+    stated = typed_values(ImageOptions, {name: str(text) for name, text in row.items()})
     source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in stated, **stated})
-    return Stars.of([source], settings_model()())
+    return collect_stars([source], settings_model()())
 
 
-def log_sizes(stars_by_name: Mapping[str, Stars]) -> dict[str, np.ndarray]:
+def log_sizes(stars_by_name: Mapping[str, ImageStars]) -> dict[str, np.ndarray]:
     """Return the logarithms of the FWHM (px) and axis ratio of an image's mean PSF, by its name."""
     from psfdae.stars.moments import measure_shapes
 
@@ -257,7 +257,7 @@ def log_sizes(stars_by_name: Mapping[str, Stars]) -> dict[str, np.ndarray]:
 
 
 def from_most_usual(
-    stars_by_name: Mapping[str, Stars], sizes: Mapping[str, np.ndarray]
+    stars_by_name: Mapping[str, ImageStars], sizes: Mapping[str, np.ndarray]
 ) -> list[str]:
     """Return the names of images, that which is most like the median image of the group first.
 
@@ -273,10 +273,10 @@ def from_most_usual(
     return [most_usual, *(name for name in stars_by_name if name != most_usual)]
 
 
-def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
+def model_of_image(stars: ImageStars, start: PsfModel | None) -> PsfModel:
     """Return the field model of an image, changed from that of another image if there is one."""
+    from psfdae.api import fit
     from psfdae.training.exposures import adapted_to_stars
-    from psfdae.training.fitting import fit
     from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
@@ -292,12 +292,12 @@ def model_of_image(stars: Stars, start: PsfModel | None) -> PsfModel:
     return adapted_to_stars(start, stars)
 
 
-def telescope_state(stars: Stars, telescope: Path) -> Row:
+def telescope_state(stars: ImageStars, telescope: Path) -> Row:
     """Return the numbers of a telescope that explain the brightest stars of an image, and errors.
 
     Parameters
     ----------
-    stars : Stars
+    stars : ImageStars
     telescope : Path
         YAML file of the telescope, as `psfdae wavefront` takes it.
 
@@ -331,14 +331,14 @@ def telescope_state(stars: Stars, telescope: Path) -> Row:
     return row
 
 
-def measured(row: Mapping[str, object], stars: Stars, model: PsfModel, folder: Path) -> Row:
+def measured(row: Mapping[str, object], stars: ImageStars, model: PsfModel, folder: Path) -> Row:
     """Write model, catalogue and report page of an image, and return what its row tells.
 
     Parameters
     ----------
     row : mapping
         Row of the list; its `reference` is a star list with magnitudes.
-    stars : Stars
+    stars : ImageStars
     model : PsfModel
     folder : Path
         Files begin with the row's name.

@@ -1,0 +1,373 @@
+"""Fit of the light of stars outside their stamps, and of the sky that is left without it.
+
+All pixels of the image together give the profile p of the wings (`psfdae.psf.wings`) by weighted
+least squares, with a prior: the light falls off outside of the stamp about as for other telescopes.
+Bright stars outweigh the prior; few faint ones hardly change it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from psfdae.base.progress import steps
+from psfdae.image.detection import Sky, sky_of
+from psfdae.image.sky_level import level_and_noise
+from psfdae.image.trails import saturated_cores
+from psfdae.psf.wings import Wings, expected_profile, tents
+from psfdae.stars.moments import dither
+
+
+class StarFluxes(NamedTuple):
+    """Places and fluxes of n stars, in whose light wings are looked for.
+
+    Attributes
+    ----------
+    place : ndarray, shape (n, 2)
+        x and y in px; NaN where unknown.
+    flux : ndarray, shape (n,)
+        In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 have no
+        wings.
+    outer_share : ndarray, shape (n,)
+        Part of the light in the outer part of the stamp, as `outer_shares` gives it; NaN: no wings.
+    """
+
+    place: np.ndarray
+    flux: np.ndarray
+    outer_share: np.ndarray
+
+
+def star_tents(
+    rows: slice, width: int, stars: StarFluxes, wings: Wings
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
+
+    A window is of rows, counted from `rows.start`, and columns; the image is `width` px wide.
+    """
+    reach, radius = int(wings.radius_px[-1]), wings.radius_px
+    # F s, the factor of all tents of a star.
+    scaled_flux = stars.flux * wings.scale(stars.outer_share)
+    # Unlike in `scale`, stars of unknown outer share are left out.
+    scaled_flux = np.where(np.isfinite(stars.outer_share), scaled_flux, np.nan)
+    is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.place).all(axis=1)
+    # In a crowded image, the thousand brightest stars have most of the light of all wings.
+    lit_stars = np.flatnonzero(is_lit)
+    brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
+    # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
+    middle = np.rint(stars.place[brightest]).astype(int)
+    first = np.maximum(middle - reach, [0, rows.start])
+    end = np.minimum(middle + reach + 1, [width, rows.stop])
+    windows = zip(brightest.tolist(), first.tolist(), end.tolist(), strict=True)
+    for star, (column, row), (column_end, row_end) in windows:
+        if column >= column_end or row >= row_end:
+            continue
+        # Distances of the pixels from the star along either axis, and from its centre.
+        x, y = stars.place[star]
+        across = (np.arange(column, column_end) - x).astype(np.float32)
+        down = (np.arange(row, row_end) - y).astype(np.float32)
+        distance = np.sqrt(np.square(down)[:, None] + np.square(across))
+        # h_0 is 1 in the stamp, and the tents are 0 there.
+        in_stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
+        tents_outside = np.where(in_stamp, 0.0, tents(distance, radius))
+        window = np.s_[row - rows.start : row_end - rows.start, column:column_end]
+        yield window, float(scaled_flux[star]) * np.concatenate([in_stamp[None], tents_outside])
+
+
+def draw_tents(
+    shape: tuple[int, ...], stars: StarFluxes, wings: Wings
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
+    height, width = shape
+    # The tents of a whole image would take K times its memory.
+    for top in steps("wings", range(0, height, 128)):
+        rows = slice(top, min(top + 128, height))
+        tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
+        for window, tented_star in star_tents(rows, width, stars, wings):
+            tented[:, *window] += tented_star
+        yield rows, tented
+
+
+def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
+    """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
+    # One map, to which each star adds the light in its window.
+    image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
+    if wings is not None:
+        for window, tented_star in star_tents(rows, shape[1], stars, wings):
+            image[window] += np.tensordot(wings.profile, tented_star, 1)
+    return image
+
+
+def wings_of(
+    residual: np.ndarray,
+    sigma: np.ndarray,
+    bad: np.ndarray,
+    stars: StarFluxes,
+    stamp_px: int,
+    earlier: Wings | None = None,
+) -> Wings | None:
+    """Fit the wings of stars to what is left of an image without sky and models of its stars.
+
+    An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
+    are more than 4 σ from the wings of an `earlier` fit.
+
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (h, w)
+        What is left of the image, and σ of its pixels, in its unit.
+    bad : ndarray of bool, shape (h, w)
+    stars : StarFluxes
+    stamp_px : int
+        Side of the models' stamps.
+    earlier : Wings, optional
+
+    Returns
+    -------
+    Wings or None
+        None without a star that has light, or without a good pixel.
+    """
+    from scipy.ndimage import uniform_filter
+
+    # Six tents, of which the last one ends 2.5 stamps from the star; those of an earlier fit stay.
+    radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
+    if earlier is not None:
+        radius = earlier.radius_px
+    # The mean of the outer share by light, for which s = 1.
+    flux, outer_share = stars.flux, stars.outer_share
+    has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
+    if not has_light.any():
+        return None
+    mean_share = float(np.average(outer_share[has_light], weights=flux[has_light]))
+    if not mean_share > 0:
+        return None
+    count = len(radius)
+    unfitted = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
+    # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
+    # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
+    # So σ² is averaged over a stamp.
+    variance = np.square(sigma)
+    smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
+    # A mean is not below the least value, but for the rounding of running sums.
+    np.maximum(smooth_variance, variance.min(), out=smooth_variance)
+    smooth_sigma = np.sqrt(smooth_variance, out=smooth_variance)
+    del variance, smooth_variance
+    # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
+    # of A is (F s h_k, 1)/σ of a pixel, and d its residual over σ; the same in blocks of a stamp.
+    normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
+    square, pixels, blocks = 0.0, 0, []
+    for band, tented in draw_tents(residual.shape, stars, unfitted):
+        is_used = ~bad[band]
+        if earlier is not None:
+            deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
+            # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
+            is_used &= np.abs(deviation) < 4.0 * sigma[band]
+        weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
+        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
+        flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
+        normal, projection = normal + flat @ flat.T, projection + flat @ data
+        square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
+        # Blocks at the lower and right edges may be smaller.
+        sums = np.concatenate([design, [residual[band] * weight, weight > 0]])
+        for axis in (1, 2):
+            sums = np.add.reduceat(sums, range(0, sums.shape[axis], stamp_px), axis=axis)
+        blocks.append(sums.reshape(len(sums), -1))
+    if not normal[-1, -1] > 0:
+        return None
+    *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
+    # Least squares of p with its prior, and of the even light without one, in units of the prior's
+    # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, that
+    # of the pixels and that of sums over blocks: an uneven sky and undetected sources leave
+    # residuals that neighbours share, as wide as wings.
+    expected, prior_sigma = expected_profile(radius, mean_share)
+    unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
+    normal, projection = normal * unit * unit[:, None], projection * unit
+    prior = np.diag(np.append(np.ones(count), 0.0))
+    prior_projection = np.append(expected / prior_sigma, 0.0)
+    # χ² depends on x: three rounds.
+    chi2 = 1.0
+    for _ in range(3):
+        inverse = np.linalg.inv(normal / chi2 + prior)
+        parameters = inverse @ (projection / chi2 + prior_projection)
+        residual_square = square - 2.0 * parameters @ projection + parameters @ normal @ parameters
+        chi2_of_pixels = residual_square / max(pixels, 1)
+        # The square of a sum of n independent residuals is n on average.
+        block_residual = block_light - (parameters * unit) @ np.array(block_design)
+        chi2_of_blocks = float(block_residual @ block_residual) / max(block_pixels.sum(), 1.0)
+        chi2 = max(chi2_of_pixels, chi2_of_blocks, 1.0)
+    parameters, inverse = parameters * unit, inverse * unit * unit[:, None]
+    return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
+
+
+def add_model_errors(
+    error: np.ndarray, star_light: np.ndarray, wing_light: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Return σ (h, w) of an image without its stars: its noise, and the errors of their models.
+
+    These are 3 % of the models' light and 30 % of the wings': wings are round here; a telescope's
+    may differ from that by as much in a pixel.
+    """
+    return np.asarray(np.hypot(np.hypot(error, 0.03 * star_light), 0.3 * wing_light))
+
+
+def around_stars(
+    image: np.ndarray,
+    sky: Sky,
+    error: np.ndarray,
+    star_light: np.ndarray,
+    stars: StarFluxes,
+    stamp_px: int,
+    earlier: Wings | None,
+    tolerance: float,
+    is_saturated: np.ndarray,
+) -> tuple[Sky, np.ndarray, Wings | None]:
+    """Find wings and sky of an image (h, w) in turns, without the models of its stars.
+
+    A sky map takes wide wings for sky until the wings are known.
+
+    Parameters
+    ----------
+    image, error, star_light : ndarray, shape (h, w)
+        Image with its sky, σ of its pixels, and light of the models of its stars.
+    sky : Sky
+        As it is known so far; its `bad` pixels do not count.
+    stars : StarFluxes
+        Positions and fluxes of the stars.
+    stamp_px : int
+        Side of the stamps in which the model has the light of a star.
+    earlier : Wings or None
+        Wings with which the turns begin.
+    tolerance : float
+        Turns end when the light of the wings changes by less than this part of its error.
+    is_saturated : ndarray of bool, shape (h, w)
+        Saturated pixels.
+
+    Returns
+    -------
+    sky : Sky
+        Sky without wings; its `flat` is what is left without sky, stars and wings.
+    light_of_wings : ndarray, shape (h, w)
+        With the halos of saturated cores without a fitted star.
+    wings : Wings or None
+    """
+    # What is left beside the models has their errors, too.
+    sigma = add_model_errors(error, star_light)
+    without_stars = image - star_light
+    wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
+    light_of_wings = draw_wings(image.shape, stars, wings)
+    # The sky without them, of the same structure, and with its noise map if it has one.
+    sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
+    without_light = without_stars - light_of_wings
+    sky = sky_of(without_light, sky.bad, sigma_map, structure=sky.structure)
+    del without_light
+    # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
+    # are under stars, too: the mean deviation is added to the level.
+    deviation = (without_stars - sky.level - light_of_wings) / sigma
+    clipped = sky.bad | (np.abs(deviation) > 4.0)
+    # Mean deviation Σ (d/σ)/σ over Σ 1/σ².
+    weight = np.where(clipped, 0.0, 1.0 / sigma)
+    deviation *= weight
+    weight *= weight
+    total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
+    even_light = float(deviation.sum(dtype=np.float64)) / total_weight
+    sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
+    # Saturated stars that are not fitted have halos, too.
+    middles = stars.place[stars.flux > 0]
+    for core in saturated_cores(is_saturated):
+        if np.hypot(*(middles - core[:2]).T).min(initial=np.inf) > 2.0:
+            halo = measure_halo(sky.flat, sky.bad, sigma, core)
+            light_of_wings += halo
+            sky = replace(sky, flat=sky.flat - halo)
+    return sky, light_of_wings, wings
+
+
+def measure_halo(
+    residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
+) -> np.ndarray:
+    """Return the light (h, w) around a saturated core: at each distance, the median.
+
+    It ends at the first ring of which the median is below five times its error, or at 256 px.
+
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (h, w)
+        Image without sky and stars, and σ of its pixels.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that are in no ring.
+    core : ndarray, shape (3,)
+        Middle x, y and radius in px.
+    """
+    from scipy import ndimage
+
+    halo, (height, width) = np.zeros_like(residual), residual.shape
+    column, row = np.rint(core[:2]).astype(int)
+    rows = slice(max(row - 256, 0), min(row + 257, height))
+    window = rows, slice(max(column - 256, 0), min(column + 257, width))
+    y, x = np.mgrid[window]
+    radius = np.hypot(x - core[0], y - core[1])
+    # Rings wider by a tenth each; bad pixels are in none.
+    edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
+    ring = np.where(bad[window], 0, np.digitize(radius, edges))
+    numbers = np.unique(ring)[1:-1]
+    level = ndimage.median(residual[window], ring, numbers)
+    middle = ndimage.mean(radius, ring, numbers)
+    # The error of a median of n values is 1.25 σ/√n.
+    error = 1.25 * ndimage.mean(sigma[window], ring, numbers)
+    error /= np.sqrt(np.bincount(ring.ravel())[numbers])
+    # Between the rings it is a power of the distance.
+    count = int(np.logical_and.accumulate(level > 5.0 * error).sum())
+    if count:
+        log_level = np.log(level[:count])
+        power = np.interp(np.log(np.maximum(radius, 1.0)), np.log(middle[:count]), log_level)
+        halo[window] = np.where(radius <= middle[count - 1], np.exp(power), 0.0)
+    return halo
+
+
+def _wings_beside(
+    without_stars: np.ndarray,
+    sky: Sky,
+    sigma: np.ndarray,
+    stars: StarFluxes,
+    stamp_px: int,
+    earlier: Wings | None,
+    tolerance: float,
+) -> Wings | None:
+    """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
+    from scipy.ndimage import uniform_filter
+
+    wings, all_stars = earlier, stars
+    # Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if most
+    # of the 5 × 5 px about it are good, and their RMS residual is below 2 σ, which includes errors
+    # of the PSF.
+    residual, bad = without_stars - sky.level, sky.bad
+    squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
+    mean_square = uniform_filter(squares, 5, mode="constant")
+    good_part = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
+    height, width = bad.shape
+    column, row = np.rint(np.nan_to_num(stars.place, nan=-9.0)).astype(int).T
+    is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
+    is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
+    del squares, mean_square, good_part  # of a large image, each map takes much memory
+    stars = all_stars._replace(flux=np.where(is_star, all_stars.flux, np.nan))
+    unlike_psf = all_stars._replace(flux=np.where(is_star, np.nan, all_stars.flux))
+    # Each turn finds the sky without the wings so far, then the wings on this sky.
+    for _ in steps("light beyond the stamps", range(8)):
+        previous = wings
+        if previous is not None:
+            without_wings = without_stars - draw_wings(bad.shape, all_stars, previous)
+            without_wings[bad] = 0.0
+            without_wings, _ = dither(without_wings, sky.structure.pixel_step)
+            residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
+            # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
+            # small.
+            residual -= draw_wings(bad.shape, unlike_psf, previous)
+        wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
+        if wings is None:
+            break
+        # Until their light changes by less than a part of its error.
+        light, light_sigma = wings.light()
+        if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
+            break
+    return wings
