@@ -52,7 +52,7 @@ def with_network(bundle):
     """The bundle with a network of random weights in place of its method."""
     shape = Architecture(kernels=(5, 3, 5), widths=(4, 4))
     network = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
-    description = bundle.info.model_dump(exclude={"misfit"})
+    description = bundle.info.model_dump()
     description |= {"method": "dae", "dae": shape, "image_scale": 256.0}
     errors = bundle.errors
     unscaled = ErrorModel.uncalibrated(errors.noise, errors.half_width68)

@@ -9,7 +9,6 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import PredictionError, StarFlag
-from psfdae.api import PsfModel
 from psfdae.denoise import denoiser as restoration
 from psfdae.denoise.prediction import CUBES
 from psfdae.image.stamps import cut
@@ -112,9 +111,9 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
 
 def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
     """A shape that the model does not know would pass for flux and for no noise."""
-    no_misfit = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
+    without_floor = shipped.with_errors(replace(shipped.bundle.errors, noise_floor=0.0))
     stars = observe(field_psfs, 3e-5)
-    result, plain = (m.predict(stars.stamps) for m in (shipped, PsfModel(no_misfit)))
+    result, plain = (m.predict(stars.stamps) for m in (shipped, without_floor))
     assert rms(result.flux / stars.flux - 1) < 0.7 * rms(plain.flux / stars.flux - 1)
     assert result.noise.min() > 0.8 * SKY**0.5
     assert (result.flags > 0).mean() < 0.02

@@ -14,7 +14,7 @@ from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
 from psfdae.photometry.crowded import photometry, star_flags
-from psfdae.training.calibration import with_model_errors
+from psfdae.training.calibration import fit_model_errors
 from psfdae.training.fitting import described, fitted_to
 from psfdae.training.packing import uncalibrated, with_wings
 from small_field import GAIN, READ, SKY, noisy
@@ -59,9 +59,10 @@ def fitted(seed):
     field = fitted_to(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
     packed, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
-    bundle = with_model_errors(psfdae.PsfModel(packed), field, 1)
-    wings = photometry(psfdae.PsfModel(bundle), stars.observation, 3.0).image_wings
-    return psfdae.PsfModel(with_wings(bundle, wings))
+    model = psfdae.PsfModel(packed)
+    model = model.with_errors(fit_model_errors(model, field, 1))
+    wings = photometry(model, stars.observation, 3.0).image_wings
+    return psfdae.PsfModel(with_wings(model.bundle, wings))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_no_errors_of_the_model_where_numbers_are_known(models):
     prediction = models[0].predict(stamps, fixed=True, **stated)
     assert (prediction.background_error == 0).all()
     assert (prediction.x_error == 0).all()
-    errors = models[0].bundle.errors.measured
+    errors = models[0].bundle.errors.model
     assert (prediction.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
 
 

@@ -126,7 +126,7 @@ class Stars(ImageStars):
 
 
 class PsfModel(StarModel):
-    """Fitted method with all that it takes to restore stars: photometry, errors and limits.
+    """Fitted method with all that it takes to denoise stars: photometry, errors and limits.
 
     Examples
     --------

@@ -105,7 +105,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
-    warm_up = np.zeros((WARM_UP * model.restorer.block_size, side, side), np.float32)
+    warm_up = np.zeros((WARM_UP * model.denoiser.block_size, side, side), np.float32)
     model.predict(warm_up, threads=threads)
     options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
     rates = {"bare_shared": [], "bare_parallel": [], "predict": []}
@@ -133,7 +133,7 @@ def bare_rate(model, stamps, threads, way):
     mean = model.bundle.flux_model.mean.reshape(1, side, side).astype(np.float32)
     images = np.repeat(mean, min(BARE_STAMPS, stamps), axis=0)
     rounds = -(-stamps // len(images))
-    size = model.restorer.block_size
+    size = model.denoiser.block_size
     blocks = rounds * np.array_split(images, range(size, len(images), size))
 
     def apply(images):
@@ -253,7 +253,7 @@ def covered(bundle, product, seed):
     from psfdae.api import PsfModel
     from psfdae.denoise.bundle import estimator
     from psfdae.denoise.error_model import brightest
-    from psfdae.training.calibration import calibrated
+    from psfdae.training.calibration import fit_case_scales, fit_half_widths
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     settings = part(("seed", "noise", "parts"), trained)
@@ -269,12 +269,14 @@ def covered(bundle, product, seed):
     ]
     cells = {}
     for judges, judged in (halves, halves[::-1]):
-        model = calibrated(bundle, fitted, judges, seed)[0]
+        model = PsfModel(bundle, fitted)
+        model = model.with_errors(fit_half_widths(model, judges, seed)[0])
+        model = model.with_errors(fit_case_scales(model, judges, seed))
         for tested in bundle.info.metrics:
             level = tested["noise_level"]
             flux = float(noise.flux(level))
             stamps = rng.poisson(flux * judged.images + noise.background).astype(np.float32)
-            result = PsfModel(model).predict(stamps, gain=1.0, position=judged.position)
+            result = model.predict(stamps, gain=1.0, position=judged.position)
             good = np.isfinite(result.psf).all(axis=(1, 2))
             # As the calibration has it: the own noise of stars of an image is no error.
             error = flux * judged.errors(result.psf / flux)[good] / result.uncertainty[good]

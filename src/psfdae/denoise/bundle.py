@@ -107,7 +107,7 @@ def estimator(bundle: Bundle) -> Method:
         # A network is checked by torch when its weights are loaded.
         with needed_by(f"the model {info.name!r}"):
             return method_class.unpack(bundle.weights, info)
-    # The method knows which arrays it can work with: it states conditions, and restores a stamp.
+    # The method knows which arrays it can work with: it gives conditions, and denoises a stamp.
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
         fitted = method_class.unpack(bundle.weights, info)

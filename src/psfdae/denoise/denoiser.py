@@ -1,20 +1,21 @@
-"""Restoration of stars by a model bundle: from stamps to PSFs with errors and flags.
+"""Denoising of stars by a model: from stamps to PSFs with errors and flags.
 
 Each star goes through three steps, and no star influences another one:
 
-1. `Restorer._centred`: the star is moved to the middle of its stamp, and its flux, sky and noise
-   are found by the mean PSF of the training (`psfdae.denoise.star_flux`).
-2. The method restores its PSF: `restored_by_measurement` for a method that measures flux, sky and
-   centre itself (`psfdae.methods.field`), `Restorer._by_photometry` for all others.
-3. `Restorer._prediction`: half-widths of the errors, χ², light beyond the stamp, shape and flags.
+1. `Denoiser._centre`: the star is moved to the middle of its stamp, and its flux, sky and noise
+   are estimated with the mean PSF of the training (`psfdae.denoise.star_flux`).
+2. `_denoise`: the method gives its PSF. A `FieldDenoiser` has a method that measures flux, sky and
+   centre itself (`psfdae.methods.field`), a `StampDenoiser` one that corrects the photometry.
+3. `Denoiser._predict`: half-widths of the errors, χ², light outside the stamp, shape and flags.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -45,7 +46,7 @@ MAX_CHI2 = 10.0
 
 
 class CentredStars(NamedTuple):
-    """Stars in the middle of their stamps, with their photometry, before they are restored.
+    """Stars in the middle of their stamps, with their photometry, before they are denoised.
 
     Attributes
     ----------
@@ -107,7 +108,7 @@ class CentredStars(NamedTuple):
         return data, noise, is_unusable
 
 
-class RestoredStars(NamedTuple):
+class DenoisedStars(NamedTuple):
     """PSFs of stars as a method gives them.
 
     Attributes
@@ -136,13 +137,13 @@ class RestoredStars(NamedTuple):
     centre: np.ndarray
     covariance: np.ndarray
 
-    def part(self, rows: slice) -> RestoredStars:
+    def part(self, rows: slice) -> DenoisedStars:
         """Return some of the stars."""
         values: dict[str, Any] = {
             name: array[rows] if isinstance(array, np.ndarray) else array
             for name, array in self._asdict().items()
         }
-        return RestoredStars(**values | {"photometry": self.photometry.part(rows)})
+        return DenoisedStars(**values | {"photometry": self.photometry.part(rows)})
 
     def centre_columns(self) -> dict[str, np.ndarray]:
         """Return the columns on centres, and on errors beside that of the flux.
@@ -161,21 +162,24 @@ class RestoredStars(NamedTuple):
         return columns
 
 
-class Restorer:
-    """A bundle that is ready to use: the method, and the matrices of the photometry.
+class Denoiser(ABC):
+    """A model that is ready to use: the method, and the matrices of the photometry.
 
     Safe to use from several threads.
 
     Parameters
     ----------
     bundle : Bundle
+        Description, arrays and errors of the model.
     method : Method
-        That of the bundle.
+        Its fitted method.
     """
+
+    has_snr_max: ClassVar[bool]
+    """True if stars above the S/N of the training get the flag SNR_HIGH."""
 
     def __init__(self, bundle: Bundle, method: Method) -> None:
         self.bundle, self.method = bundle, method
-        self.free_flux = method.free_flux()
         packing = method.packing or Packing()
         # Stamps of more than 32 px come in smaller blocks.
         pixels = bundle.info.stamp_px**2
@@ -192,7 +196,7 @@ class Restorer:
         size = self.block_size
         return [stars.part(slice(start, start + size)) for start in range(0, len(stars), size)]
 
-    def restore(self, stars: Stamps, fixed: bool = False) -> Prediction:
+    def denoise(self, stars: Stamps, fixed: bool = False) -> Prediction:
         """Return the PSFs of at most `block_size` stars, whose listed centres are exact if `fixed`.
 
         Raises
@@ -211,18 +215,13 @@ class Restorer:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             # 2048 stars at a time are measured and described: their arrays fit in memory.
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
-            centred = [self._centred(part, fixed) for part in parts]
-            if self.method.knows_field:
-                errors = self.bundle.errors
-                restored = [restored_by_measurement(part, self.method, errors) for part in centred]
-            else:
-                restored = self._by_photometry(centred)
-            predictions = map(self._prediction, centred, restored)
+            centred = [self._centre(part, fixed) for part in parts]
+            predictions = map(self._predict, centred, self._denoise(centred))
             return Prediction.joined([*predictions]).of(slice(count))
 
     # Step 1: centring and photometry.
 
-    def _centred(self, stars: Stamps, fixed: bool) -> CentredStars:
+    def _centre(self, stars: Stamps, fixed: bool) -> CentredStars:
         """Move stars to the middle of their stamps, and measure flux, sky and noise there."""
         has_exact_centre = fixed & np.isfinite(stars.listed).all(axis=1)
         side = self.bundle.info.stamp_px
@@ -259,12 +258,102 @@ class Restorer:
 
     # Step 2: the method.
 
-    def _by_photometry(self, centred: Sequence[CentredStars]) -> list[RestoredStars]:
+    @abstractmethod
+    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
+        """Return the PSFs of stars by the method, with fluxes and skies."""
+
+    # Step 3: errors and flags.
+
+    def _predict(self, centred: CentredStars, denoised: DenoisedStars) -> Prediction:
+        """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
+        info, errors = self.bundle.info, self.bundle.errors
+        stars, flags, photometry = centred.stars, centred.flags, denoised.photometry
+        psf, sigma = denoised.psf, denoised.sigma
+        # Noise over the flux: the unit of the training, on which errors and limits depend.
+        noise = photometry.noise / np.where(denoised.has_no_flux, np.nan, photometry.flux)
+        shapes = measure_shapes(psf)
+        # S/N of a matched filter: √(Σ psf²) F/σ.
+        snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
+        distance = mahalanobis(photometry.images, noise, self.bundle.flux_model, info.components)
+        # PSFs, their errors and what is left of the stamps, in the unit of the stamps: errors of
+        # PSFs of flux 1 times the flux, and r = x − b − F psf.
+        flux = photometry.flux.astype(np.float32)[:, None, None]
+        # F psf ± F w, with the half-width w of the case of each star.
+        half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
+        psf *= flux
+        residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
+        # Pixels that were repaired tell nothing.
+        residual[~photometry.used] = np.nan
+        flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
+        chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
+        flux_error = self._flux_errors(photometry, flux_scale, stars.gain)
+        # Flags beside those of centring, photometry and method. The S/N of a star is known to its
+        # tolerance.
+        is_unlike = errors.is_unlike_training(noise, distance, denoised.outlier_score)
+        flags |= photometry.flags
+        raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
+        is_bright = snr > info.snr_max * SNR_TOLERANCE
+        raise_flag(flags, StarFlag.SNR_HIGH, self.has_snr_max & is_bright)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
+        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
+        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
+        columns = {
+            "id": stars.id,
+            "x": stars.x,
+            "y": stars.y,
+            "flux": photometry.flux,
+            "flux_error": flux_error,
+            "noise": photometry.noise,
+            "snr": snr,
+            "ratio95": ratio95[:, 0],
+            "ratio95_bright": ratio95[:, 1],
+            "chi2": chi2,
+            "distance": distance,
+            "outlier_score": denoised.outlier_score,
+            "fwhm_px": shapes.fwhm_px,
+            "ellipticity": shapes.ellipticity,
+            "position_angle_deg": shapes.position_angle_deg,
+            "shift_x": centred.shift[:, 1],
+            "shift_y": centred.shift[:, 0],
+            "flags": flags,
+        }
+        columns |= self._total_fluxes(stars, photometry, flux_error)
+        columns |= denoised.centre_columns()
+        return Prediction(
+            columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
+        )
+
+    @abstractmethod
+    def _flux_errors(
+        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+    ) -> np.ndarray:
+        """Return the standard errors of fluxes (n,), with the photons of the stars.
+
+        `flux_scale` (n,) is the factor of the errors by noise, `gain` (n,) in electrons per unit.
+        """
+
+    @abstractmethod
+    def _total_fluxes(
+        self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
+    ) -> dict[str, Any]:
+        """Return fluxes with the light outside the stamps, and skies without that in the stamps."""
+
+
+class StampDenoiser(Denoiser):
+    """Denoiser with a method that knows the PSF of a star alone, and corrects its photometry."""
+
+    has_snr_max = True
+
+    def __init__(self, bundle: Bundle, method: Method) -> None:
+        super().__init__(bundle, method)
+        self._free_flux = method.free_flux()
+
+    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
         """Restore stars with the fluxes of the photometry, which the method may correct.
 
         A method that finds fluxes does so first, for stars of unknown flux and sky. It takes the
         noise for larger then: what it does not know of a bright star would pass for flux. Parts are
-        restored together, in which some stars have about the same noise.
+        denoised together, in which some stars have about the same noise.
         """
         # Photometry of all parts together, and stars that have none.
         info = self.bundle.info
@@ -278,10 +367,10 @@ class Restorer:
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
         )
         if is_free.any() and self.method.finds_flux:
-            # √(noise² + misfit²): what the method does not know of a star counts as noise.
+            # √(noise² + floor²): what the method does not know of a star counts as noise.
             images, noise = self._normalised(photometry, has_no_flux)
-            level = np.hypot(noise, info.misfit) / info.kappa
-            factor, near_clusters["near_clusters"] = self.free_flux.flux(images, level)
+            level = np.hypot(noise, self.bundle.errors.noise_floor) / info.kappa
+            factor, near_clusters["near_clusters"] = self._free_flux.flux(images, level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
             photometry = photometry.with_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
         psf, sigma = np.full_like(photometry.images, np.nan), None
@@ -298,14 +387,14 @@ class Restorer:
             # Only a model with a limit asks how unlike the training stars they are.
             if self.bundle.errors.outlier_limit is not None:
                 clusters = {name: values[has_flux] for name, values in near_clusters.items()}
-                score[has_flux] = self.free_flux.outlier_score(
+                score[has_flux] = self._free_flux.outlier_score(
                     images[has_flux], level[has_flux], **clusters
                 )
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred)])
         unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
-        restored = RestoredStars(psf, sigma, photometry, has_no_flux, score, *unknown)
-        return [restored.part(slice(*rows)) for rows in pairwise(ends)]
+        denoised = DenoisedStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [denoised.part(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalised(
         self, photometry: Photometry, has_no_flux: np.ndarray
@@ -320,78 +409,44 @@ class Restorer:
         noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
         return images, np.where(has_no_flux, self.bundle.info.noise_max, noise)
 
-    # Step 3: errors and flags.
+    def _flux_errors(
+        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+    ) -> np.ndarray:
+        # σ² of the sky's noise, scaled, and the photons of the star.
+        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / gain)
+        return np.asarray(np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons))
 
-    def _prediction(self, centred: CentredStars, restored: RestoredStars) -> Prediction:
-        """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
-        info, errors = self.bundle.info, self.bundle.errors
-        stars, flags, photometry = centred.stars, centred.flags, restored.photometry
-        psf, sigma = restored.psf, restored.sigma
-        measures_stars = self.method.knows_field
-        # Noise over the flux: the unit of the training, on which errors and limits depend.
-        noise = photometry.noise / np.where(restored.has_no_flux, np.nan, photometry.flux)
-        shapes = measure_shapes(psf)
-        # S/N of a matched filter: √(Σ psf²) F/σ.
-        snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
-        distance = mahalanobis(photometry.images, noise, self.bundle.flux_model, info.components)
-        # PSFs, their errors and what is left of the stamps, in the unit of the stamps: errors of
-        # PSFs of flux 1 times the flux, and r = x − b − F psf.
-        flux = photometry.flux.astype(np.float32)[:, None, None]
-        # F psf ± F w, with the half-width w of the case of each star.
-        half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
-        psf *= flux
-        residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
-        # Pixels that were repaired tell nothing.
-        residual[~photometry.used] = np.nan
-        flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
-        chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
-        # A method that measures stars has the star's photons in its errors. It knows the noise of
-        # bright stars, and comes ever nearer to the star itself: it has no upper limit of the S/N.
-        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
-        photons = np.where(measures_stars, 0.0, photons)
-        flux_error = np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons)
-        # Flags beside those of centring, photometry and method. The S/N of a star is known to its
-        # tolerance.
-        is_unlike = errors.is_unlike_training(noise, distance, restored.outlier_score)
-        flags |= photometry.flags
-        raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
-        is_bright = snr > info.snr_max * SNR_TOLERANCE
-        raise_flag(flags, StarFlag.SNR_HIGH, (not measures_stars) & is_bright)
-        raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
-        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
-        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
-        columns = {
-            "id": stars.id,
-            "x": stars.x,
-            "y": stars.y,
-            "flux": photometry.flux,
-            "flux_error": flux_error,
-            "noise": photometry.noise,
-            "snr": snr,
-            "ratio95": ratio95[:, 0],
-            "ratio95_bright": ratio95[:, 1],
-            "chi2": chi2,
-            "distance": distance,
-            "outlier_score": restored.outlier_score,
-            "fwhm_px": shapes.fwhm_px,
-            "ellipticity": shapes.ellipticity,
-            "position_angle_deg": shapes.position_angle_deg,
-            "shift_x": centred.shift[:, 1],
-            "shift_y": centred.shift[:, 0],
-            "flags": flags,
-        }
-        columns |= self._total_fluxes(stars, photometry, flux_error)
-        columns |= restored.centre_columns()
-        return Prediction(
-            columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
-        )
+    def _total_fluxes(
+        self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
+    ) -> dict[str, Any]:
+        unknown = np.full(len(photometry.flux), np.nan)
+        sky = photometry.background
+        return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
+
+
+class FieldDenoiser(Denoiser):
+    """Denoiser with a method that knows the PSF at every position, and measures stars itself.
+
+    It knows the noise of bright stars, and its PSF comes ever nearer to the star itself: there is
+    no upper limit of the S/N. Its errors of fluxes have the photons of the star.
+    """
+
+    has_snr_max = False
+
+    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
+        return [measure_stars(part, self.method, self.bundle.errors) for part in centred]
+
+    def _flux_errors(
+        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+    ) -> np.ndarray:
+        return np.asarray(np.abs(flux_scale * photometry.flux_error))
 
     def _total_fluxes(
         self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
     ) -> dict[str, Any]:
         """Return fluxes with the light beyond the stamps, and skies without that in the stamps."""
         flux, sky = photometry.flux, photometry.background
-        if self.wings is None or not self.method.knows_field:
+        if self.wings is None:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
@@ -406,12 +461,10 @@ class Restorer:
         return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
 
 
-def restored_by_measurement(
-    centred: CentredStars, method: Method, errors: ErrorModel
-) -> RestoredStars:
-    """Restore stars with the fluxes that the method measures in place of the photometry.
+def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> DenoisedStars:
+    """Denoise stars with the fluxes that the method measures in place of the photometry.
 
-    The photometry repairs bad pixels and tells the noise.
+    The photometry repairs bad pixels and gives the noise.
 
     Parameters
     ----------
@@ -445,7 +498,7 @@ def restored_by_measurement(
     # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
     measured = estimate.measured
     assert measured is not None and estimate.sigma is not None
-    covariance = errors.measured.added_to(measured.covariance, measured.flux, place[:, :2])
+    covariance = errors.model.added_to(measured.covariance, measured.flux, place[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
     # A flux that was given counts if the photometry could use it, another one above its error.
     flux = np.where(has_flux, stars.flux, measured.flux)
@@ -479,7 +532,7 @@ def restored_by_measurement(
     score = np.full(len(flux), np.nan) if score is None else score.copy()
     for array in (estimate.psf, estimate.sigma, centre, covariance, score):
         array[has_no_flux] = np.nan
-    return RestoredStars(
+    return DenoisedStars(
         estimate.psf, estimate.sigma, photometry, has_no_flux, score, centre, covariance
     )
 
@@ -493,7 +546,7 @@ def reduced_chi2(
 ) -> np.ndarray:
     """Return Σ r²/v over what is expected of it, over pixels that are not NaN, (n,).
 
-    A restored star follows its own noise where it is bright. If the method knows the σ u of its
+    A denoised star follows its own noise where it is bright. If the method knows the σ u of its
     pixels, in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at least 1 %, of
     what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
 
@@ -524,3 +577,8 @@ def reduced_chi2(
     )
     chi2 = total / np.where(expected_total > 0, expected_total, np.inf)
     return np.where(is_used.any(axis=(1, 2)), chi2, np.nan)
+
+
+def make_denoiser(bundle: Bundle, method: Method) -> Denoiser:
+    """Return the denoiser of a model with this fitted method."""
+    return (FieldDenoiser if method.knows_field else StampDenoiser)(bundle, method)

@@ -1,4 +1,4 @@
-"""Description of a model: what it was trained for, and how accurately it restores stars.
+"""Description of a model: what it was trained for, and how accurately it denoises stars.
 
 The command `describe` prints it, and a notebook shows a part of it for a `PsfModel`.
 """
@@ -63,7 +63,7 @@ def model_facts(bundle: Bundle) -> dict[str, str]:
 def error_table(info: BundleInfo) -> Table | None:
     """Return the errors of the test stars as a table of texts, a row for each noise level.
 
-    The column "gain" is added: the MSE of the noisy stamps over that of the restored ones. Below
+    The column "gain" is added: the MSE of the noisy stamps over the MSE of the denoised ones. Below
     1 the model makes stars worse than they were. A model that has met no test stars, such as a
     registered one, has no table.
 

@@ -125,8 +125,11 @@ class ErrorModel:
         99.9 % quantile of the distance of test stars (`mahalanobis`).
     outlier_limit : ndarray, shape (S,), or None
         99.9 % quantile of the outlier score of test stars, if the method has a score.
-    measured : ModelErrors
-        Errors of stars that the method measures itself.
+    noise_floor : float
+        Noise over the flux that is added in quadrature to the noise of a star while its flux is
+        found, but not while it is denoised: errors of the PSF's shape would bias the flux.
+    model : ModelErrors
+        Errors of stars that the method measures itself, due to the PSF model.
     """
 
     noise: np.ndarray
@@ -137,7 +140,8 @@ class ErrorModel:
     flux_scale: np.ndarray
     distance_limit: float
     outlier_limit: np.ndarray | None = None
-    measured: ModelErrors = field(default_factory=ModelErrors)
+    noise_floor: float = 0.0
+    model: ModelErrors = field(default_factory=ModelErrors)
 
     @classmethod
     def uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
@@ -159,24 +163,26 @@ class ErrorModel:
             "flux_scale": (nodes,),
             "distance_limit": (),
             "outlier_limit": (nodes,),
-            "measured": (10,),
+            "noise_floor": (),
+            "model": (10,),
         }
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
-        values: dict[str, Any] = {**arrays, "distance_limit": float(arrays["distance_limit"])}
+        values: dict[str, Any] = dict(arrays)
+        values |= {name: float(arrays[name]) for name in ("distance_limit", "noise_floor")}
         # Ten numbers of the model's own errors; the last six are middle and growth of the flux's.
-        table = arrays["measured"]
+        table = arrays["model"]
         flux, sky, centre, fitted_flux = table[:4].tolist()
-        measured = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
-        return cls(**values | {"measured": measured})
+        model = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
+        return cls(**values | {"model": model})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
         # The reverse of `of_arrays`.
         values = {table.name: getattr(self, table.name) for table in fields(self)}
-        values["measured"] = np.hstack(self.measured)
+        values["model"] = np.hstack(self.model)
         return {
             name: np.asarray(value, np.float32 if name == "half_width68" else np.float64)
             for name, value in values.items()

@@ -55,7 +55,7 @@ class Prediction:
           if the model knows none
         - `background`, `noise`: sky level, without the light of the star's wings if the model
           knows it, and RMS of the sky noise in a pixel
-        - `snr`: of a filter matched to the star as restored, √Σ psf² / noise
+        - `snr`: of a filter matched to the denoised star, √Σ psf² / noise
         - `ratio95`, `ratio95_bright`: `uncertainty` times this holds 95 % of the errors, in the
           brightest pixels the second one
         - `chi2`: mean of (residual / σ)² over the used pixels, divided by what is expected of it

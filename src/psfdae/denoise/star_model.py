@@ -1,7 +1,7 @@
-"""`StarModel`: a model of the PSF, with the call that restores stars.
+"""`StarModel`: a model of the PSF, with the call that denoises stars.
 
 A stamp, or an image with its star list, goes in; a `Prediction` with PSFs, their errors, fluxes and
-flags comes out. What happens between is in `psfdae.denoise.denoiser`.
+flags comes out. the steps are in `psfdae.denoise.denoiser`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from psfdae.base.errors import call, keyword
 from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.denoise.bundle import Bundle, estimator, read_bundle, write_bundle
-from psfdae.denoise.denoiser import Restorer
+from psfdae.denoise.denoiser import make_denoiser
+from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.stamp_arrays import stamps_of_arrays
 from psfdae.image.detector_frame import find_offset
@@ -39,7 +40,7 @@ SCALE_TOLERANCE = 0.02
 
 
 class StarModel(FieldPsfs):
-    """Fitted method with all that it takes to restore stars: photometry, errors and limits.
+    """Fitted method with all that it takes to denoise stars: photometry, errors and limits.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class StarModel(FieldPsfs):
 
     def __init__(self, bundle: Bundle, method: Method | None = None) -> None:
         self.bundle = bundle
-        self.restorer = Restorer(bundle, estimator(bundle) if method is None else method)
+        self.denoiser = make_denoiser(bundle, estimator(bundle) if method is None else method)
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     @classmethod
@@ -118,6 +119,10 @@ class StarModel(FieldPsfs):
             tables.append(html_table(errors.colnames, [tuple(row) for row in errors]))
         return "".join(tables)
 
+    def with_errors(self, errors: ErrorModel) -> Self:
+        """Return the same model with other errors."""
+        return type(self)(replace(self.bundle, errors=errors), self.method)
+
     @property
     def info(self) -> BundleInfo:
         """Stamp size, pixel scale, range of S/N and all else that the bundle says."""
@@ -125,8 +130,8 @@ class StarModel(FieldPsfs):
 
     @property
     def method(self) -> Method:
-        """Fitted method that restores the stars."""
-        return self.restorer.method
+        """Fitted method that denoises the stars."""
+        return self.denoiser.method
 
     @check_arguments
     def save(self, path: str | Path) -> None:
@@ -200,11 +205,11 @@ class StarModel(FieldPsfs):
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
-        # Blocks of stars, side by side; each is restored as if it were alone.
-        blocks = self.restorer.blocks(stars) or [stars]
+        # Blocks of stars, side by side; each is denoised as if it were alone.
+        blocks = self.denoiser.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
         with one_thread_each():
-            parts = side_by_side(lambda block: self.restorer.restore(block, fixed), blocks, threads)
+            parts = side_by_side(lambda block: self.denoiser.denoise(block, fixed), blocks, threads)
         return replace(Prediction.joined(parts), unit=unit)
 
     def stream(
@@ -215,13 +220,13 @@ class StarModel(FieldPsfs):
         Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
         taken.
         """
-        # Stamps are read in chunks, each of which is restored in blocks by a thread of its own.
-        restorer = self.to_image_frame(observation)[0].restorer
-        size = restorer.block_size
+        # Stamps are read in chunks, each of which is denoised in blocks by a thread of its own.
+        denoiser = self.to_image_frame(observation)[0].denoiser
+        size = denoiser.block_size
 
         def predicted(stamps: Stamps) -> Prediction:
-            blocks = restorer.blocks(stamps)
-            return Prediction.joined([restorer.restore(block, fixed) for block in blocks])
+            blocks = denoiser.blocks(stamps)
+            return Prediction.joined([denoiser.denoise(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
@@ -255,7 +260,7 @@ class StarModel(FieldPsfs):
     @property
     def wings(self) -> Wings | None:
         """Light of stars beyond their stamps, if the bundle says any."""
-        return self.restorer.wings
+        return self.denoiser.wings
 
     def flux_error(self, place: np.ndarray) -> np.ndarray:
         """Return the relative flux errors of stars at positions (n, 2), x and y, due to the PSF.
@@ -264,7 +269,7 @@ class StarModel(FieldPsfs):
         middle of the field, they are not below those of the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
-        errors = self.bundle.errors.measured
+        errors = self.bundle.errors.model
         return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0))
 
     @property
@@ -335,8 +340,9 @@ class StarModel(FieldPsfs):
         bundle, weights = self.bundle, dict(self.bundle.weights)
         for name in ("low", "high"):
             weights[name] = weights[name] - np.pad(offset, (0, len(weights[name]) - 2))
-        measured = bundle.errors.measured
-        errors = replace(bundle.errors, measured=measured._replace(middle=measured.middle - offset))
+        model_errors = bundle.errors.model
+        moved_errors = model_errors._replace(middle=model_errors.middle - offset)
+        errors = replace(bundle.errors, model=moved_errors)
         shifted_bundle = replace(bundle, weights=weights, errors=errors)
         # Results name the file of the model.
         vars(shifted_bundle)["sha256"] = bundle.sha256

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Version of the format, raised when an older psfdae could not read what a newer one writes."""
 
 Positive = Annotated[float, Field(gt=0)]
@@ -99,9 +99,6 @@ class BundleInfo(_Described):
     method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
     reference: Literal["realisation", "template"]
     """Image that is restored."""
-    misfit: Annotated[float, Field(ge=0)] = 0.0
-    """Noise that stands for the method's error of the PSF: added in quadrature to that of a star
-    while its flux is found, but not while it is restored."""
     config: dict[str, Any]
     """Resolved configuration of all stages, and the wings as Wings.plain gives them."""
     metrics: list[dict[str, float]]

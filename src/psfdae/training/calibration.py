@@ -1,10 +1,8 @@
-"""Calibration of a model's errors by stars that no training has seen.
+"""Calibration of a model's errors on stars that no training has seen.
 
-In go a fitted method and noise-free held-out stars; out comes an `ErrorModel`. Each star gets noise
-of every noise node, the method restores it, and the errors are counted: in each pixel where flux
-and sky are stated, and over all pixels in each case of what had to be estimated. Errors of what
-only the model makes, limits of outliers by the training stars themselves, and the noise with which
-bright stars are measured best are found here, too.
+Inputs: a model whose errors are not calibrated, and its held-out and training stars. Output: an
+`ErrorModel`, in five steps (`calibrate_errors`). Held-out stars are free of noise: each gets the
+noise of every node, the method denoises it, and quantiles of the errors become half-widths.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ import numpy as np
 
 from psfdae.base.progress import steps
 from psfdae.base.rng import stream
-from psfdae.denoise.bundle import Bundle
 from psfdae.denoise.denoiser import SNR_TOLERANCE
 from psfdae.denoise.error_model import (
     ErrorModel,
@@ -175,40 +172,148 @@ def noise_nodes(band: np.ndarray) -> np.ndarray:
     return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, NODES)
 
 
-def calibrated(
-    bundle: Bundle, fitted: Method, stars: HeldOutStars, seed: int
-) -> tuple[Bundle, StarErrors]:
-    """Return the bundle with all that test stars say of its errors, and these errors."""
-    # Errors of stars of known flux and sky, and limits of outliers.
-    rng = stream(seed, "noise", "calibration", "errors")
-    nodes, components = bundle.errors.noise, bundle.info.components
-    errors = StarErrors.measure(stars, fitted, bundle.flux_model, nodes, components, rng)
-    calibration = replace(
-        ErrorModel.uncalibrated(nodes, errors.half_width),
-        ratio95=errors.ratio95(),
-        distance_limit=errors.distance_limit(),
-        outlier_limit=errors.outlier_limit(),
-        measured=bundle.errors.measured,
-    )
-    # With other noise, factors of these errors where flux, sky or noise are estimated.
-    model = StarModel(replace(bundle, errors=calibration), fitted)
-    rng = stream(seed, "noise", "calibration", "scales")
-    return replace(bundle, errors=with_case_scales(model, stars, rng)), errors
+def calibrate_errors(
+    model: StarModel, fitted: Method, stars: ModelStars, seed: int
+) -> tuple[ErrorModel, StarErrors]:
+    """Calibrate the errors of a model on stars that its training has not seen.
 
+    Parameters
+    ----------
+    model : StarModel
+        Its errors are `ErrorModel.uncalibrated`.
+    fitted : Method
+        The fit before it was packed, which draws stars of its own distribution.
+    stars : ModelStars
+        Held-out and training stars.
+    seed : int
+        Seed of the random streams of the steps.
 
-def with_case_scales(model: StarModel, stars: HeldOutStars, rng: np.random.Generator) -> ErrorModel:
-    """Return the errors of a model with what noise, flux, sky and brightness do to them.
-
-    No training must have seen the stars: where noise is far below the errors that a method makes
-    on other stars, those of the training do not tell.
+    Returns
+    -------
+    errors : ErrorModel
+    star_errors : StarErrors
+        Errors of the held-out stars at the noise nodes.
     """
-    # Noise as it is found, and factors, at each node; the last axis is that of the nodes.
+    held_out = stars.held_out
+    # 1. Shape errors bias the flux of bright stars: the noise floor at which fluxes are measured.
+    model = model.with_errors(fit_noise_floor(model, held_out, seed))
+    # 2. Errors of the PSF model itself, of stars that the method measures.
+    model = model.with_errors(fit_model_errors(model, fitted, seed))
+    # 3. Half-widths of 68 and 95 % for known flux and sky, and limits of outliers.
+    errors, star_errors = fit_half_widths(model, held_out, seed)
+    model = model.with_errors(errors)
+    # 4. Factors of the half-widths where noise, flux or sky are estimated.
+    model = model.with_errors(fit_case_scales(model, held_out, seed))
+    # 5. Training stars of an image are not outliers.
+    return fit_outlier_limits(model, stars), star_errors
+
+
+def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorModel:
+    """Return the errors of a model with the noise floor that minimises the MSE of bright stars.
+
+    A method that finds fluxes takes what it does not know of a star's shape for flux where there is
+    little noise. Tried are a floor of 0 and the noise nodes, until the MSE rises.
+    """
+    errors, method = model.bundle.errors, model.method
+    if not method.finds_flux:
+        return errors
+    rng = stream(seed, "noise", "calibration", "misfit")
+    test_stars = replace(stars, images=stars.images[: stars.min_images])
+    # Bright stars: the lower half of the noise nodes.
+    noisy = [test_stars.draw(node, rng) for node in errors.noise[: len(errors.noise) // 2]]
+    # Geometric mean over the nodes of the MSE of PSFs of flux 1.
+    log_mse: list[float] = []
+    floors = (0.0, *errors.noise.tolist())
+    for floor in floors:
+        tried_model = model.with_errors(replace(errors, noise_floor=floor))
+        node_log_mse = []
+        for images, star in noisy:
+            prediction = tried_model.predict(images)
+            psf = prediction.psf / prediction.flux[:, None, None]
+            node_log_mse.append(np.log(np.nanmean(np.square(psf - stars.references[star]))))
+        log_mse.append(float(np.mean(node_log_mse)))
+        if log_mse[-1] > min(log_mse):
+            break
+    return replace(errors, noise_floor=floors[int(np.argmin(log_mse))])
+
+
+def fit_model_errors(model: StarModel, fitted: Method, seed: int) -> ErrorModel:
+    """Return the errors of a model with those of flux, sky and centre due to the PSF model.
+
+    Stars that are drawn from the uncertainty of the fit are measured with hardly any noise: what
+    the errors by noise do not explain is due to the model. A method that measures no stars has
+    none.
+    """
     errors = model.bundle.errors
+    if not fitted.knows_field:
+        return errors
+    rng = stream(seed, "noise", "calibration", "model")
+    # S/N 2000 of a matched filter, where noise is far below the errors of most models.
+    noise = 1.0 / (2000.0 * np.sqrt(model.info.noise_equivalent_px))
+    # Stars of flux 1 on a sky of 0, with known centres.
+    images, position, centre = fitted.draw_stars(HeldOutStars.min_images, rng)
+    noisy = images + noise * rng.normal(size=images.shape)
+    prediction = model.predict(noisy, position=position)
+    usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
+    # Drawn centres count from the middle of the stamp, fitted ones from its corner.
+    centre = centre + images.shape[-1] // 2
+
+    def compute_excess(offset: np.ndarray, sigma: np.ndarray) -> float:
+        """Return √(e² − σ²) for the e within which 68 % of normal errors are, or 95 % in 1.96 e."""
+        # e in units of σ, from both quantiles; the model's part of e² is the rest.
+        ratio = np.abs(offset) / sigma
+        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, 0.95) / 1.96)
+        return float(np.median(sigma) * np.sqrt(max(scale**2 - 1.0, 0.0)))
+
+    # The errors of the flux, of the sky, and of the centre, both axes together.
+    fitted_flux, *growth = fitted.fitted_flux_error()
+    flux = compute_excess((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
+    # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
+    sky = compute_excess(prediction.background[usable], prediction.background_error[usable])
+    sky = max(sky, flux / images[0].size)
+    offset = np.concatenate([prediction.y_fit - centre[:, 0], prediction.x_fit - centre[:, 1]])
+    sigma = np.concatenate([prediction.y_error, prediction.x_error])
+    usable_centres = np.concatenate([usable, usable])
+    centre_error = compute_excess(offset[usable_centres], sigma[usable_centres])
+    # Few fields are drawn: the error of the flux is not below that of a fit on a known sky.
+    model_errors = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
+    return replace(errors, model=model_errors)
+
+
+def fit_half_widths(
+    model: StarModel, stars: HeldOutStars, seed: int
+) -> tuple[ErrorModel, StarErrors]:
+    """Return the errors of a model with half-widths and limits of outliers, and the stars' errors.
+
+    Flux and sky of the stars are known.
+    """
+    errors = model.bundle.errors
+    rng = stream(seed, "noise", "calibration", "errors")
+    star_errors = StarErrors.measure(
+        stars, model.method, model.bundle.flux_model, errors.noise, model.info.components, rng
+    )
+    errors = replace(
+        errors,
+        half_width68=star_errors.half_width,
+        ratio95=star_errors.ratio95(),
+        distance_limit=star_errors.distance_limit(),
+        outlier_limit=star_errors.outlier_limit(),
+    )
+    return errors, star_errors
+
+
+def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorModel:
+    """Return the errors of a model with their factors where noise, flux or sky are estimated.
+
+    Factors depend on the case, on the noise and on the brightness of a pixel.
+    """
+    # Noise as the photometry estimates it, and factors, at each node; the last axis is the node.
+    errors, rng = model.bundle.errors, stream(seed, "noise", "calibration", "scales")
     nodes = errors.noise
-    measured = [_scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)]
-    noise, scale, flux_scale = (np.stack(values, axis=-1) for values in zip(*measured, strict=True))
-    # Where a star has light that the photometry does not know, its noise is found too large: the
-    # factors are those at the noise that was found.
+    by_node = [_scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)]
+    noise, scale, flux_scale = (np.stack(values, axis=-1) for values in zip(*by_node, strict=True))
+    # Where a star has light that the photometry does not know, its noise estimate is too large: the
+    # factors are given at the estimates.
     noise = np.maximum.accumulate(noise, axis=-1)
     for index in np.ndindex(scale.shape[:-1]):
         scale[index] = np.interp(nodes, noise[index[1], index[2]], scale[index])
@@ -224,17 +329,17 @@ def with_case_scales(model: StarModel, stars: HeldOutStars, rng: np.random.Gener
 def _scales_at(
     model: StarModel, stars: HeldOutStars, node: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return what the cases do to the errors of noisy test stars of one noise.
+    """Return the factors of the errors of noisy test stars of one noise, for each case.
 
     Returns
     -------
     noise : ndarray, shape (2, 3)
-        Median noise over the flux as it was found: noise stated or estimated; case of `Estimated`.
+        Median noise estimate over the flux: noise given or estimated; case of `Estimated`.
     scale : ndarray, shape (2, 2, 3, 2)
         Factors of half-widths that hold 68 and 95 %; the two axes of `noise`; faint or bright
         pixels.
     flux_scale : float
-        Factor of the stated error of the flux, where all is estimated.
+        Factor of the error of the flux, where all is estimated.
     """
     count = len(Estimated)
     noise, scale, flux_scale = np.full((2, count), node), np.ones((2, 2, count, 2)), 1.0
@@ -242,7 +347,7 @@ def _scales_at(
     # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
     measures = model.method.knows_field
     step, noise_cases = (3, (True,)) if measures else (1, (False, True))
-    # Rows are cases times images, once with stated noise and once without.
+    # Rows are cases times images, once with the noise given and once without.
     noisy, star = stars.draw(node, rng)
     case, image = np.divmod(np.arange(0, count * len(star), step), len(star))
     is_estimated = np.repeat(noise_cases, len(case))
@@ -254,7 +359,7 @@ def _scales_at(
         noise=np.where(is_estimated, np.nan, node),
         position=stars.position[star[image]],
     )
-    # Errors in units of what is stated without factors.
+    # Errors in units of the half-widths without factors.
     is_finite = np.isfinite(prediction.psf).all(axis=(1, 2))
     error = stars.errors(prediction.psf, star[image], prediction.uncertainty)
     is_bright = brightest(prediction.psf)
@@ -276,24 +381,19 @@ def _scales_at(
     return noise, scale, flux_scale
 
 
-def with_training_stars(model: StarModel, stars: ModelStars) -> Bundle:
-    """Return the bundle of a model with limits of outliers that training stars are not beyond.
+def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
+    """Return the errors of a model with limits of outliers that its training stars do not exceed.
 
     The noise of a training star is in the axes of the training, along which a star of the same
     noise is an outlier by as much as there are few of them. Training stars have less noise than the
-    least node, of which the limit is that of all brighter stars.
-
-    Parameters
-    ----------
-    model : StarModel
-    stars : ModelStars
-        Those of a simulation change nothing: they have no noise.
+    lowest node, whose limit applies to all brighter stars. Simulated stars have no noise, and
+    change nothing.
     """
-    bundle, errors = model.bundle, model.bundle.errors
+    errors = model.bundle.errors
     if errors.outlier_limit is None or (bright := stars.bright) is None:
-        return bundle
+        return errors
     # The stars as they are in the image, framed, with the flux 1.
-    images, is_measured = bright.framed(bundle.info.stamp_px)
+    images, is_measured = bright.framed(model.info.stamp_px)
     images = np.where(is_measured, images, 0.0) / bright.flux[:, None, None]
     noise = bright.noise / bright.flux
     prediction = model.predict(images, noise=noise, background=0.0, position=bright.place)
@@ -308,80 +408,7 @@ def with_training_stars(model: StarModel, stars: ModelStars) -> Bundle:
     outlier_limit = errors.outlier_limit.copy()
     outlier_limit[0] = max(outlier_limit[0], score)
     distance_limit = max(errors.distance_limit, distance)
-    errors = replace(errors, outlier_limit=outlier_limit, distance_limit=distance_limit)
-    return replace(bundle, errors=errors)
-
-
-def with_model_errors(model: StarModel, fitted: Method, seed: int) -> Bundle:
-    """Return the bundle of a model with the errors of measured stars that the model makes.
-
-    Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
-    stated errors lack is the model's.
-    """
-    bundle, rng = model.bundle, stream(seed, "noise", "calibration", "model")
-    # S/N 2000 of a matched filter, where noise is far below the errors of most models.
-    noise = 1.0 / (2000.0 * np.sqrt(bundle.info.noise_equivalent_px))
-    # Measure stars of the fit's own law, of which flux, sky and centre are known: 1, 0 and drawn.
-    images, position, centre = fitted.draw_stars(HeldOutStars.min_images, rng)
-    noisy = images + noise * rng.normal(size=images.shape)
-    prediction = model.predict(noisy, position=position)
-    usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
-    # Drawn centres count from the middle of the stamp, fitted ones from its corner.
-    centre = centre + images.shape[-1] // 2
-
-    def lacking(off: np.ndarray, stated: np.ndarray) -> float:
-        """√(e² − stated²) for the e within which 68 % of normal errors are, or 95 % within 1.96."""
-        # e in units of what is stated, from both quantiles; the model's part of e² is the rest.
-        ratio = np.abs(off) / stated
-        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, 0.95) / 1.96)
-        return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
-
-    # The errors of the flux, of the sky, and of the centre, both axes together.
-    fitted_flux, *growth = fitted.fitted_flux_error()
-    flux = lacking((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
-    # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
-    sky = lacking(prediction.background[usable], prediction.background_error[usable])
-    sky = max(sky, flux / images[0].size)
-    off = np.concatenate([prediction.y_fit - centre[:, 0], prediction.x_fit - centre[:, 1]])
-    stated = np.concatenate([prediction.y_error, prediction.x_error])
-    usable_centres = np.concatenate([usable, usable])
-    centre_error = lacking(off[usable_centres], stated[usable_centres])
-    # Few fields are drawn: the error of the flux is not below that of a fit on a known sky.
-    measured = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
-    return replace(bundle, errors=replace(bundle.errors, measured=measured))
-
-
-def with_misfit(
-    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
-) -> Bundle:
-    """Return the bundle with the noise over the flux with which bright stars are measured best.
-
-    What the method does not know of a star's shape would pass for flux, if there is little noise
-    beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
-    """
-    if not fitted.finds_flux:
-        return bundle
-    info, nodes = bundle.info, bundle.errors.noise
-    test_stars = replace(stars, images=stars.images[: stars.min_images])
-    # Bright stars: the lower half of the noise nodes.
-    noisy = [test_stars.draw(node, rng) for node in nodes[: len(nodes) // 2]]
-    # Geometric mean over the nodes of the MSE of PSFs of flux 1, until it rises.
-    log_mse: list[float] = []
-    misfits = (0.0, *nodes)
-    for misfit in misfits:
-        # The same stars with another idea of the noise of the flux's estimate.
-        tried_info = info.model_copy(update={"misfit": misfit})
-        model = StarModel(replace(bundle, info=tried_info), fitted)
-        logs = []
-        for images, star in noisy:
-            prediction = model.predict(images)
-            psf = prediction.psf / prediction.flux[:, None, None]
-            logs.append(np.log(np.nanmean(np.square(psf - stars.references[star]))))
-        log_mse.append(float(np.mean(logs)))
-        if log_mse[-1] > min(log_mse):
-            break
-    best_misfit = float(misfits[int(np.argmin(log_mse))])
-    return replace(bundle, info=info.model_copy(update={"misfit": best_misfit}))
+    return replace(errors, outlier_limit=outlier_limit, distance_limit=distance_limit)
 
 
 def crossed_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[str, float]]:

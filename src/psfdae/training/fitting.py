@@ -138,11 +138,11 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # Stars to which the model will be applied have an unknown flux: it is free here.
-            restorer = judged.free_flux()
+            free_method = judged.free_flux()
             # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):
-                psf = restorer.estimate(images, level, positions, with_sigma=False).psf
+                psf = free_method.estimate(images, level, positions, with_sigma=False).psf
                 psf = psf / psf.sum(axis=(1, 2), keepdims=True)
                 log_mse.append(np.log(np.square(psf - truth).mean()))
         errors[name] = float(np.exp(np.mean(log_mse)))

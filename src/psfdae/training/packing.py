@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from psfdae.base.files import Product, ProductError
-from psfdae.base.rng import stream
 from psfdae.base.settings import OfTest
 from psfdae.base.version import __version__
 from psfdae.denoise.bundle import Bundle, BundleError, creation_date, estimator
@@ -29,12 +28,9 @@ from psfdae.methods.metrics import all_metrics
 from psfdae.psf.wings import Wings
 from psfdae.training.calibration import (
     StarErrors,
-    calibrated,
+    calibrate_errors,
     crossed_coverage,
     noise_nodes,
-    with_misfit,
-    with_model_errors,
-    with_training_stars,
 )
 from psfdae.training.star_sets import HeldOutStars, ModelStars, noisy_test_images
 
@@ -73,25 +69,21 @@ def model_of(
     bundle, model_stars = uncalibrated(
         fitted, stars, reference, config, trained, name, licence, largest_mb
     )
-    held_out = model_stars.held_out
-    unpacked = estimator(bundle)  # errors are those of the fit as it is packed
-    rng = stream(config.seed, "noise", "calibration", "misfit")
-    bundle = with_misfit(bundle, unpacked, held_out, rng)
-    if fitted.knows_field:
-        bundle = with_model_errors(StarModel(bundle, unpacked), fitted, config.seed)
-    # Errors on test stars; in an image, limits of outliers by its training stars, too.
-    bundle, errors = calibrated(bundle, unpacked, held_out, config.seed)
-    bundle = with_training_stars(StarModel(bundle, unpacked), model_stars)
+    # Errors are those of the fit as it is packed.
+    model = StarModel(bundle, estimator(bundle))
+    errors, star_errors = calibrate_errors(model, fitted, model_stars, config.seed)
     # Metrics of test stars at the noise levels of the configuration.
     noisy = (
         (level, noisy_test_images(config, stars, model_stars.test, level))
         for level in config.noise.levels
     )
     area, data_range = bundle.info.noise_equivalent_px, config.evaluation.data_range
-    metrics = metrics_by_level(unpacked, held_out, noisy, errors, area, data_range)
+    held_out = model_stars.held_out
+    metrics = metrics_by_level(model.method, held_out, noisy, star_errors, area, data_range)
+    # The model as it is written: with errors, and a description that has them.
     settings = {**bundle.info.config, "evaluation": config.evaluation.model_dump()}
     info = bundle.info.model_copy(update={"metrics": metrics, "config": settings})
-    return StarModel(replace(bundle, info=info), unpacked)
+    return StarModel(replace(bundle, info=info, errors=errors), model.method)
 
 
 def uncalibrated(
