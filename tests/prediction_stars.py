@@ -55,7 +55,7 @@ def with_network(bundle):
     description = bundle.info.model_dump()
     description |= {"method": "dae", "dae": shape, "image_scale": 256.0}
     errors = bundle.errors
-    unscaled = ErrorModel.uncalibrated(errors.noise, errors.half_width68)
+    unscaled = ErrorModel.build_uncalibrated(errors.noise, errors.half_width68)
     limit = errors.distance_limit
     return replace(
         bundle,

@@ -17,16 +17,16 @@ from psfdae.base.files import Column, ProductError, read_product, write_product
 from psfdae.denoise.bundle import (
     BundleError,
     estimator,
+    locate_shipped_model,
     read_bundle,
-    shipped_path,
     write_bundle,
 )
-from psfdae.denoise.error_model import at_noise, brightest, mahalanobis
+from psfdae.denoise.error_model import brightest, interpolate_at_noise, mahalanobis
 from psfdae.denoise.flux_model import FluxModel
 from psfdae.methods import groups_of
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split
-from psfdae.training.calibration import StarErrors, crossed_coverage
+from psfdae.training.calibration import StarErrors, cross_validate_coverage
 from psfdae.training.star_sets import HeldOutStars, noise_model, noisy_test_images, read_stars
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle as stage
@@ -138,7 +138,7 @@ def fresh_stars():
 
 def covered(error, noise, nodes, maps):
     """Part of the errors (n, d, d) within the half-widths at the noise of each star."""
-    return (np.abs(error) <= at_noise(noise, nodes, maps)).mean()
+    return (np.abs(error) <= interpolate_at_noise(noise, nodes, maps)).mean()
 
 
 def test_half_width_covers_fresh_stars(tiny):
@@ -248,7 +248,7 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     error = rng.normal(size=(1, 4000, 8, 8)) * scale
     errors = StarErrors(np.array([0.01]), np.abs(error), star, np.zeros((1, 4000)))
     fresh = np.abs(rng.normal(size=(400, 8, 8)) * scale[:400])
-    coverage = crossed_coverage(errors)(fresh, 0.01)
+    coverage = cross_validate_coverage(errors)(fresh, 0.01)
     expected = {"coverage68": (0.9973 + 0.2611) / 2, "coverage95": (1 + 0.4865) / 2}
     assert coverage == pytest.approx(expected, abs=0.01)
 
@@ -287,7 +287,7 @@ def test_commands_pack_and_describe(folder, tmp_path):
 def test_shipped_bundle_is_small_and_wide():
     info = read_bundle().info
     assert info.name == "wfsat" and info.subpixel
-    assert shipped_path().stat().st_size <= 5_000_000
+    assert locate_shipped_model().stat().st_size <= 5_000_000
     assert info.snr_min < 5 and info.snr_max > 500
     faint = [row["mse"] / row["mse_noisy"] for row in info.metrics if row["snr"] < 50]
     assert len(faint) >= 3 and max(faint) < 0.2

@@ -83,7 +83,7 @@ def test_the_mask_of_a_container_is_that_of_the_keyword(image, place, bad, name)
 # The four lines of Python: each container, with each kind of list.
 
 
-def model_of(image, catalogue):
+def build_model(image, catalogue):
     """Stars, their model and a prediction."""
     stars = Stars.from_image(image, catalogue=catalogue, train_stars=30, test_stars=10, **CAMERA)
     with few_draws():
@@ -95,7 +95,7 @@ def model_of(image, catalogue):
 def expected(image, place):
     """Results of another process, which pickles what it gives back."""
     with ProcessPoolExecutor(1, get_context("fork")) as pool:
-        return pool.submit(model_of, image, place).result()
+        return pool.submit(build_model, image, place).result()
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_any_container_and_any_list_give_the_same_model(
     monkeypatch.chdir(tmp_path)
     write("image.fits", image)
     table(place).write("stars.csv")
-    stars, model, _ = model_of(container(image), listed(place))
+    stars, model, _ = build_model(container(image), listed(place))
     weights = (m.bundle.weights["coefficients"] for m in (model, expected[1]))
     np.testing.assert_allclose(*weights, rtol=1e-4, atol=1e-8)
     assert len(stars) == len(expected[0]) and "\n" not in repr(stars)

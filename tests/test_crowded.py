@@ -29,7 +29,7 @@ from psfdae.photometry.photon_noise import measure_gain, with_measured_gain
 from psfdae.photometry.wings_fit import StarFluxes, draw_tents, wings_of
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.wings import Wings
-from psfdae.training.neighbours import light_of_others
+from psfdae.training.neighbours import draw_other_stars
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, FRAME = 330, 200.0, 10, 61
@@ -376,7 +376,7 @@ def test_light_of_others_leaves_each_star_alone(sky, phot):
     pixels = fits.getdata(folder / "i.fits").astype(float) - SKY
     cut = (pixels, pixels.shape, *place.T, STAMP, 2)
     data = cut_image(*cut)[0]
-    light = light_of_others(phot, place)(slice(None), STAMP, 2)
+    light = draw_other_stars(phot, place)(slice(None), STAMP, 2)
     middle = slice(FRAME // 2 - STAMP // 2 - 2, FRAME // 2 + STAMP // 2 + 2)
     own_light = np.array(true["flux"])[:, None, None] * stamps(*place.T)[:, middle, middle]
     doubt = np.sqrt(SKY + np.abs(data)) * 4 + 0.03 * own_light.max(axis=(1, 2), keepdims=True)

@@ -150,7 +150,7 @@ def test_photometry_by_a_grid_of_another_program(tmp_path):
     stars = stars.reshape(-1, 2) + rng.uniform(-5, 5, (stars.size // 2, 2))
     flux = 10 ** rng.uniform(4.3, 5.0, len(stars))
     image = np.zeros((660, 1000))
-    for (x, y), f, psf in zip(stars, flux, model.on_pixels(stars), strict=True):
+    for (x, y), f, psf in zip(stars, flux, model.draw_on_pixels(stars), strict=True):
         row, column = (int(np.floor(v + 0.5)) - 12 for v in (y, x))
         image[row : row + 24, column : column + 24] += f * psf
     image = rng.poisson(image + 100.0).astype(np.float32)

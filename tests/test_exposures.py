@@ -17,7 +17,7 @@ from psfdae.methods.field_search import fit_field
 from psfdae.methods.field_spline import deformations
 from psfdae.psf.wings import Wings
 from psfdae.report.validation import validate
-from psfdae.training.exposures import exposure, for_exposures
+from psfdae.training.exposures import adapt_to_exposures, exposure
 from psfdae.training.from_image import collect_stars
 from psfdae.training.settings import from_words
 from psfdae_paper.stars.example import add_stamps, write_field
@@ -223,7 +223,7 @@ def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night, shipped):
     with pytest.raises(PredictionError, match="was trained on other stars of this image"):
         validate(model, first_stars)
     # A model without a field is that of each exposure.
-    assert for_exposures(shipped, stars) == dict.fromkeys(NIGHT, shipped)
+    assert adapt_to_exposures(shipped, stars) == dict.fromkeys(NIGHT, shipped)
 
 
 def test_the_sky_of_a_training_is_that_of_the_typical_star(night):

@@ -35,7 +35,7 @@ from psfdae import Error, load_model
 from psfdae.base.files import read_product, temporary_name
 from psfdae.base.reading import read_table, read_yaml
 from psfdae.denoise import bundle as bundles
-from psfdae.denoise.bundle import read_bundle, shipped_path
+from psfdae.denoise.bundle import locate_shipped_model, read_bundle
 from psfdae.image import fits_file as images
 from psfdae.image import list_formats
 from psfdae.image.catalogue import read_catalogue
@@ -61,7 +61,7 @@ def good(tmp_path_factory):
     options = {"shape": (40, 60), "pixel_scale_arcsec": 0.1, "compress": True}
     write_field(folder / TILES, folder / LIST, stamps, x, y, **options)
     Table.read(folder / LIST).write(folder / TABLE)
-    shutil.copy(shipped_path(), folder / MODEL)
+    shutil.copy(locate_shipped_model(), folder / MODEL)
     return folder
 
 
@@ -185,7 +185,7 @@ def test_columns_of_fits_tables_that_hold_arrays_are_no_numbers(tmp_path):
 
 def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipped):
     """Large stamps' way, on small ones: the same predictions but for rounding."""
-    lean_basis = partial(bundles.flux_model_of, full_basis_max_px=0)
+    lean_basis = partial(bundles.build_flux_model, full_basis_max_px=0)
     monkeypatch.setattr(bundles, "flux_model_of", lean_basis)
     lean = load_model()
     flux_model, rng = lean.bundle.flux_model, np.random.default_rng(3)

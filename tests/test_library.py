@@ -17,7 +17,7 @@ from image_training import FIELD, MIXTURE, SIZES, few_draws
 from psfdae.api import PsfModel
 from psfdae.methods import method
 from psfdae.training.calibration import COVERAGE
-from psfdae.training.settings import DATASET_CHOICE, from_words, of_config, settings_model
+from psfdae.training.settings import DATASET_CHOICE, from_words, make_settings, settings_model
 from psfdae_paper.configuration.compose import load_stage
 
 
@@ -149,7 +149,7 @@ def test_what_cannot_be_used_is_one_kind_of_error(training, stars, call, message
 def test_words_and_files_of_the_configuration_mean_the_same():
     """Defaults stand in classes, and in files where a dataset of the paper has others."""
     groups = tuple(settings_model().model_fields)
-    assert of_config(load_stage(groups, (DATASET_CHOICE,))) == from_words()
+    assert make_settings(load_stage(groups, (DATASET_CHOICE,))) == from_words()
     word = "calibration_stars.snr_levels=[5,10]"
     assert from_words([word]).calibration_stars.snr_levels == [5.0, 10.0]
     assert from_words([word, "train=onecycle"]).calibration_stars.snr_levels == [5.0, 10.0]

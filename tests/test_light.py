@@ -75,7 +75,7 @@ def test_psfs_have_the_same_light_at_every_phase(bright_field, tmp_path):
     ]
     expected = np.array(stamps) / stamps[0]
     tolerance = 1e-3
-    assert_allclose(field.on_pixels(place).sum(axis=(1, 2)), expected, atol=tolerance)
+    assert_allclose(field.draw_on_pixels(place).sum(axis=(1, 2)), expected, atol=tolerance)
     # What photometry, photutils and PSFEx's readers interpolate, to a row at the edge of the PSF.
     tolerance += 16 * profile(8.0)
     grid = PsfGrid.of(field, 2)
@@ -86,7 +86,7 @@ def test_psfs_have_the_same_light_at_every_phase(bright_field, tmp_path):
     sums = [photutils.evaluate(x, y, 1.0, *at).sum() for at in place]
     assert_allclose(sums, expected, atol=tolerance)
     write_psfex(tmp_path / "f.psf", field, 4)
-    psfex = load_field(tmp_path / "f.psf").on_pixels(place)
+    psfex = load_field(tmp_path / "f.psf").draw_on_pixels(place)
     assert_allclose(psfex.sum(axis=(1, 2)), expected, atol=2 * tolerance)
 
 
@@ -186,7 +186,7 @@ def test_photometry_has_the_psf_of_each_magnitude(measured_twice):
     place = np.tile(np.rint(model.grid(2, 2)[0]), (4, 1))
     counts = 10 ** np.array([3.0, 4.5, 5.0, 7.0])
     stamps = grid.stamps(place, place.astype(int) - 8, 16, counts)[:, 0]
-    psfs = model.on_pixels(np.column_stack([place, -2.5 * np.log10(counts)]))
+    psfs = model.draw_on_pixels(np.column_stack([place, -2.5 * np.log10(counts)]))
     middle = model.stamp_px // 2
     expected = psfs[:, middle - 8 : middle + 8, middle - 8 : middle + 8]
     assert_allclose(stamps, expected, atol=0.01 * expected.max())

@@ -274,7 +274,7 @@ def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch
 
     def load(path):
         opened.append(path.name.removesuffix(".psf.safetensors"))
-        return SimpleNamespace(image_px=(300, 200), on_pixels=lambda _: np.ones((5, 8, 8)))
+        return SimpleNamespace(image_px=(300, 200), draw_on_pixels=lambda _: np.ones((5, 8, 8)))
 
     monkeypatch.setattr(api, "load_model", load)
     write_night_page(out, tmp_path / "images", tmp_path / "night.html")

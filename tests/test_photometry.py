@@ -11,7 +11,7 @@ from scipy import ndimage
 from prediction_stars import observe
 from psfdae.denoise import flux_model as module
 from psfdae.denoise.flux_model import FluxModel, robust_flux
-from psfdae.denoise.leading_modes import LeadingModes, clipped_rms
+from psfdae.denoise.leading_modes import LeadingModes, compute_clipped_rms
 from psfdae.denoise.star_flux import Photometer
 from psfdae.image.stamps import StarFlag, border_pixels, cut, displacement, smoothed
 from psfdae.stars.moments import measure_shapes
@@ -87,7 +87,7 @@ def test_one_fit_is_the_one_of_dense_matrices(stars, model):
     x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
     used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
     prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
-    results = module.generalised_least_squares(x, used, prior, sigma, model)
+    results = module.solve_least_squares(x, used, prior, sigma, model)
     covariance = (model.basis * model.variance) @ model.basis.T
     for star, (flux, error, score, repaired) in enumerate(zip(*results, strict=True)):
         total = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
@@ -204,7 +204,7 @@ def test_another_flux_of_the_same_light_is_another_sky(gaussian_stars, whole_mod
     stamps = 1e3 * gaussian_stars[:20] + 70.0 + rng.normal(0, 3.0, (20, 16, 16))
     phot = measure(whole_model, stamps, 72.0)
     factor = rng.uniform(0.5, 2.0, 20)
-    rescaled = phot.with_flux(factor)
+    rescaled = phot.scale_flux(factor)
 
     def light(measured):
         sky = measured.background[:, None, None]
@@ -242,8 +242,8 @@ def test_root_mean_square_of_scores_is_without_outliers_and_without_nan():
     """1 for a normal variable; a row of NaN counts as 1."""
     score = np.random.default_rng(9).normal(size=(3, 20_000))
     score[0, :100], score[1, ::2], score[2] = 50.0, np.nan, np.nan
-    assert clipped_rms(score) == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
-    assert clipped_rms(score)[2] == 1.0
+    assert compute_clipped_rms(score) == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
+    assert compute_clipped_rms(score)[2] == 1.0
 
 
 # Centring

@@ -23,7 +23,7 @@ from psfdae.image.trails import add_trails, find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.photometry import crowded
 from psfdae.stars.bright_stars import BrightStars
-from psfdae.training.fitting import fitted_to
+from psfdae.training.fitting import fit_method
 from psfdae.training.neighbours import _Field
 from small_field import CAMERA, SKY, drawn, moffat, noisy
 
@@ -376,7 +376,7 @@ def test_bad_pixels_have_no_weight_in_the_field(clean):
     image, place, _ = clean
     mask = np.random.default_rng(2).uniform(size=image.shape) < 0.005
     clean_field, masked_field = (
-        fitted_to(Stars.from_image(i, place, mask=m.astype(np.uint8), **CAMERA), FieldMixture)
+        fit_method(Stars.from_image(i, place, mask=m.astype(np.uint8), **CAMERA), FieldMixture)
         for i, m in ((image, np.zeros_like(mask)), (image, mask))
     )
     at = np.array([[160.2, 160.4]])
@@ -503,7 +503,7 @@ def test_nothing_depends_on_the_unit(clean, unit):
     results = []
     for pixels in (image, image * unit):
         stars = Stars.from_image(pixels, detect=True)
-        model = _Field(fitted_to(stars, FieldMixture), 16)
+        model = _Field(fit_method(stars, FieldMixture), 16)
         results.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
     (first_stars, first, table), (second_stars, second, scaled) = results
     assert (first_stars.candidates.verdict == second_stars.candidates.verdict).all()

@@ -111,7 +111,7 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
 
 def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
     """A shape that the model does not know would pass for flux and for no noise."""
-    without_floor = shipped.with_errors(replace(shipped.bundle.errors, noise_floor=0.0))
+    without_floor = shipped.replace_errors(replace(shipped.bundle.errors, noise_floor=0.0))
     stars = observe(field_psfs, 3e-5)
     result, plain = (m.predict(stars.stamps) for m in (shipped, without_floor))
     assert rms(result.flux / stars.flux - 1) < 0.7 * rms(plain.flux / stars.flux - 1)
@@ -147,10 +147,10 @@ def test_chi2_of_noise_is_1_whatever_part_of_it_a_star_follows(sigma):
     residual = np.sqrt(18.0 * part) * rng.normal(size=psf.shape)
     residual[:, 0] = np.nan
     flux_sigma = None if sigma is None else np.full(psf.shape, sigma)
-    chi2 = restoration.reduced_chi2(residual, psf, flux_sigma, noise, gain)
+    chi2 = restoration.compute_reduced_chi2(residual, psf, flux_sigma, noise, gain)
     assert chi2.mean() == pytest.approx(1.0, abs=0.01)
     residual[:] = np.nan
-    assert np.isnan(restoration.reduced_chi2(residual, psf, flux_sigma, noise, gain)).all()
+    assert np.isnan(restoration.compute_reduced_chi2(residual, psf, flux_sigma, noise, gain)).all()
 
 
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):

@@ -15,8 +15,8 @@ from psfdae.methods.field import FieldMixture
 from psfdae.methods.field_errors import excess_scatter
 from psfdae.photometry.crowded import photometry, star_flags
 from psfdae.training.calibration import fit_model_errors
-from psfdae.training.fitting import described, fitted_to
-from psfdae.training.packing import uncalibrated, with_wings
+from psfdae.training.fitting import described, fit_method
+from psfdae.training.packing import add_wings, build_uncalibrated
 from small_field import GAIN, READ, SKY, noisy
 
 SIZE = 600
@@ -56,13 +56,15 @@ def fitted(seed):
     image, place = bright_field(seed)
     camera = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
     stars = psfdae.Stars.from_image(image, place, **camera)
-    field = fitted_to(stars, FieldMixture)
+    field = fit_method(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
-    packed, _ = uncalibrated(field, stars.product, "realisation", settings, of_fit, "field", "")
+    packed, _ = build_uncalibrated(
+        field, stars.product, "realisation", settings, of_fit, "field", ""
+    )
     model = psfdae.PsfModel(packed)
-    model = model.with_errors(fit_model_errors(model, field, 1))
+    model = model.replace_errors(fit_model_errors(model, field, 1))
     wings = photometry(model, stars.observation, 3.0).image_wings
-    return psfdae.PsfModel(with_wings(model.bundle, wings))
+    return psfdae.PsfModel(add_wings(model.bundle, wings))
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from psfdae.psf.photutils_grid import make_photutils_grid
 from psfdae.training.exposures import exposure
 from psfdae.training.fitting import fit_model
 from psfdae.training.from_image import collect_stars
-from psfdae.training.settings import Settings, settings_model, with_keywords
+from psfdae.training.settings import Settings, apply_keywords, settings_model
 from psfdae.training.stars import ImageStars
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ class Stars(ImageStars):
         image_options: dict[str, Any] = {n: v for n, v in options.items() if n in names}
         settings = {name: value for name, value in options.items() if name not in names}
         source = ImageInput(images[0], catalogue=catalogue, **image_options)
-        all_settings = with_keywords(settings_model()(), Settings.image_groups, settings)
+        all_settings = apply_keywords(settings_model()(), Settings.image_groups, settings)
         stars = collect_stars(source.of_each(images), all_settings)
         return cls(*(getattr(stars, field.name) for field in fields(stars)))
 

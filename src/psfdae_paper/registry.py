@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psfdae.denoise.bundle import SUFFIX, Bundle, write_bundle
-from psfdae.training.packing import uncalibrated
+from psfdae.training.packing import build_uncalibrated
 from psfdae.training.star_sets import read_stars
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.tracking import TrackedRun
@@ -88,7 +88,9 @@ def bundle_of(run: TrackedRun) -> Bundle:
     config = part(groups, {group: described[group] for group in groups})
     # The bundle is named like the registered model.
     fitted, name = method_class.load(place, run.reference), registered_name(run)
-    return uncalibrated(fitted, product, run.reference, config, described, name, "not stated")[0]
+    return build_uncalibrated(
+        fitted, product, run.reference, config, described, name, "not stated"
+    )[0]
 
 
 def registered_name(run: TrackedRun) -> str:

@@ -203,7 +203,7 @@ class TrueField:
     def fwhm_px(self):
         return FWHM_PX
 
-    def on_pixels(self, place):
+    def draw_on_pixels(self, place):
         axis = np.arange(self.stamp_px) - self.stamp_px // 2
         return np.stack([moffat(*np.meshgrid(axis, axis), *at) for at in place])
 

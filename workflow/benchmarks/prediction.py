@@ -270,8 +270,8 @@ def covered(bundle, product, seed):
     cells = {}
     for judges, judged in (halves, halves[::-1]):
         model = PsfModel(bundle, fitted)
-        model = model.with_errors(fit_half_widths(model, judges, seed)[0])
-        model = model.with_errors(fit_case_scales(model, judges, seed))
+        model = model.replace_errors(fit_half_widths(model, judges, seed)[0])
+        model = model.replace_errors(fit_case_scales(model, judges, seed))
         for tested in bundle.info.metrics:
             level = tested["noise_level"]
             flux = float(noise.flux(level))

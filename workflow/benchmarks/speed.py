@@ -168,7 +168,7 @@ def untrained_bundle(tree, stars, out):
         info=BundleInfo(**about),
         weights={k: v.contiguous().numpy() for k, v in network.state_dict().items()},
         flux_model=leading(model, shipped.info.components),
-        errors=ErrorModel.uncalibrated(nodes, np.ones((len(nodes), side, side), np.float32)),
+        errors=ErrorModel.build_uncalibrated(nodes, np.ones((len(nodes), side, side), np.float32)),
     )
     write_bundle(bundle, out)
 

@@ -33,11 +33,11 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae.report.validation import validate
-from psfdae.training.exposures import for_exposures
+from psfdae.training.exposures import adapt_to_exposures
 from psfdae.training.fitting import (
     choose_method,
     described,
-    fitted_to,
+    fit_method,
     makes_models,
     pack_model,
     worth_trying,
@@ -47,8 +47,8 @@ from psfdae.training.settings import (
     DATASET_CHOICE,
     Settings,
     SettingsReader,
-    of_config,
-    with_keywords,
+    apply_keywords,
+    make_settings,
 )
 from psfdae.training.stars import ImageStars
 
@@ -163,7 +163,7 @@ def from_stars(
     if stamp_px is not None:
         # A stated size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
-    settings = with_keywords(of_config(config), Settings.image_groups, size_settings)
+    settings = apply_keywords(make_settings(config), Settings.image_groups, size_settings)
     stem, sentence = model_name(image, name), ""
     if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
@@ -388,7 +388,7 @@ def write_model(
     with rename_together(files.bundle):
         model.save(files.bundle)
         # The field of each exposure, by its own stars.
-        exposure_models = for_exposures(model, stars)
+        exposure_models = adapt_to_exposures(model, stars)
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]
             exposure_model.save(files.bundle_of(exposure.name))
@@ -417,7 +417,7 @@ def fit_methods(
         place = files.fit(method_class)
         # A network keeps its state here while it trains, for the case that it is killed.
         checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
-        fit = fitted_to(stars, method_class, checkpoint)
+        fit = fit_method(stars, method_class, checkpoint)
         # The checkpoint goes when the fit is stored; until then, a killed run goes on from it.
         fits.store(fit, place, described(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)

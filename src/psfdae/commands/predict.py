@@ -117,9 +117,9 @@ def predict_command(
             if list_path is not None:
                 write_list(observation, list_path)
             if plot is not None:
-                from psfdae.report.plot import map_of_file
+                from psfdae.report.plot import read_psf_map
 
-                write_png(map_of_file(unfinished), plot)
+                write_png(read_psf_map(unfinished), plot)
     except OSError as error:
         name = error.filename or out
         raise PredictionError(f"{name}: cannot be written ({error.strerror or error})") from error

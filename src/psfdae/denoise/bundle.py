@@ -8,7 +8,7 @@ it was made.
 
 Only the leading eigenvectors of the flux model's covariance are stored. The variance of the others
 is spread evenly over the directions that they span. For stamps of up to 32 × 32 pixels, reading
-completes the basis (`flux_model_of`); any basis of these directions gives the same results. For
+completes the basis (`build_flux_model`); any basis of these directions gives the same results. For
 larger stamps, whose full basis would take gigabytes, the variance stays one number.
 """
 
@@ -86,7 +86,7 @@ class Bundle:
         """Light of stars beyond the stamps, if it was measured; BundleError if damaged."""
         tree = self.info.config.get("wings")
         try:
-            return None if tree is None else Wings.of_plain(tree)
+            return None if tree is None else Wings.from_plain(tree)
         except ValueError as error:
             raise BundleError(f"{self.info.name}: damaged ({error})") from None
 
@@ -111,9 +111,9 @@ def estimator(bundle: Bundle) -> Method:
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
         fitted = method_class.unpack(bundle.weights, info)
-        for name, expected, is_fulfilled in fitted.conditions():
+        for name, expected_shapes, is_fulfilled in fitted.conditions():
             if not np.all(is_fulfilled):
-                raise ValueError(f"array {name!r} must have {expected}")
+                raise ValueError(f"array {name!r} must have {expected_shapes}")
         if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:
             raise ValueError("its PSFs have not the size of stamps")
     except (ValueError, TypeError, LookupError, ArithmeticError) as error:
@@ -218,7 +218,7 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
 # Reading.
 
 
-def shipped_path() -> Path:
+def locate_shipped_model() -> Path:
     """Return the file of the bundle that comes with the package."""
     return Path(str(files("psfdae.denoise") / "bundles" / f"wfsat{SUFFIX}"))
 
@@ -257,7 +257,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     """
     from safetensors import SafetensorError, safe_open
 
-    path = shipped_path() if path is None else path
+    path = locate_shipped_model() if path is None else path
     try:
         # A bundle of stamps of 256 × 256 pixels has some 20 MB.
         size, max_size = path.stat().st_size, 2**28
@@ -305,7 +305,7 @@ def build_bundle(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> Bundle:
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)
     )
-    return Bundle(info, weights, flux_model_of(flux), ErrorModel.of_arrays(errors))
+    return Bundle(info, weights, build_flux_model(flux), ErrorModel.of_arrays(errors))
 
 
 def _require(condition: ArrayLike, path: Path, problem: str) -> None:
@@ -332,7 +332,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     """
     # Arrays of every bundle; limits of an outlier score only of some.
     pixels, components = info.stamp_px**2, info.components
-    expected: dict[str, tuple[int, ...] | None] = {
+    expected_shapes: dict[str, tuple[int, ...] | None] = {
         **dict.fromkeys(("flux/mean", "flux/low", "flux/high"), (pixels,)),
         "flux/variance": (components,),
         "flux/rest": (),
@@ -340,21 +340,21 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     }
     nodes = arrays["errors/noise"].size if "errors/noise" in arrays else 0
     shapes = ErrorModel.shapes(nodes, info.stamp_px)
-    expected |= {f"errors/{name}": shape for name, shape in shapes.items()}
+    expected_shapes |= {f"errors/{name}": shape for name, shape in shapes.items()}
     if "errors/outlier_limit" not in arrays:
-        del expected["errors/outlier_limit"]
+        del expected_shapes["errors/outlier_limit"]
     # Arrays of the method; a shape that the method leaves open is taken as it is.
     try:
         method_shapes = method(info.method).shapes(info)
     except ProductError as error:
         raise BundleError(f"{path}: {error}; a newer psfdae would do") from None
-    expected |= {f"{info.method}/{name}": shape for name, shape in method_shapes.items()}
+    expected_shapes |= {f"{info.method}/{name}": shape for name, shape in method_shapes.items()}
     # No array is missing or unknown; then each has the right shape, and finite numbers.
-    unmatched = arrays.keys() ^ expected.keys()
-    name = min(unmatched, default="")
-    state = "missing" if name in expected else "unknown"
-    _require(not unmatched, path, f"array {name!r} is {state}")
-    for name, shape in expected.items():
+    unmatched_names = arrays.keys() ^ expected_shapes.keys()
+    name = min(unmatched_names, default="")
+    state = "missing" if name in expected_shapes else "unknown"
+    _require(not unmatched_names, path, f"array {name!r} is {state}")
+    for name, shape in expected_shapes.items():
         array = arrays[name]
         is_number = array.dtype in (np.float16, np.float32, np.float64, np.int64)
         _require(is_number, path, f"array {name!r} of {array.dtype}")
@@ -372,7 +372,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
 
 
 def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
-    """Return the arrays of a flux model with so many leading eigenvectors, for `flux_model_of`.
+    """Return the arrays of a flux model with so many leading eigenvectors, for `build_flux_model`.
 
     Parameters
     ----------
@@ -405,7 +405,7 @@ def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
     }
 
 
-def flux_model_of(arrays: Mapping[str, np.ndarray], full_basis_max_px: int = 32**2) -> FluxModel:
+def build_flux_model(arrays: Mapping[str, np.ndarray], full_basis_max_px: int = 32**2) -> FluxModel:
     """Return the flux model of the arrays of a file, eigenvalues ascending.
 
     Parameters

@@ -89,12 +89,14 @@ class CentredStars(NamedTuple):
         # Bad pixels as the photometry repaired them, or the level of the border where it could not.
         is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
         level = self.border_level[:, None, None]
-        repaired = (
+        filled_stamps = (
             photometry.images * photometry.flux[:, None, None]
             + photometry.background[:, None, None]
         )
-        repaired = np.where(is_unmeasured[:, None, None], np.where(bad, level, stamps), repaired)
-        data = np.where(photometry.used & ~bad, stamps, repaired).astype(np.float64) - level
+        filled_stamps = np.where(
+            is_unmeasured[:, None, None], np.where(bad, level, stamps), filled_stamps
+        )
+        data = np.where(photometry.used & ~bad, stamps, filled_stamps).astype(np.float64) - level
         # Stamps need as many good pixels as the photometry asks for, and any contrast.
         modulus = np.abs(data).max(axis=(1, 2))
         has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
@@ -215,8 +217,8 @@ class Denoiser(ABC):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             # 2048 stars at a time are measured and described: their arrays fit in memory.
             parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
-            centred = [self._centre(part, fixed) for part in parts]
-            predictions = map(self._predict, centred, self._denoise(centred))
+            centred_stars = [self._centre(part, fixed) for part in parts]
+            predictions = map(self._predict, centred_stars, self._denoise(centred_stars))
             return Prediction.joined([*predictions]).of(slice(count))
 
     # Step 1: centring and photometry.
@@ -237,15 +239,15 @@ class Denoiser(ABC):
         is_too_far = np.abs(shift).max(axis=1) > margin
         shift[is_too_far] = 0
         # Stamps of the model's side about the star; pixels that none shows are bad.
-        stamps, bad, saturated = (
+        stamps, bad, saturated_pixels = (
             cut(frames, side, shift) for frames in (data, stars.bad, stars.saturated)
         )
         # Flags of the list, and those of pixels and centring.
         flags = stars.flags.copy()
         raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
-        raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.SATURATED, saturated_pixels.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.OFF_CENTRE, is_too_far)
-        bad = bad | saturated
+        bad = bad | saturated_pixels
         # A sky that is given and is more than 5 σ off that of the border is flagged.
         border_level = border_median(stamps, bad)
         if np.isfinite(stars.background).any():
@@ -259,18 +261,22 @@ class Denoiser(ABC):
     # Step 2: the method.
 
     @abstractmethod
-    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
+    def _denoise(self, centred_stars: Sequence[CentredStars]) -> list[DenoisedStars]:
         """Return the PSFs of stars by the method, with fluxes and skies."""
 
     # Step 3: errors and flags.
 
-    def _predict(self, centred: CentredStars, denoised: DenoisedStars) -> Prediction:
+    def _predict(self, centred_stars: CentredStars, denoised_stars: DenoisedStars) -> Prediction:
         """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
         info, errors = self.bundle.info, self.bundle.errors
-        stars, flags, photometry = centred.stars, centred.flags, denoised.photometry
-        psf, sigma = denoised.psf, denoised.sigma
+        stars, flags, photometry = (
+            centred_stars.stars,
+            centred_stars.flags,
+            denoised_stars.photometry,
+        )
+        psf, sigma = denoised_stars.psf, denoised_stars.sigma
         # Noise over the flux: the unit of the training, on which errors and limits depend.
-        noise = photometry.noise / np.where(denoised.has_no_flux, np.nan, photometry.flux)
+        noise = photometry.noise / np.where(denoised_stars.has_no_flux, np.nan, photometry.flux)
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
         snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
@@ -281,15 +287,17 @@ class Denoiser(ABC):
         # F psf ± F w, with the half-width w of the case of each star.
         half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
         psf *= flux
-        residual = (centred.stamps - photometry.background[:, None, None]).astype(np.float32) - psf
+        residual = (centred_stars.stamps - photometry.background[:, None, None]).astype(
+            np.float32
+        ) - psf
         # Pixels that were repaired tell nothing.
         residual[~photometry.used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
-        chi2 = reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
+        chi2 = compute_reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
         flux_error = self._flux_errors(photometry, flux_scale, stars.gain)
         # Flags beside those of centring, photometry and method. The S/N of a star is known to its
         # tolerance.
-        is_unlike = errors.is_unlike_training(noise, distance, denoised.outlier_score)
+        is_unlike = errors.is_unlike_training(noise, distance, denoised_stars.outlier_score)
         flags |= photometry.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
         is_bright = snr > info.snr_max * SNR_TOLERANCE
@@ -309,16 +317,16 @@ class Denoiser(ABC):
             "ratio95_bright": ratio95[:, 1],
             "chi2": chi2,
             "distance": distance,
-            "outlier_score": denoised.outlier_score,
+            "outlier_score": denoised_stars.outlier_score,
             "fwhm_px": shapes.fwhm_px,
             "ellipticity": shapes.ellipticity,
             "position_angle_deg": shapes.position_angle_deg,
-            "shift_x": centred.shift[:, 1],
-            "shift_y": centred.shift[:, 0],
+            "shift_x": centred_stars.shift[:, 1],
+            "shift_y": centred_stars.shift[:, 0],
             "flags": flags,
         }
         columns |= self._total_fluxes(stars, photometry, flux_error)
-        columns |= denoised.centre_columns()
+        columns |= denoised_stars.centre_columns()
         return Prediction(
             columns=columns, psf=psf, residual=residual, uncertainty=flux * half_width
         )
@@ -348,7 +356,7 @@ class StampDenoiser(Denoiser):
         super().__init__(bundle, method)
         self._free_flux = method.free_flux()
 
-    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
+    def _denoise(self, centred_stars: Sequence[CentredStars]) -> list[DenoisedStars]:
         """Restore stars with the fluxes of the photometry, which the method may correct.
 
         A method that finds fluxes does so first, for stars of unknown flux and sky. It takes the
@@ -357,14 +365,14 @@ class StampDenoiser(Denoiser):
         """
         # Photometry of all parts together, and stars that have none.
         info = self.bundle.info
-        photometry = Photometry.joined([part.photometry for part in centred])
+        photometry = Photometry.joined([part.photometry for part in centred_stars])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
         has_flux = ~has_no_flux
         # Factors of the fluxes, between 1/2 and 2; more would be no correction. A method is told
         # the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
         near_clusters: dict[str, Any] = {}
         is_free = has_flux & np.concatenate(
-            [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred]
+            [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred_stars]
         )
         if is_free.any() and self.method.finds_flux:
             # √(noise² + floor²): what the method does not know of a star counts as noise.
@@ -372,7 +380,7 @@ class StampDenoiser(Denoiser):
             level = np.hypot(noise, self.bundle.errors.noise_floor) / info.kappa
             factor, near_clusters["near_clusters"] = self._free_flux.flux(images, level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
-            photometry = photometry.with_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
+            photometry = photometry.scale_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
         psf, sigma = np.full_like(photometry.images, np.nan), None
         score = np.full(len(has_flux), np.nan)
         # The PSFs; stars of a catalogue that reaches far beyond the image have all no flux.
@@ -391,10 +399,10 @@ class StampDenoiser(Denoiser):
                     images[has_flux], level[has_flux], **clusters
                 )
         # The parts again, without centres.
-        ends = np.cumsum([0, *(len(part.stars) for part in centred)])
+        ends = np.cumsum([0, *(len(part.stars) for part in centred_stars)])
         unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
-        denoised = DenoisedStars(psf, sigma, photometry, has_no_flux, score, *unknown)
-        return [denoised.part(slice(*rows)) for rows in pairwise(ends)]
+        denoised_stars = DenoisedStars(psf, sigma, photometry, has_no_flux, score, *unknown)
+        return [denoised_stars.part(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalised(
         self, photometry: Photometry, has_no_flux: np.ndarray
@@ -433,8 +441,8 @@ class FieldDenoiser(Denoiser):
 
     has_snr_max = False
 
-    def _denoise(self, centred: Sequence[CentredStars]) -> list[DenoisedStars]:
-        return [measure_stars(part, self.method, self.bundle.errors) for part in centred]
+    def _denoise(self, centred_stars: Sequence[CentredStars]) -> list[DenoisedStars]:
+        return [measure_stars(part, self.method, self.bundle.errors) for part in centred_stars]
 
     def _flux_errors(
         self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
@@ -461,22 +469,26 @@ class FieldDenoiser(Denoiser):
         return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
 
 
-def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> DenoisedStars:
+def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorModel) -> DenoisedStars:
     """Denoise stars with the fluxes that the method measures in place of the photometry.
 
     The photometry repairs bad pixels and gives the noise.
 
     Parameters
     ----------
-    centred : CentredStars
+    centred_stars : CentredStars
     method : Method
         One with the capability `knows_field`.
     errors : ErrorModel
         Errors of measured stars due to errors of the model, which are added to those of the method.
     """
-    stars, photometry, border_level = centred.stars, centred.photometry, centred.border_level
+    stars, photometry, border_level = (
+        centred_stars.stars,
+        centred_stars.photometry,
+        centred_stars.border_level,
+    )
     # Stamps above the level of their border; the sky that is measured counts from it, too.
-    data, noise, is_unusable = centred.measurable()
+    data, noise, is_unusable = centred_stars.measurable()
     has_flux = np.isfinite(stars.flux)
     # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
     # that of its flux.
@@ -489,19 +501,19 @@ def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> 
         data,
         noise,
         place,
-        stars.listed - centred.shift,
-        centred.has_exact_centre,
+        stars.listed - centred_stars.shift,
+        centred_stars.has_exact_centre,
         flux=stars.flux,
         sky=stars.background - border_level,
         gain=stars.gain,
     )
     # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
-    measured = estimate.measured
-    assert measured is not None and estimate.sigma is not None
-    covariance = errors.model.added_to(measured.covariance, measured.flux, place[:, :2])
+    star_fit = estimate.measured
+    assert star_fit is not None and estimate.sigma is not None
+    covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, place[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
     # A flux that was given counts if the photometry could use it, another one above its error.
-    flux = np.where(has_flux, stars.flux, measured.flux)
+    flux = np.where(has_flux, stars.flux, star_fit.flux)
     is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
     has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
     # Flags on pixels are those of the photometry, on the flux those of the method.
@@ -512,8 +524,8 @@ def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> 
     raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
     # The same photometry with the method's fluxes and skies: images are (x − b) / F.
     unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
-    images = (data - measured.background[:, None, None]) / unit
-    sky = border_level + measured.background
+    images = (data - star_fit.background[:, None, None]) / unit
+    sky = border_level + star_fit.background
     photometry = replace(
         photometry,
         flux=np.where(is_unusable, np.nan, flux),
@@ -526,7 +538,7 @@ def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> 
     # known.
     middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
     middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
-    centre = middle + centred.shift + measured.centre
+    centre = middle + centred_stars.shift + star_fit.centre
     # Stars without a flux are told nothing.
     score = estimate.outlier_score
     score = np.full(len(flux), np.nan) if score is None else score.copy()
@@ -537,7 +549,7 @@ def measure_stars(centred: CentredStars, method: Method, errors: ErrorModel) -> 
     )
 
 
-def reduced_chi2(
+def compute_reduced_chi2(
     residual: np.ndarray,
     psf: np.ndarray,
     flux_sigma: np.ndarray | None,
@@ -566,14 +578,14 @@ def reduced_chi2(
         variance = variance + np.maximum(psf, 0.0) * per_electron
     # What is expected of r²/v in each pixel: 1, or less by what the star follows of its own noise.
     is_used = np.isfinite(residual) & np.isfinite(variance)
-    expected = np.ones(residual.shape)
+    expected_square = np.ones(residual.shape)
     if flux_sigma is not None:
         mean_variance = variance.mean(axis=(1, 2), keepdims=True)
         part = np.clip(1.0 - flux_sigma.astype(np.float64) ** 2 / mean_variance, 0.01, 1.0)
-        expected = part * (mean_variance + part * (variance - mean_variance)) / variance
+        expected_square = part * (mean_variance + part * (variance - mean_variance)) / variance
     total, expected_total = (
         np.where(is_used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
-        for values in (np.square(residual / np.sqrt(variance)), expected)
+        for values in (np.square(residual / np.sqrt(variance)), expected_square)
     )
     chi2 = total / np.where(expected_total > 0, expected_total, np.inf)
     return np.where(is_used.any(axis=(1, 2)), chi2, np.nan)

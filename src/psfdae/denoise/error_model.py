@@ -74,7 +74,9 @@ class ModelErrors(NamedTuple):
         terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
         return np.where(np.isfinite(u2 + w2), np.sqrt(self.growth @ terms), 1.0)
 
-    def added_to(self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray) -> np.ndarray:
+    def add_to_covariance(
+        self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray
+    ) -> np.ndarray:
         """Return covariances of measured stars with the errors of the model too.
 
         Parameters
@@ -144,7 +146,7 @@ class ErrorModel:
     model: ModelErrors = field(default_factory=ModelErrors)
 
     @classmethod
-    def uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
+    def build_uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
         """Return errors whose factors are 1, and whose limit of the distance is 0."""
         unit, scale = np.ones(len(noise)), np.ones((len(noise), 2, len(Estimated), 2))
         return cls(noise, half_width68, unit, scale, scale, unit, distance_limit=0.0)
@@ -216,7 +218,7 @@ class ErrorModel:
             Factor of the error of the flux.
         """
         # Errors of stars of known flux and sky, at this noise, in units of the method's σ.
-        half_width = at_noise(noise, self.noise, self.half_width68)
+        half_width = interpolate_at_noise(noise, self.noise, self.half_width68)
         if sigma is not None:
             half_width = half_width * sigma
         # The half-width of 95 %, as a multiple of that of 68 %.
@@ -227,7 +229,7 @@ class ErrorModel:
         )
         case = np.where(estimates_sky, Estimated.FLUX_AND_SKY, estimates_flux.astype(int))
 
-        def at_case(table: np.ndarray) -> np.ndarray:
+        def interpolate_case(table: np.ndarray) -> np.ndarray:
             """Interpolate a table of all cases (S, 2, 3, 2) at the noise and case of each star."""
             # Linear in the noise, each of the 12 numbers of a node by itself.
             columns = table.reshape(len(table), -1).T
@@ -236,7 +238,7 @@ class ErrorModel:
             return np.asarray(of_case[np.arange(len(noise)), estimates_noise.astype(int), case])
 
         # A pixel has the factor of its brightness; ratios of 95 % follow from both factors.
-        scale68, scale95 = at_case(self.scale68), at_case(self.scale95)
+        scale68, scale95 = interpolate_case(self.scale68), interpolate_case(self.scale95)
         faint_scale, bright_scale = scale68.T.astype(np.float32)[:, :, None, None]
         half_width = half_width * np.where(brightest(psf), bright_scale, faint_scale)
         # The stated error of a flux is scaled where it was counted: with flux and sky estimated.
@@ -255,7 +257,7 @@ class ErrorModel:
         return is_unlike
 
 
-def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
+def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
     """Interpolate maps of errors linearly at the noise of each star.
 
     They are linear in the noise and not in its logarithm: an error is a floor plus a part that
@@ -320,7 +322,7 @@ def mahalanobis(
     ndarray, shape (n,), float64
     """
     # Scores along the eigenvectors, each over its standard deviation with the star's noise.
-    centred = stamps.reshape(len(stamps), -1) - model.mean
-    scores = centred @ model.basis[:, -components:]
+    deviations = stamps.reshape(len(stamps), -1) - model.mean
+    scores = deviations @ model.basis[:, -components:]
     variance = model.variance[-components:] + np.asarray(noise, dtype=np.float64)[:, None] ** 2
     return np.asarray(np.sqrt((scores**2 / variance).sum(axis=1)))

@@ -188,7 +188,7 @@ class Photometry:
         columns = ([getattr(p, field.name) for p in parts] for field in fields(cls))
         return cls(*map(np.concatenate, columns))
 
-    def with_flux(self, factor: np.ndarray) -> Photometry:
+    def scale_flux(self, factor: np.ndarray) -> Photometry:
         """Return the same light with fluxes times a factor (n,), the rest of it being sky."""
         # F image + b = f F image' + b', where image' has the sum 1 as well: what the flux has less,
         # the sky has more, b' = b + F (1 − f)/P.
@@ -307,13 +307,13 @@ def _robust_fit(
         used = np.where((is_used.mean(axis=1) >= model.min_good_pixels)[:, None], is_used, finite)
         # F² in S, from the last round, and never below the variance of F by the noise alone.
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
-        flux, error, score, repaired = generalised_least_squares(x, used, prior, sigma, model)
+        flux, error, score, repaired = solve_least_squares(x, used, prior, sigma, model)
         # Scores have a standard deviation of 1 if σ is right.
         sigma = np.maximum(sigma * np.clip(scatter(score, used), 0.2, 1.5), NOISE_FLOOR)
     return flux, error, sigma, is_used, repaired
 
 
-def generalised_least_squares(
+def solve_least_squares(
     x: np.ndarray, used: np.ndarray, prior: np.ndarray, sigma: np.ndarray, model: FluxModel
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Fit the flux with S = prior · C + σ²I over the used pixels of every star.

@@ -76,8 +76,8 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assuming()
     statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} states it)"
-    assumed = statement if observation.scale_assumed else ""
-    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    scale_note = statement if observation.scale_assumed else ""
+    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{scale_note}")
     if fixed and not (model.method.knows_field and observation.shape):
         raise PredictionError(
             f"{source.path}: {call('fixed=True', '--fixed-positions')} takes an image with a star "

@@ -94,8 +94,8 @@ class LeadingModes:
         # latter that E does not hold is `outside`, and x² beyond E is `energy`.
         total = x.sum(axis=1, dtype=np.float64)
         x = x - (total / self.pixels)[:, None]
-        projected = x @ self._projector
-        modes, along = projected[:, :-1], projected[:, -1]
+        mode_scores = x @ self._projector
+        modes, along = mode_scores[:, :-1], mode_scores[:, -1]
         outside = along - modes @ self._modes
         energy = np.einsum("ij,ij->i", x, x) - (modes**2).sum(axis=1)
         # A known sky makes the mean of the stamp a measurement of the flux, Σx = F ± σ √P.
@@ -135,7 +135,7 @@ class LeadingModes:
         score = self.border_scores(x, modes, total, fitted_flux, weight, sigma2, sky_known)
         if used is not None:
             score[~used[:, self._ring]] = np.nan
-        scatter = np.where(np.isfinite(noise), 1.0, clipped_rms(score))
+        scatter = np.where(np.isfinite(noise), 1.0, compute_clipped_rms(score))
         sigma = np.maximum(np.sqrt(sigma2) * scatter, NOISE_FLOOR)
         # With this noise, what the star has beyond E belongs to its covariance again.
         fitted_flux, error, _ = flux_of(fitted_flux, sigma**2, self._other_variance)
@@ -182,22 +182,22 @@ class LeadingModes:
         return np.asarray(residual / np.sqrt(precision))
 
 
-def clipped_rms(score: np.ndarray) -> np.ndarray:
+def compute_clipped_rms(score: np.ndarray) -> np.ndarray:
     """Return the RMS of each row without values beyond 4 σ, with σ from the median of the modulus.
 
     NaN is left out; a row of nothing else counts as 1.
     """
     # The median of the values that are there, the lower of two in the middle where some are NaN.
     modulus = np.abs(score)
-    unused = np.isnan(modulus)
-    if unused.any():
+    unused_pixels = np.isnan(modulus)
+    if unused_pixels.any():
         ascending = np.sort(modulus, axis=1)  # NaN goes last
-        middle = np.maximum((~unused).sum(axis=1, keepdims=True) - 1, 0) // 2
+        middle = np.maximum((~unused_pixels).sum(axis=1, keepdims=True) - 1, 0) // 2
         median = np.take_along_axis(ascending, middle, axis=1)
     else:
         median = np.median(modulus, axis=1, keepdims=True)
     # σ = 1.4826 times the median of the modulus of a normal variable.
-    is_used = ~unused & (modulus <= 4.0 * SIGMA_OF_MAD * median)
+    is_used = ~unused_pixels & (modulus <= 4.0 * SIGMA_OF_MAD * median)
     squares = np.where(is_used, modulus, 0.0)
     count = is_used.sum(axis=1)
     total = np.einsum("ij,ij->i", squares, squares)

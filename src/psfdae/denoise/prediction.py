@@ -110,8 +110,8 @@ class Prediction:
 
     def __post_init__(self) -> None:
         # The order of the list, whatever the order in which columns were computed.
-        ordered = {name: self.columns[name] for name in COLUMNS if name in self.columns}
-        object.__setattr__(self, "columns", ordered)
+        ordered_names = {name: self.columns[name] for name in COLUMNS if name in self.columns}
+        object.__setattr__(self, "columns", ordered_names)
 
     def __getattr__(self, name: str) -> np.ndarray:
         """Return a column by its name."""

@@ -18,7 +18,7 @@ from psfdae.image.stamps import Stamps
 from psfdae.psf.interface import PredictionError
 
 
-def stamps_of_arrays(
+def make_stamps(
     stamps: Any,
     side: int,
     model_name: str,
@@ -50,7 +50,7 @@ def stamps_of_arrays(
         If shapes, types or units do not fit.
     """
     # The stamps; a single one has two axes, and counts as a cube of one.
-    values, masked, sigma, unit = _unpacked(stamps)
+    values, masked, sigma, unit = _unpack(stamps)
     data = real_numbers("stamps", values, PredictionError)
     is_single = data.ndim == 2
     data = data[None] if is_single else data
@@ -96,7 +96,7 @@ def stamps_of_arrays(
     # Pixels that are not finite, or masked in their container, are bad, too.
     bad = pixel_masks["bad"] | ~is_finite
     x, y, magnitude, colour = _columns("position", position, count, 4).T
-    checked = Stamps(
+    checked_arrays = Stamps(
         data=data if is_finite.all() else np.where(is_finite, data, 0),
         bad=bad if masked is None else bad | masked,
         saturated=pixel_masks["saturated"],
@@ -109,10 +109,10 @@ def stamps_of_arrays(
         listed=_columns("centre", centre, count, 2)[:, ::-1],
         **star_columns,
     )
-    return checked, unit
+    return checked_arrays, unit
 
 
-def _unpacked(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
+def _unpack(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
     """Return numbers, mask, σ and unit of stamps in any container; None, None, "" without them."""
     if hasattr(stamps, "uncertainty") and hasattr(stamps, "mask"):  # an NDData
         mask = stamps.mask if stamps.mask is None else np.asarray(stamps.mask, dtype=bool)

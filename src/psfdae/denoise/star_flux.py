@@ -42,7 +42,7 @@ class Photometer:
         self._low, self._high = (limit.astype(np.float32) for limit in model.pixel_range)
 
     def measure(
-        self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, stated: Stamps
+        self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, given_stars: Stamps
     ) -> Photometry:
         """Measure flux, sky and noise of stars.
 
@@ -54,15 +54,15 @@ class Photometer:
             Pixels that are not used.
         start : ndarray, shape (n,)
             Sky to start from (`psfdae.image.stamps.border_median`).
-        stated : Stamps
+        given_stars : Stamps
             Its `flux`, `background` and `noise` are taken where they are not NaN.
         """
         count = len(stamps)
         hidden = bad.reshape(count, -1)
-        flux_known, sky_known = np.isfinite(stated.flux), np.isfinite(stated.background)
+        flux_known, sky_known = np.isfinite(given_stars.flux), np.isfinite(given_stars.background)
         # Stamps above the sky in units of their brightest pixel, in which no square overflows; a
         # mean PSF in place of those without light.
-        sky = np.where(sky_known, stated.background, start)
+        sky = np.where(sky_known, given_stars.background, start)
         x = (stamps.reshape(count, -1) - sky[:, None]).astype(np.float32)
         np.copyto(x, 0.0, where=hidden)
         scale = np.abs(x).max(axis=1).astype(np.float64)
@@ -71,7 +71,7 @@ class Photometer:
         x[~lit] = self.model.mean
         x /= scale.astype(np.float32)[:, None]
         # All stars in the space of the leading eigenvectors.
-        fit = self.leading.fit(x, sky_known, stated.flux / scale, stated.noise / scale)
+        fit = self.leading.fit(x, sky_known, given_stars.flux / scale, given_stars.noise / scale)
         # Images of flux 1 without the sky that is left, (x − b) / F.
         has_flux = fit.flux > self.least_flux
         flux = np.where(has_flux, fit.flux, 1.0)
@@ -83,21 +83,23 @@ class Photometer:
         has_outlier |= (images + reach < self._low).any(axis=1)
         images[~has_flux] = 0.0
         # In the unit of the stamps; what was stated stays.
-        measured = Photometry(
-            flux=np.where(flux_known, stated.flux, fit.flux * scale),
+        photometry = Photometry(
+            flux=np.where(flux_known, given_stars.flux, fit.flux * scale),
             flux_error=np.where(flux_known, np.nan, fit.error * scale),
             background=np.where(sky_known, sky, sky + fit.sky * scale),
-            noise=np.where(np.isfinite(stated.noise), stated.noise, fit.noise * scale),
+            noise=np.where(np.isfinite(given_stars.noise), given_stars.noise, fit.noise * scale),
             images=images.reshape(stamps.shape),
             used=np.ones(stamps.shape, dtype=bool),
             flags=np.zeros(count, dtype=np.uint16),
         )
-        raise_flag(measured.flags, StarFlag.FAINT, is_faint(measured.flux, measured.flux_error))
+        raise_flag(
+            photometry.flags, StarFlag.FAINT, is_faint(photometry.flux, photometry.flux_error)
+        )
         # Stars with bad pixels, outliers, or less flux than twice its error again, with care.
         is_clear = flux_known | (fit.flux > 2.0 * fit.error)
         careful = hidden.any(axis=1) | ~lit | ~is_clear | ~has_flux | has_outlier
-        self._carefully(np.flatnonzero(careful), stamps, hidden, sky, stated, measured)
-        return measured
+        self._carefully(np.flatnonzero(careful), stamps, hidden, sky, given_stars, photometry)
+        return photometry
 
     def _carefully(
         self,
@@ -105,12 +107,12 @@ class Photometer:
         stamps: np.ndarray,
         hidden: np.ndarray,
         sky: np.ndarray,
-        stated: Stamps,
-        measured: Photometry,
+        given_stars: Stamps,
+        photometry: Photometry,
     ) -> None:
-        """Fit the stars of some rows with `robust_flux`, and overwrite their rows of `measured`."""
+        """Fit the stars of some rows with `robust_flux`; overwrite their rows of `photometry`."""
         # Stars of unknown sky have a model of their own, in which any sky is as likely.
-        has_free_sky = ~np.isfinite(stated.background[stars])
+        has_free_sky = ~np.isfinite(given_stars.background[stars])
         for is_free, members in ((True, stars[has_free_sky]), (False, stars[~has_free_sky])):
             if not members.size:
                 continue
@@ -127,48 +129,58 @@ class Photometer:
                 if estimate is None:
                     estimate = robust_flux(x.reshape(-1, side, side), model)
                     blind_estimate = estimate if blind else blind_estimate
-                self._overwrite(measured, group, estimate, sky[group], stated)
+                self._overwrite(photometry, group, estimate, sky[group], given_stars)
 
     def _overwrite(
         self,
-        measured: Photometry,
+        photometry: Photometry,
         group: np.ndarray,
         estimate: Photometry,
         sky: np.ndarray,
-        stated: Stamps,
+        given_stars: Stamps,
     ) -> None:
         """Overwrite rows `group` of a photometry by an estimate, of which they are the first."""
         # A flux that is given counts, and so do the repaired pixels and their noise.
         count = group.size
-        known_flux, known_noise = stated.flux[group], stated.noise[group]
-        has_flux, repaired = np.isfinite(known_flux), estimate.images[:count].reshape(count, -1)
+        known_flux, known_noise = given_stars.flux[group], given_stars.noise[group]
+        has_flux, filled_pixels = (
+            np.isfinite(known_flux),
+            estimate.images[:count].reshape(count, -1),
+        )
         fitted_flux, fit_flags = estimate.flux[:count], estimate.flags[:count]
-        fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
+        is_fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
         # A star has no flux if it was not fitted, if the flux is below its error and not given, or
         # if it has no image in single precision. A flux that is given is not faint.
-        is_lost = ~fitted | ~(flux > self.least_flux * np.abs(repaired).max(axis=1))
+        is_lost = ~is_fitted | ~(flux > self.least_flux * np.abs(filled_pixels).max(axis=1))
         is_lost |= ~has_flux & ((fit_flags & StarFlag.NO_FLUX) > 0)
         # NO_FLUX is judged with the fluxes that are given; all other flags are those of the fit.
         flags = fit_flags & ~np.uint16(StarFlag.NO_FLUX)
         flags[has_flux] &= ~np.uint16(StarFlag.FAINT)
         raise_flag(flags, StarFlag.NO_FLUX, is_lost)
         # The sky that is left, b = mean(x) − F/P, and images of flux 1 without it.
-        residual_sky = repaired.mean(axis=1) - np.nan_to_num(fitted_flux) / repaired.shape[1]
-        residual_sky = np.where(np.isfinite(stated.background[group]), 0.0, residual_sky)
-        images = (repaired - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
+        residual_sky = (
+            filled_pixels.mean(axis=1) - np.nan_to_num(fitted_flux) / filled_pixels.shape[1]
+        )
+        residual_sky = np.where(np.isfinite(given_stars.background[group]), 0.0, residual_sky)
+        images = (filled_pixels - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
         images[is_lost] = 0.0
         # The noise as of other stars, by the pixels of the border that were used.
-        filled = np.tile(self.model.mean.astype(np.float32), (len(estimate.flux), 1))
-        filled[:count] = images
+        known_images = np.tile(self.model.mean.astype(np.float32), (len(estimate.flux), 1))
+        known_images[:count] = images
         # These are images of flux 1 without sky, both known here: only the noise is fitted.
-        unit, used = np.ones(len(filled)), estimate.used.reshape(filled.shape)
-        noise = self.leading.fit(filled, unit > 0, unit, np.nan * unit, used).noise[:count] * flux
+        unit, is_used_pixel = np.ones(len(known_images)), estimate.used.reshape(known_images.shape)
+        noise = (
+            self.leading.fit(known_images, unit > 0, unit, np.nan * unit, is_used_pixel).noise[
+                :count
+            ]
+            * flux
+        )
         noise = np.where(is_lost, estimate.noise[:count], noise)
         # Rows of the photometry; what was stated stays.
-        measured.flux[group] = flux
-        measured.flux_error[group] = np.where(has_flux, np.nan, estimate.flux_error[:count])
-        measured.background[group] = sky + np.where(fitted, residual_sky, 0.0)
-        measured.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
-        measured.images[group] = images.reshape(estimate.images[:count].shape)
-        measured.used[group] = estimate.used[:count]
-        measured.flags[group] = flags
+        photometry.flux[group] = flux
+        photometry.flux_error[group] = np.where(has_flux, np.nan, estimate.flux_error[:count])
+        photometry.background[group] = sky + np.where(is_fitted, residual_sky, 0.0)
+        photometry.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
+        photometry.images[group] = images.reshape(estimate.images[:count].shape)
+        photometry.used[group] = estimate.used[:count]
+        photometry.flags[group] = flags

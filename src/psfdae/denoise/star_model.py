@@ -24,7 +24,7 @@ from psfdae.denoise.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.denoise.denoiser import make_denoiser
 from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.prediction import Prediction
-from psfdae.denoise.stamp_arrays import stamps_of_arrays
+from psfdae.denoise.stamp_arrays import make_stamps
 from psfdae.image.detector_frame import find_offset
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
@@ -119,7 +119,7 @@ class StarModel(FieldPsfs):
             tables.append(html_table(errors.colnames, [tuple(row) for row in errors]))
         return "".join(tables)
 
-    def with_errors(self, errors: ErrorModel) -> Self:
+    def replace_errors(self, errors: ErrorModel) -> Self:
         """Return the same model with other errors."""
         return type(self)(replace(self.bundle, errors=errors), self.method)
 
@@ -204,7 +204,7 @@ class StarModel(FieldPsfs):
         side = self.stamp_px + 2 * margin
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
-        stars, unit = stamps_of_arrays(stamps, side, self.name, numbers, masks, position, centre)
+        stars, unit = make_stamps(stamps, side, self.name, numbers, masks, position, centre)
         # Blocks of stars, side by side; each is denoised as if it were alone.
         blocks = self.denoiser.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
@@ -224,14 +224,14 @@ class StarModel(FieldPsfs):
         denoiser = self.to_image_frame(observation)[0].denoiser
         size = denoiser.block_size
 
-        def predicted(stamps: Stamps) -> Prediction:
+        def predict_chunk(stamps: Stamps) -> Prediction:
             blocks = denoiser.blocks(stamps)
             return Prediction.joined([denoiser.denoise(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
         with one_thread_each(), task("stars", observation.count) as advance:
-            for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
+            for stamps, prediction in in_order(predict_chunk, chunks, threads or available_cores()):
                 # Columns of the star list go along with the stars' rows.
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
@@ -373,9 +373,9 @@ class StarModel(FieldPsfs):
                 f"arcsec){advice}"
             )
         if not abs(pixel_scale_arcsec / model_scale - 1.0) <= SCALE_TOLERANCE:
-            assumed = ", assumed" if self.info.scale_assumed else ""
+            scale_note = ", assumed" if self.info.scale_assumed else ""
             raise PredictionError(
                 f"{source}: pixels of {pixel_scale_arcsec:.6g} arcsec, but the model "
-                f"{self.info.name!r} was trained on {model_scale:.6g} arcsec{assumed} "
+                f"{self.info.name!r} was trained on {model_scale:.6g} arcsec{scale_note} "
                 f"(tolerance {100 * SCALE_TOLERANCE:g} %){advice}"
             )

@@ -151,7 +151,7 @@ def photometry(
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
-        fluxes = StarFluxes(place, flux, outer_shares(model.on_pixels, place, flux / unit))
+        fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
         # At first, stars are no better known than to the error of the wings.
         sky, wing_light, wings = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, saturated
@@ -218,7 +218,9 @@ def tabulate_stars(
     total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
         flux = fit.flux / observation.unit_factor
-        total, total_error = wings.total_over_flux(outer_shares(model.on_pixels, fit.place, flux))
+        total, total_error = wings.total_over_flux(
+            outer_shares(model.draw_on_pixels, fit.place, flux)
+        )
     is_detected = observation.detections is not None
     # With a list, the errors of stars that overlap are larger than this bias, and of either sign.
     flux = fit.flux - fit.flux_bias if is_detected else fit.flux

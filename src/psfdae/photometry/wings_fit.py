@@ -17,7 +17,7 @@ from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import level_and_noise
 from psfdae.image.trails import saturated_cores
-from psfdae.psf.wings import Wings, expected_profile, tents
+from psfdae.psf.wings import Wings, compute_prior_profile, tents
 from psfdae.stars.moments import dither
 
 
@@ -180,7 +180,7 @@ def wings_of(
     # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, that
     # of the pixels and that of sums over blocks: an uneven sky and undetected sources leave
     # residuals that neighbours share, as wide as wings.
-    expected, prior_sigma = expected_profile(radius, mean_share)
+    expected, prior_sigma = compute_prior_profile(radius, mean_share)
     unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
     normal, projection = normal * unit * unit[:, None], projection * unit
     prior = np.diag(np.append(np.ones(count), 0.0))

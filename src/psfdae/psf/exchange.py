@@ -258,12 +258,12 @@ class PsfexField(FieldFile):
     def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
-        sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
+        samples = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
         columns, rows = (
-            _lanczos((axis - phase[:, i, None]) / self.step_px, sampled.shape[2 - i])
+            _lanczos((axis - phase[:, i, None]) / self.step_px, samples.shape[2 - i])
             for i in (0, 1)
         )
-        return np.asarray(rows @ sampled @ columns.transpose(0, 2, 1))
+        return np.asarray(rows @ samples @ columns.transpose(0, 2, 1))
 
 
 def _lanczos(offset: np.ndarray, count: int) -> np.ndarray:

@@ -215,7 +215,7 @@ class FieldPsfs(ABC):
             )
         return psfs if position.ndim == 2 else psfs[0]
 
-    def on_pixels(self, position: np.ndarray) -> np.ndarray:
+    def draw_on_pixels(self, position: np.ndarray) -> np.ndarray:
         """Return PSFs (n, d, d) in the pixels of the image, at positions (n, 2) or (n, 3).
 
         A third column has the magnitudes; see `psf_at`.
@@ -284,6 +284,6 @@ def aperture_correction(
     if wings is None:
         return 1.0 / inside
     # All light over that in the aperture, each with the wings of this PSF.
-    scale = float(wings.scale(outer_shares(model.on_pixels, np.array([[x, y]])))[0])
+    scale = float(wings.scale(outer_shares(model.draw_on_pixels, np.array([[x, y]])))[0])
     all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
     return (1.0 + all_wings) / (inside + inner_wings)

@@ -53,7 +53,7 @@ class Wings:
     outer_share: float
 
     @classmethod
-    def of_plain(cls, plain: Mapping[str, Any]) -> Self:
+    def from_plain(cls, plain: Mapping[str, Any]) -> Self:
         """Return wings from the lists and numbers of `plain`.
 
         Raises
@@ -159,7 +159,7 @@ class Wings:
     @property
     def is_measured(self) -> bool:
         """True if the pixels of the image made the error of the light smaller than the prior's."""
-        sigma = expected_profile(self.radius_px, self.outer_share)[1]
+        sigma = compute_prior_profile(self.radius_px, self.outer_share)[1]
         return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
 
@@ -176,10 +176,10 @@ def outer_shares(
     position = np.rint(place)  # at whole pixels, so that phases do not change the share
     if flux is not None:
         position = np.column_stack([position, magnitude(flux)])
-    located = np.flatnonzero(np.isfinite(position).all(axis=1))
+    rows_with_position = np.flatnonzero(np.isfinite(position).all(axis=1))
     # Some at a time, so that their PSFs take little memory.
-    for first in range(0, len(located), 2048):
-        part = located[first : first + 2048]
+    for first in range(0, len(rows_with_position), 2048):
+        part = rows_with_position[first : first + 2048]
         psf = draw(position[part])
         side = psf.shape[-1]
         # Pixels by their distance from the middle of the stamp.
@@ -203,7 +203,9 @@ def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-Wings.steepness * log_radius))
 
 
-def expected_profile(radius_px: np.ndarray, outer_share: float) -> tuple[np.ndarray, np.ndarray]:
+def compute_prior_profile(
+    radius_px: np.ndarray, outer_share: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return what is expected of p before any pixel outside of stamps is seen, and its σ, (K,).
 
     Outside of a stamp of the half side h, the light falls off as a (r/h)^-5, the mean slope of
@@ -216,9 +218,9 @@ def expected_profile(radius_px: np.ndarray, outer_share: float) -> tuple[np.ndar
     outer_integral = Wings.outer_part_from**-3.0 - 1.0
     edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * outer_integral)
     # The ring, at 1.5 h, was taken for sky: every pixel of the stamp lacks its light.
-    expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0))
+    expected_light = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0))
     # ∫ 2π r (r/h)^-3 dr from h on is 2π h².
     sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
     # The model may have 1.5 % too much or too little light in its stamp.
     sigma[0] = 0.015 / (2.0 * half) ** 2
-    return expected, sigma
+    return expected_light, sigma

@@ -168,18 +168,18 @@ def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
     ----------
     stars : mapping of str to ndarray, shape (n,)
     """
-    flagged, learnt = stars["flags"] != 0, stars["part"] == "training"
+    is_flagged, is_trained_on = stars["flags"] != 0, stars["part"] == "training"
     # Both axes are logarithmic.
     positive = (stars["chi2"] > 0) & (stars["snr"] > 0)
     figure = new_figure(2.8, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="χ² per pixel")
-    for selected, color, label in (
-        (positive & flagged, "#aaaaaa", "flagged"),
-        (positive & ~flagged & learnt, SERIES_COLORS[5], "no flag, training"),
-        (positive & ~flagged & ~learnt, SERIES_COLORS[0], "no flag, other"),
+    for is_shown, color, label in (
+        (positive & is_flagged, "#aaaaaa", "flagged"),
+        (positive & ~is_flagged & is_trained_on, SERIES_COLORS[5], "no flag, training"),
+        (positive & ~is_flagged & ~is_trained_on, SERIES_COLORS[0], "no flag, other"),
     ):
         axes.plot(
-            stars["snr"][selected], stars["chi2"][selected], ".", ms=3, color=color, label=label
+            stars["snr"][is_shown], stars["chi2"][is_shown], ".", ms=3, color=color, label=label
         )
     axes.axhline(1.0, color="black", lw=0.8)
     axes.grid(True)

@@ -58,7 +58,7 @@ def stars_with_stamps(stars: Mapping[str, np.ndarray]) -> tuple[np.ndarray, floa
 
     Returns
     -------
-    selected : ndarray of int
+    selected_stars : ndarray of int
         Indices of stars, brightest first.
     spacing_px : float
         Least distance of two of them along an axis, in pixels of the image.
@@ -68,16 +68,16 @@ def stars_with_stamps(stars: Mapping[str, np.ndarray]) -> tuple[np.ndarray, floa
     extent = float(np.ptp(position[:, candidates], axis=1).max()) if candidates.size else 0.0
     spacing_px = extent / 8 if extent > 0 else 1.0
     # Take the brightest star, drop all whose stamps would overlap with its stamp, and repeat.
-    selected = []
+    selected_stars = []
     while candidates.size:
         star = candidates[0]
-        selected.append(star)
+        selected_stars.append(star)
         distance = np.abs(position[:, candidates] - position[:, star, None]).max(axis=0)
         candidates = candidates[distance >= spacing_px]
-    return np.array(selected, dtype=int), spacing_px
+    return np.array(selected_stars, dtype=int), spacing_px
 
 
-def map_of_file(path: Path) -> Figure:
+def read_psf_map(path: Path) -> Figure:
     """Draw the map of the PSFs in a FITS file of a prediction.
 
     Parameters
@@ -94,8 +94,8 @@ def map_of_file(path: Path) -> Figure:
         stars = {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
         # Only the PSFs that are drawn are read: a file may have a million.
-        def read_psfs(selected: np.ndarray) -> np.ndarray:
-            psfs = [file["PSF"].section[int(star)] for star in selected]
+        def read_psfs(selected_stars: np.ndarray) -> np.ndarray:
+            psfs = [file["PSF"].section[int(star)] for star in selected_stars]
             return np.array(psfs, dtype=np.float32)
 
         return psf_map(stars, read_psfs, file[0].header["INFILE"])
@@ -157,7 +157,7 @@ def psf_map(
 
 
 def _draw_whiskers(
-    axes: Axes, stars: Mapping[str, np.ndarray], selected: np.ndarray, spacing_px: float
+    axes: Axes, stars: Mapping[str, np.ndarray], selected_stars: np.ndarray, spacing_px: float
 ) -> LineCollection | None:
     """Draw a line along the major axis of each selected star, with a key for ellipticity 0.2.
 
@@ -166,7 +166,7 @@ def _draw_whiskers(
     axes : Axes
     stars : mapping of str to ndarray, shape (n,)
         As in `psf_map`.
-    selected : ndarray of int
+    selected_stars : ndarray of int
         Numbers of the stars.
     spacing_px : float
         Distance of two stamps of the map.
@@ -178,20 +178,20 @@ def _draw_whiskers(
     """
     from matplotlib.collections import LineCollection
 
-    if not selected.size:
+    if not selected_stars.size:
         axes.text(0.5, 0.5, "no unflagged star", ha="center", transform=axes.transAxes)
         return None
     # A whisker is as long as two stamps for an ellipticity of 1.
     px_per_ellipticity = 2.0 * spacing_px
     # Ends of a whisker: the centre plus and minus half its length along the major axis.
-    angle = np.deg2rad(stars["position_angle_deg"][selected])
-    half = 0.5 * px_per_ellipticity * stars["ellipticity"][selected]
+    angle = np.deg2rad(stars["position_angle_deg"][selected_stars])
+    half = 0.5 * px_per_ellipticity * stars["ellipticity"][selected_stars]
     step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
-    centre = np.stack([stars["x"][selected], stars["y"][selected]], axis=1)
+    centre = np.stack([stars["x"][selected_stars], stars["y"][selected_stars]], axis=1)
     ends = np.stack([centre - step, centre + step], axis=1)
     lines = LineCollection(list(ends), cmap="viridis", linewidths=1.3)
     # Colours leave out 2 % of the stars at either end, so that outliers do not flatten the scale.
-    fwhm_px = stars["fwhm_px"][selected]
+    fwhm_px = stars["fwhm_px"][selected_stars]
     lines.set_array(fwhm_px)
     lines.set_clim(*np.percentile(fwhm_px, [2, 98]))
     axes.add_collection(lines)

@@ -163,8 +163,8 @@ class Report:
         snr = nearest_snr(levels)
         # Six stars that lie evenly over the field, one image of each.
         star, place = product["field_index"][test], field_positions(product)[test]
-        tested, first = np.unique(star, return_index=True)
-        shown = first[_evenly_spread(product["position"][tested], 6)]
+        tested_stars, first = np.unique(star, return_index=True)
+        shown = first[_evenly_spread(product["position"][tested_stars], 6)]
         images = self.restored[levels[snr]]
         noisy, truth = images["noisy"][shown], images["truth"][shown]
         # A row of the bright stars, then one for each method that figures show.
@@ -304,7 +304,7 @@ def quality_page(
     verdicts, flags = stars["verdict"], stars["flags"]
     verdict_counts = [(v, int((verdicts == v).sum())) for v in Verdict]
     flag_counts = [(f.name or "", int(((flags & int(f)) > 0).sum())) for f in StarFlag]
-    unflagged = ("none", str(int((flags == 0).sum())))
+    unflagged_row = ("none", str(int((flags == 0).sum())))
     template = Path(__file__).with_name("report.html").read_text(encoding="utf-8")
     return Template(template).substitute(
         title=escape(report.model.info.name),
@@ -327,7 +327,8 @@ def quality_page(
             [(escape(verdict), str(count)) for verdict, count in verdict_counts if count],
         ),
         flags=html_table(
-            ("flag", "stars"), [*((f, str(count)) for f, count in flag_counts if count), unflagged]
+            ("flag", "stars"),
+            [*((f, str(count)) for f, count in flag_counts if count), unflagged_row],
         ),
         notes="".join(f"<li>{escape(line)}</li>\n" for line in notes),
     )

@@ -154,13 +154,13 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
         methods,
         _error_table([*rows, *mean_rows], stars, methods),
         table_of_rows(rows),
-        _joined(per_star),
+        join_tables(per_star),
         measure_photometry(model, stars, restored),
         restored,
     )
 
 
-def _joined(blocks: Sequence[Mapping[str, Any]]) -> Table:
+def join_tables(blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return one table of blocks of columns, NaN in the columns that a block does not have.
 
     A block has the array `star` (n,); its other values are arrays as long, or constants.

@@ -20,8 +20,8 @@ from psfdae.denoise.error_model import (
     ErrorModel,
     Estimated,
     ModelErrors,
-    at_noise,
     brightest,
+    interpolate_at_noise,
     mahalanobis,
 )
 from psfdae.denoise.flux_model import FluxModel
@@ -65,7 +65,7 @@ class StarErrors:
     def measure(
         cls,
         stars: HeldOutStars,
-        fitted: Method,
+        method_fit: Method,
         model: FluxModel,
         nodes: np.ndarray,
         components: int,
@@ -80,12 +80,12 @@ class StarErrors:
         noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
         noise = np.repeat(nodes, len(draws[0][1]))
         level = noise / stars.noise.kappa
-        estimate = fitted.estimate(noisy, level, stars.position[star])
+        estimate = method_fit.estimate(noisy, level, stars.position[star])
         # A method that scores stars by themselves does so in its form for estimated fluxes, as it
         # does for a user's stars.
         score = estimate.outlier_score
         if score is None:
-            score = fitted.free_flux().outlier_score(noisy, level)
+            score = method_fit.free_flux().outlier_score(noisy, level)
         # Errors in units of the method's σ, if it has one; distances with the noise of each star.
         error = stars.errors(estimate.psf, star, estimate.sigma).astype(np.float32)
         distance = mahalanobis(noisy, noise, model, components)
@@ -100,9 +100,12 @@ class StarErrors:
 
     def of(self, is_selected: np.ndarray) -> StarErrors:
         """Return the errors of some of the stars, by a mask over stars; without their scores."""
-        selected = is_selected[self.star]
+        is_star_selected = is_selected[self.star]
         return StarErrors(
-            self.nodes, self.error[:, selected], self.star[selected], self.distance[:, selected]
+            self.nodes,
+            self.error[:, is_star_selected],
+            self.star[is_star_selected],
+            self.distance[:, is_star_selected],
         )
 
     @cached_property
@@ -121,8 +124,8 @@ class StarErrors:
         """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
         # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
         # are taken to have the same distribution.
-        scaled = self.error / np.maximum(self.half_width, 1e-12)[:, None]
-        return np.array([np.quantile(node, 0.95) for node in scaled], np.float64)
+        scaled_error = self.error / np.maximum(self.half_width, 1e-12)[:, None]
+        return np.array([np.quantile(node, 0.95) for node in scaled_error], np.float64)
 
     def outlier_limit(self) -> np.ndarray | None:
         """Return the outlier score that 0.1 % of the stars exceed at every node, shape (S,).
@@ -173,15 +176,15 @@ def noise_nodes(band: np.ndarray) -> np.ndarray:
 
 
 def calibrate_errors(
-    model: StarModel, fitted: Method, stars: ModelStars, seed: int
+    model: StarModel, method_fit: Method, stars: ModelStars, seed: int
 ) -> tuple[ErrorModel, StarErrors]:
     """Calibrate the errors of a model on stars that its training has not seen.
 
     Parameters
     ----------
     model : StarModel
-        Its errors are `ErrorModel.uncalibrated`.
-    fitted : Method
+        Its errors are `ErrorModel.build_uncalibrated`.
+    method_fit : Method
         The fit before it was packed, which draws stars of its own distribution.
     stars : ModelStars
         Held-out and training stars.
@@ -196,14 +199,14 @@ def calibrate_errors(
     """
     held_out = stars.held_out
     # 1. Shape errors bias the flux of bright stars: the noise floor at which fluxes are measured.
-    model = model.with_errors(fit_noise_floor(model, held_out, seed))
+    model = model.replace_errors(fit_noise_floor(model, held_out, seed))
     # 2. Errors of the PSF model itself, of stars that the method measures.
-    model = model.with_errors(fit_model_errors(model, fitted, seed))
+    model = model.replace_errors(fit_model_errors(model, method_fit, seed))
     # 3. Half-widths of 68 and 95 % for known flux and sky, and limits of outliers.
     errors, star_errors = fit_half_widths(model, held_out, seed)
-    model = model.with_errors(errors)
+    model = model.replace_errors(errors)
     # 4. Factors of the half-widths where noise, flux or sky are estimated.
-    model = model.with_errors(fit_case_scales(model, held_out, seed))
+    model = model.replace_errors(fit_case_scales(model, held_out, seed))
     # 5. Training stars of an image are not outliers.
     return fit_outlier_limits(model, stars), star_errors
 
@@ -225,7 +228,7 @@ def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     log_mse: list[float] = []
     floors = (0.0, *errors.noise.tolist())
     for floor in floors:
-        tried_model = model.with_errors(replace(errors, noise_floor=floor))
+        tried_model = model.replace_errors(replace(errors, noise_floor=floor))
         node_log_mse = []
         for images, star in noisy:
             prediction = tried_model.predict(images)
@@ -237,7 +240,7 @@ def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     return replace(errors, noise_floor=floors[int(np.argmin(log_mse))])
 
 
-def fit_model_errors(model: StarModel, fitted: Method, seed: int) -> ErrorModel:
+def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorModel:
     """Return the errors of a model with those of flux, sky and centre due to the PSF model.
 
     Stars that are drawn from the uncertainty of the fit are measured with hardly any noise: what
@@ -245,13 +248,13 @@ def fit_model_errors(model: StarModel, fitted: Method, seed: int) -> ErrorModel:
     none.
     """
     errors = model.bundle.errors
-    if not fitted.knows_field:
+    if not method_fit.knows_field:
         return errors
     rng = stream(seed, "noise", "calibration", "model")
     # S/N 2000 of a matched filter, where noise is far below the errors of most models.
     noise = 1.0 / (2000.0 * np.sqrt(model.info.noise_equivalent_px))
     # Stars of flux 1 on a sky of 0, with known centres.
-    images, position, centre = fitted.draw_stars(HeldOutStars.min_images, rng)
+    images, position, centre = method_fit.draw_stars(HeldOutStars.min_images, rng)
     noisy = images + noise * rng.normal(size=images.shape)
     prediction = model.predict(noisy, position=position)
     usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
@@ -266,7 +269,7 @@ def fit_model_errors(model: StarModel, fitted: Method, seed: int) -> ErrorModel:
         return float(np.median(sigma) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
     # The errors of the flux, of the sky, and of the centre, both axes together.
-    fitted_flux, *growth = fitted.fitted_flux_error()
+    fitted_flux, *growth = method_fit.fitted_flux_error()
     flux = compute_excess((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
     sky = compute_excess(prediction.background[usable], prediction.background_error[usable])
@@ -411,7 +414,7 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
     return replace(errors, outlier_limit=outlier_limit, distance_limit=distance_limit)
 
 
-def crossed_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[str, float]]:
+def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[str, float]]:
     """Return a function that tells how many errors are within half-widths of other stars.
 
     Parameters
@@ -437,12 +440,14 @@ def crossed_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[s
         halves.append((half, {"coverage68": width, "coverage95": width95}))
 
     # Each half by the map of the other half, at the noise that is asked for; then their mean.
-    def covered(error: np.ndarray, noise: float) -> dict[str, float]:
+    def measure_coverage(error: np.ndarray, noise: float) -> dict[str, float]:
         parts: dict[str, list[float]] = {}
         for half, widths in halves:
             for name, maps in widths.items():
-                is_inside = error[half] <= at_noise(np.array([noise]), errors.nodes, maps)
+                is_inside = error[half] <= interpolate_at_noise(
+                    np.array([noise]), errors.nodes, maps
+                )
                 parts.setdefault(name, []).append(float(is_inside.mean()))
         return {name: float(np.mean(values)) for name, values in parts.items()}
 
-    return covered
+    return measure_coverage

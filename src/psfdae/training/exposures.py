@@ -22,7 +22,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.psf.interface import PredictionError
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.training.packing import checksum
-from psfdae.training.settings import of_config
+from psfdae.training.settings import make_settings
 from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 from psfdae.training.stars import ImageStars
 
@@ -72,8 +72,10 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
         )
     # The settings by which the stars of the training were chosen.
     try:
-        trained = info.config["stars"]
-        settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
+        training_config = info.config["stars"]
+        settings = make_settings(
+            {key: training_config[key] for key in ("calibration_stars", "framing")}
+        )
     except (KeyError, TypeError):
         raise PredictionError(
             f"the model {model.name!r} does not say how its stars were chosen"
@@ -125,7 +127,7 @@ def note_empty_quarters(low: np.ndarray, high: np.ndarray, position: np.ndarray)
     return [f"{note}: the change of the PSF is not measured there"] if empty else []
 
 
-def for_exposures(model: Model, stars: ImageStars) -> dict[str, Model]:
+def adapt_to_exposures(model: Model, stars: ImageStars) -> dict[str, Model]:
     """Adapt a model of several exposures to each of them.
 
     Parameters
@@ -150,7 +152,7 @@ def for_exposures(model: Model, stars: ImageStars) -> dict[str, Model]:
     return models
 
 
-def adapted_to_stars(model: Model, stars: ImageStars) -> Model:
+def adapt_to_stars(model: Model, stars: ImageStars) -> Model:
     """Adapt a model to the stars of one other image, without those that are held out for a test.
 
     Parameters
@@ -163,11 +165,13 @@ def adapted_to_stars(model: Model, stars: ImageStars) -> Model:
     """
     model, train = model.to_image_frame(stars.observation)[0], stars.split.train
     bright = stars.candidates.bright.of(np.flatnonzero(~stars.held_out))
-    adapted = _adapt(model, stars.observation, bright, stars.name)
+    adapted_model = _adapt(model, stars.observation, bright, stars.name)
     # The checksum of the stars that were learnt from shows a test that it saw no other.
-    learnt = checksum(stars.product["realisation"][train], stars.product[stars.reference][train])
-    info = adapted.info.model_copy(update={"training_sha256": learnt})
-    return type(model)(replace(adapted.bundle, info=info))
+    training_sha256 = checksum(
+        stars.product["realisation"][train], stars.product[stars.reference][train]
+    )
+    info = adapted_model.info.model_copy(update={"training_sha256": training_sha256})
+    return type(model)(replace(adapted_model.bundle, info=info))
 
 
 def _adapt(model: Model, observation: Observation, bright: BrightStars, name: str) -> Model:

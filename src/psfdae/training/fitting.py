@@ -20,8 +20,8 @@ from psfdae.methods.interface import Method
 from psfdae.photometry.image_photometry import measure_stars
 from psfdae.photometry.photon_noise import with_measured_gain
 from psfdae.psf.wings import Wings
-from psfdae.training.packing import model_of, with_wings
-from psfdae.training.settings import with_keywords
+from psfdae.training.packing import add_wings, build_model
+from psfdae.training.settings import apply_keywords
 from psfdae.training.star_choice import ENOUGH_STARS
 from psfdae.training.star_sets import field_positions, fit_apart, noise_model
 from psfdae.training.stars import ImageStars
@@ -48,9 +48,9 @@ def fit_model(
     candidates = worth_trying(stars, [method_of(method_name) for method_name in names])
     # Keywords belong to the settings of the candidates; no setting of a method changes the stars.
     groups = [group for candidate in candidates for group in candidate.groups]
-    stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
+    stars = stars.replace_settings(apply_keywords(stars.settings, groups, settings))
     # With several fits, validation stars decide.
-    fits = {candidate.name: fitted_to(stars, candidate) for candidate in candidates}
+    fits = {candidate.name: fit_method(stars, candidate) for candidate in candidates}
     chosen_name = next(iter(fits)) if len(fits) == 1 else choose_method(stars, fits)[0]
     return pack_model(stars, fits[chosen_name], name or stars.name, licence)
 
@@ -72,7 +72,7 @@ def makes_models(name: str) -> bool:
     return kind.storage is not None and kind.packing is not None
 
 
-def fitted_to(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
+def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
     """Fit a method to the stars that are not held out.
 
     Parameters
@@ -127,18 +127,18 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
     settings, product, validation = stars.settings, stars.product, stars.split.validation
     truth, positions = product["realisation"][validation], field_positions(product)[validation]
     errors = {}
-    for name, fitted in fits.items():
-        judged, kind = fitted, type(fitted)
+    for name, method_fit in fits.items():
+        judged_fit, kind = method_fit, type(method_fit)
         data = stars.training_set(kind)
         with fixed_threads(kind.threads(settings)):
             # A method without a need of validation stars has learnt from them as well: what is
             # judged is a fit without them. One that needs them, to stop, has not.
             if not kind.needs.validation:
-                judged = fit_apart(kind, data, product["field_index"], settings)
+                judged_fit = fit_apart(kind, data, product["field_index"], settings)
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # Stars to which the model will be applied have an unknown flux: it is free here.
-            free_method = judged.free_flux()
+            free_method = judged_fit.free_flux()
             # MSE of PSFs of sum 1 at each noise level, averaged in its logarithm.
             log_mse = []
             for images, level in zip(noisy, data.levels, strict=True):
@@ -149,7 +149,7 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
     return min(errors, key=errors.__getitem__), errors
 
 
-def pack_model(stars: ImageStars, fitted: Method, name: str, licence: str) -> StarModel:
+def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -> StarModel:
     """Return the model of a fit with its errors on held-out stars, and with wings.
 
     Wings are there if the method knows the field, and an image shows any.
@@ -157,19 +157,19 @@ def pack_model(stars: ImageStars, fitted: Method, name: str, licence: str) -> St
     Parameters
     ----------
     stars : ImageStars
-    fitted : Method
+    method_fit : Method
         Fit to these stars.
     name, licence : str
         Name and licence of the model.
     """
     # Calibrate the errors of the fit on held-out stars.
     settings = stars.settings
-    description = described(stars, type(fitted))
+    description = described(stars, type(method_fit))
     with fixed_threads(settings.evaluation.threads):
-        model = model_of(
-            fitted, stars.product, ImageStars.reference, settings, description, name, licence
+        model = build_model(
+            method_fit, stars.product, ImageStars.reference, settings, description, name, licence
         )
-        if not fitted.knows_field or stars.observation.shape is None:
+        if not method_fit.knows_field or stars.observation.shape is None:
             return model
         # Light outside the stamps, as the photometry of each image with this model measures it:
         # `flux_total` of a star and its flux by photometry are the same.
@@ -180,4 +180,4 @@ def pack_model(stars: ImageStars, fitted: Method, name: str, licence: str) -> St
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model
-    return StarModel(with_wings(model.bundle, Wings.joined(wings)), model.method)
+    return StarModel(add_wings(model.bundle, Wings.joined(wings)), model.method)

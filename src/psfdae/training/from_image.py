@@ -11,7 +11,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict
-from psfdae.training.neighbours import without_neighbours
+from psfdae.training.neighbours import subtract_neighbours
 from psfdae.training.settings import Settings
 from psfdae.training.star_choice import (
     ENOUGH_STARS,
@@ -22,7 +22,7 @@ from psfdae.training.star_choice import (
     require_unique_names,
 )
 from psfdae.training.star_residuals import reject_misfits
-from psfdae.training.stars import ImageStars, joined_stars, stars_of_candidates
+from psfdae.training.stars import ImageStars, join_stars, select_stars
 
 
 def collect_stars(sources: Sequence[ImageInput], settings: Settings) -> ImageStars:
@@ -43,27 +43,29 @@ def collect_stars(sources: Sequence[ImageInput], settings: Settings) -> ImageSta
     """
     require_unique_names(sources)
     calibration = settings.calibration_stars
-    opened: Sequence[Observation] = [
+    observations: Sequence[Observation] = [
         open_observation(source, settings.framing.stamp_px, calibration.margin_px).assuming()
         for source in sources
     ]
-    for observation in opened:
+    for observation in observations:
         observation.check_planes()
-    require_one_camera(opened)
-    opened, candidates, relaxed, notes = choose_bright_stars(opened, settings)
+    require_one_camera(observations)
+    observations, candidates, relaxed_settings, notes = choose_bright_stars(observations, settings)
     # Bright stars of each image; those of a crowded image again without their neighbours.
     exposures = []
-    for source, observation, image_candidates in zip(sources, opened, candidates, strict=True):
-        candidates_like_psf = reject_misfits(image_candidates, relaxed, observation.gain)
+    for source, observation, image_candidates in zip(
+        sources, observations, candidates, strict=True
+    ):
+        candidates_like_psf = reject_misfits(image_candidates, relaxed_settings, observation.gain)
         # Of several images, one may have few stars or none.
         if len(sources) == 1:
-            stars_min = relaxed.calibration_stars.stars_min
+            stars_min = relaxed_settings.calibration_stars.stars_min
             candidates_like_psf.require(observation.path, stars_min, observation.remarks)
-        stars = stars_of_candidates(source, observation, candidates_like_psf, relaxed)
+        stars = select_stars(source, observation, candidates_like_psf, relaxed_settings)
         if is_crowded(stars):
-            stars = without_neighbours(stars, calibration.neighbour_ratio)
+            stars = subtract_neighbours(stars, calibration.neighbour_ratio)
         exposures.append(stars)
-    stars = exposures[0] if len(exposures) == 1 else joined_stars(exposures)
+    stars = exposures[0] if len(exposures) == 1 else join_stars(exposures)
     few_notes = few_stars_notes(stars.candidates.bright.row, stars.held_out)
     return replace(stars, notes=(*stars.notes, *notes, *few_notes))
 
@@ -82,6 +84,6 @@ def is_crowded(stars: ImageStars) -> bool:
         return False
     # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that have
     # neighbours than stars without, those without are enough.
-    crowded = np.count_nonzero(stars.candidates.verdict == Verdict.CROWDED)
+    crowded_count = np.count_nonzero(stars.candidates.verdict == Verdict.CROWDED)
     enough = max(len(stars), ENOUGH_STARS)
-    return len(stars) >= MIN_STARS_WITH_ERROR and bool(crowded >= enough)
+    return len(stars) >= MIN_STARS_WITH_ERROR and bool(crowded_count >= enough)

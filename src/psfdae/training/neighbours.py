@@ -21,9 +21,9 @@ from psfdae.methods.field import FieldMixture
 from psfdae.photometry import crowded
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-from psfdae.training.fitting import fitted_to
+from psfdae.training.fitting import fit_method
 from psfdae.training.star_residuals import reject_misfits
-from psfdae.training.stars import ImageStars, stars_of_candidates
+from psfdae.training.stars import ImageStars, select_stars
 
 
 class _Field(FieldPsfs):
@@ -31,15 +31,15 @@ class _Field(FieldPsfs):
 
     Parameters
     ----------
-    fitted : FieldMixture
+    method_fit : FieldMixture
     stamp_px : int
         Side of the stamps that the fit was made of.
     """
 
     name, image_px = "of stars without neighbours", None
 
-    def __init__(self, fitted: FieldMixture, stamp_px: int) -> None:
-        self.fitted, self.stamp_px = fitted, stamp_px
+    def __init__(self, method_fit: FieldMixture, stamp_px: int) -> None:
+        self.fitted, self.stamp_px = method_fit, stamp_px
 
     @property
     def order(self) -> int:
@@ -64,7 +64,7 @@ class _Field(FieldPsfs):
         return self.fitted.psf_at(position, oversampling)
 
 
-def without_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
+def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
     """Choose the bright stars of an image again, with the light of all other stars subtracted.
 
     Parameters
@@ -91,16 +91,16 @@ def without_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
     for _ in range(2 if accepted_ratio > neighbour_ratio else 1):
         # A field from the stars so far, photometry of all stars with it, and a new choice of
         # bright stars in the cleaned image.
-        field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
+        field = _Field(fit_method(stars, FieldMixture), settings.framing.stamp_px)
         try:
             photometry = crowded.photometry(field, observation)
             # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
             isolation_px = 1.25 * field.fwhm_px()
-            light = light_of_others(photometry, observation.positions)
-            cleaned = replace(observation, neighbour_light=light)
-            candidates = collect(cleaned, calibration, settings.framing, isolation_px)
-            candidates = reject_misfits(candidates, settings, cleaned.gain)
-            isolated = stars_of_candidates(stars.source, cleaned, candidates, settings)
+            light = draw_other_stars(photometry, observation.positions)
+            cleaned_observation = replace(observation, neighbour_light=light)
+            candidates = collect(cleaned_observation, calibration, settings.framing, isolation_px)
+            candidates = reject_misfits(candidates, settings, cleaned_observation.gain)
+            isolated_stars = select_stars(stars.source, cleaned_observation, candidates, settings)
         except Error as error:
             note = f"neighbours: their light was not subtracted ({error})"
             return replace(stars, notes=(*stars.notes, note))
@@ -109,23 +109,23 @@ def without_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
             f"neighbours: the light of {len(photometry.stars)} stars was subtracted in the others' "
             f"stamps; bright stars before: {len(stars)}, no neighbour above "
             f"{100 * accepted_ratio:g} % of their brightness within {calibration.isolation_px:g} "
-            f"px; now: {len(isolated)}, none above {100 * neighbour_ratio:g} % within "
+            f"px; now: {len(isolated_stars)}, none above {100 * neighbour_ratio:g} % within "
             f"{isolation_px:.2g} px"
         )
-        stars = replace(isolated, observation=observation)
-        notes = (*isolated.notes, message)
+        stars = replace(isolated_stars, observation=observation)
+        notes = (*isolated_stars.notes, message)
     return replace(stars, notes=notes)
 
 
-def light_of_others(
-    photometry: crowded.CrowdedPhotometry, listed: np.ndarray
+def draw_other_stars(
+    photometry: crowded.CrowdedPhotometry, list_positions: np.ndarray
 ) -> Callable[[slice, int, int], np.ndarray]:
     """Return a function that gives the light of all stars but the one in the middle of a stamp.
 
     Parameters
     ----------
     photometry : CrowdedPhotometry
-    listed : ndarray, shape (n, 2)
+    list_positions : ndarray, shape (n, 2)
         Positions of a star list, x and y.
 
     Returns
@@ -141,18 +141,18 @@ def light_of_others(
     stars = photometry.stars
     centre = np.stack([stars["x"], stars["y"]], axis=1)
     flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model, by_magnitude=True)
-    measured = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
+    star_rows = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
     # The fitted star of each star of the list; none is within 1.5 px of a star without position.
-    distance, nearest = cKDTree(centre[measured]).query(np.nan_to_num(listed, nan=-np.inf))
+    distance, nearest = cKDTree(centre[star_rows]).query(np.nan_to_num(list_positions, nan=-np.inf))
 
     # The fit has the light of all stars in one image; a list asks for it a part at a time.
     def light(rows: slice, stamp_px: int, margin: int) -> np.ndarray:
-        x, y = listed[rows].T
+        x, y = list_positions[rows].T
         stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]
         # The light of all fitted stars, minus that of the star itself.
         fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
-        star = measured[nearest[rows][fitted_rows]]
-        corner = np.rint(listed[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
+        star = star_rows[nearest[rows][fitted_rows]]
+        corner = np.rint(list_positions[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
         star_light = psfs.stamps(centre[star], corner, stamps.shape[-1], flux[star])[:, 0]
         stamps[fitted_rows] -= flux[star, None, None] * star_light
         return stamps

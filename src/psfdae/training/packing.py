@@ -29,18 +29,18 @@ from psfdae.psf.wings import Wings
 from psfdae.training.calibration import (
     StarErrors,
     calibrate_errors,
-    crossed_coverage,
+    cross_validate_coverage,
     noise_nodes,
 )
 from psfdae.training.star_sets import HeldOutStars, ModelStars, noisy_test_images
 
 
-def model_of(
-    fitted: Method,
+def build_model(
+    method_fit: Method,
     stars: Product,
     reference: str,
     config: OfTest,
-    trained: Mapping[str, Any],
+    training_config: Mapping[str, Any],
     name: str,
     licence: str,
     largest_mb: float | None = None,
@@ -49,13 +49,13 @@ def model_of(
 
     Parameters
     ----------
-    fitted : Method
+    method_fit : Method
     stars : product "stars"
         Stars of the fit.
     reference : "realisation" or "template"
         What is restored.
     config : settings (seed, noise, parts, evaluation)
-    trained : mapping
+    training_config : mapping
         Settings of the fit, and its "split".
     name, licence : str
     largest_mb : float, optional
@@ -66,12 +66,12 @@ def model_of(
     BundleError
         If it cannot be that small.
     """
-    bundle, model_stars = uncalibrated(
-        fitted, stars, reference, config, trained, name, licence, largest_mb
+    bundle, model_stars = build_uncalibrated(
+        method_fit, stars, reference, config, training_config, name, licence, largest_mb
     )
     # Errors are those of the fit as it is packed.
     model = StarModel(bundle, estimator(bundle))
-    errors, star_errors = calibrate_errors(model, fitted, model_stars, config.seed)
+    errors, star_errors = calibrate_errors(model, method_fit, model_stars, config.seed)
     # Metrics of test stars at the noise levels of the configuration.
     noisy = (
         (level, noisy_test_images(config, stars, model_stars.test, level))
@@ -86,12 +86,12 @@ def model_of(
     return StarModel(replace(bundle, info=info, errors=errors), model.method)
 
 
-def uncalibrated(
-    fitted: Method,
+def build_uncalibrated(
+    method_fit: Method,
     stars: Product,
     reference: str,
     config: Any,
-    trained: Mapping[str, Any],
+    training_config: Mapping[str, Any],
     name: str,
     licence: str,
     largest_mb: float | None = None,
@@ -99,7 +99,7 @@ def uncalibrated(
 ) -> tuple[Bundle, ModelStars]:
     """Return a fit with all that it takes to apply it, but its errors, and the stars for these.
 
-    Parameters are those of `model_of`; of the settings, seed, noise and parts are enough.
+    Parameters are those of `build_model`; of the settings, seed, noise and parts are enough.
     `components` is the number of leading eigenvectors of the flux model that the bundle stores.
 
     Returns
@@ -111,14 +111,14 @@ def uncalibrated(
     """
     stamp_fields = _stamp_fields(stars)
     stamp_px = stamp_fields["stamp_px"]
-    model_stars = ModelStars.of(stars, trained["split"], reference, config)
+    model_stars = ModelStars.of(stars, training_config["split"], reference, config)
     images, noise = model_stars.images, model_stars.held_out.noise
     # The flux model, its variance beyond the leading eigenvectors spread evenly.
     flux_model = leading(FluxModel.fit(images), components)
     # Range of noise, as pixel RMS over the flux, and of S/N.
     band, area = noise.kappa * np.asarray(config.noise.levels), model_stars.noise_equivalent_px
     least_noise, greatest_noise = float(band.min()), float(band.max())
-    arrays, method_fields = packed(fitted, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
+    arrays, method_fields = packed(method_fit, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
     # Everything that is needed to apply the method, and to know what it was trained on.
     info = BundleInfo(
         psfdae_version=__version__,
@@ -135,16 +135,16 @@ def uncalibrated(
         components=components,
         training_sha256=checksum(images, model_stars.references),
         training_stars=len(model_stars.stars),
-        method=fitted.name,
+        method=method_fit.name,
         reference=reference,
         **method_fields,
-        config={"stars": stars.config, "train": dict(trained)},
+        config={"stars": stars.config, "train": dict(training_config)},
         metrics=[],
     )
     # Errors are 0 until they are measured.
     nodes = noise_nodes(band)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
-    bundle = Bundle(info, arrays, flux_model, ErrorModel.uncalibrated(nodes, blank))
+    bundle = Bundle(info, arrays, flux_model, ErrorModel.build_uncalibrated(nodes, blank))
     return bundle, model_stars
 
 
@@ -179,13 +179,13 @@ def _stamp_fields(product: Product) -> dict[str, Any]:
 
 
 def packed(
-    fitted: Method, stamp_px: int, noise: float, largest: float
+    method_fit: Method, stamp_px: int, noise: float, largest: float
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return arrays of a fit for this noise, or for the least above it that takes few bytes.
 
     Parameters
     ----------
-    fitted : Method
+    method_fit : Method
     stamp_px : int
     noise : float
         Least pixel RMS over the flux that the arrays are for.
@@ -209,17 +209,17 @@ def packed(
     noises = np.geomspace(noise, max(1.0, noise), count)
 
     @cache
-    def arrays_of(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        return fitted.pack(stamp_px, float(noises[step]))
+    def pack_at_step(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return method_fit.pack(stamp_px, float(noises[step]))
 
     def is_small(step: int) -> bool:
-        return sum(array.nbytes for array in arrays_of(step)[0].values()) <= largest
+        return sum(array.nbytes for array in pack_at_step(step)[0].values()) <= largest
 
     # Mostly the first one will do, and each takes a while.
     least_step = 0 if is_small(0) else bisect_left(range(count), True, key=is_small)
     if least_step == count:
-        raise BundleError(f"{fitted.look.label}: takes more than {largest / 1e6:.2g} MB")
-    return arrays_of(least_step)
+        raise BundleError(f"{method_fit.look.label}: takes more than {largest / 1e6:.2g} MB")
+    return pack_at_step(least_step)
 
 
 def leading(model: FluxModel, components: int) -> FluxModel:
@@ -239,7 +239,7 @@ def leading(model: FluxModel, components: int) -> FluxModel:
     return replace(model, variance=variance)
 
 
-def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
+def add_wings(bundle: Bundle, wings: Wings) -> Bundle:
     """Return the bundle of a field model with the light of stars beyond their stamps."""
     info = bundle.info
     # As plain numbers in the description.
@@ -248,7 +248,7 @@ def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
 
 
 def metrics_by_level(
-    fitted: Method,
+    method_fit: Method,
     stars: HeldOutStars,
     noisy: Iterable[tuple[float, np.ndarray]],
     errors: StarErrors,
@@ -259,7 +259,7 @@ def metrics_by_level(
 
     Parameters
     ----------
-    fitted : Method
+    method_fit : Method
     stars : HeldOutStars
     noisy : iterable of (float, ndarray)
         Each λ with noisy images of all test stars, shape (n, d, d).
@@ -276,9 +276,12 @@ def metrics_by_level(
         A row of mean metrics for each level, in their order.
     """
     # Coverage is measured crosswise: on stars by the errors that the other stars show.
-    rows, covered = [], crossed_coverage(errors)
+    rows, measure_coverage = [], cross_validate_coverage(errors)
     for level, images in noisy:
-        noise, estimate = stars.noise.kappa * level, fitted.estimate(images, level, stars.position)
+        noise, estimate = (
+            stars.noise.kappa * level,
+            method_fit.estimate(images, level, stars.position),
+        )
         # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(
@@ -288,7 +291,7 @@ def metrics_by_level(
                 "snr": signal_to_noise(noise, area),
                 "mse_noisy": float(np.square(images - stars.references).mean()),
                 **{name: float(values.mean()) for name, values in quality.items()},
-                **covered(stars.errors(estimate.psf, unit=estimate.sigma), noise),
+                **measure_coverage(stars.errors(estimate.psf, unit=estimate.sigma), noise),
                 "stars": len(images),
             }
         )

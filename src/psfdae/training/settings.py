@@ -87,7 +87,7 @@ class Settings(Group):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the values alone: the class of all settings is made at run time."""
-        return of_config, (self.model_dump(exclude_unset=True),)
+        return make_settings, (self.model_dump(exclude_unset=True),)
 
 
 @cache
@@ -125,7 +125,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
             if any(argument.lstrip("+").startswith("framing.stamp_px=") for argument in words):
                 words = ("++calibration_stars.light_min=0", *words)
             for point in joined("settings"):
-                return of_config(point.load()(groups, (DATASET_CHOICE, *words)))
+                return make_settings(point.load()(groups, (DATASET_CHOICE, *words)))
             names, hint = ", ".join(groups), did_you_mean(key, keys_of(settings_model()))
             raise ConfigError(f"{word}: expected group.key=value, the group one of {names}{hint}")
         try:
@@ -150,10 +150,10 @@ class SettingsReader:
         self, options: Mapping[str, object], file: Path | None, words: Sequence[str]
     ) -> Settings:
         """Return settings from words, or from a YAML file."""
-        return of_config(read_yaml(file)) if file is not None else from_words(words)
+        return make_settings(read_yaml(file)) if file is not None else from_words(words)
 
 
-def of_config(config: Group | Mapping[str, Any]) -> Settings:
+def make_settings(config: Group | Mapping[str, Any]) -> Settings:
     """Return the settings of this module from a configuration, which may have more.
 
     Raises
@@ -171,7 +171,7 @@ def of_config(config: Group | Mapping[str, Any]) -> Settings:
     return parse_settings(settings_model(), settings)
 
 
-def with_keywords(
+def apply_keywords(
     settings: Settings, groups: Sequence[str], keywords: Mapping[str, object]
 ) -> Settings:
     """Return settings with other values, given by the names of keys of some groups.
@@ -187,7 +187,7 @@ def with_keywords(
     tree = settings.model_dump(exclude_unset=True)
     # A group without keys, such as the seed, is itself a key.
     group_keys = {group: _keys(group) or {group} for group in groups}
-    typed: dict[str, str] = {}
+    typed_word: dict[str, str] = {}
     for name, value in keywords.items():
         owner = next((group for group, keys in group_keys.items() if name in keys), None)
         if owner is None:
@@ -195,13 +195,13 @@ def with_keywords(
             hint = did_you_mean(name, names.split(", "))
             raise ConfigError(f"{name}: unknown setting; there are {names}{hint}")
         tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
-        typed[f"{owner}.{name}"] = keyword(name).removesuffix("=")
+        typed_word[f"{owner}.{name}"] = keyword(name).removesuffix("=")
     try:
         return parse_settings(settings_model(), tree)
     except ConfigError as error:
         # Name a setting as it was typed, without its group.
         message = str(error)
-        for key, word in typed.items():
+        for key, word in typed_word.items():
             message = re.sub(rf"^{re.escape(key)}\S* = ", f"{word} = ", message, flags=re.M)
         raise ConfigError(message) from None
 

@@ -31,19 +31,19 @@ MIN_STARS_WITH_ERROR = 5
 
 
 def choose_bright_stars(
-    opened: Sequence[Observation], settings: Settings
+    observations: Sequence[Observation], settings: Settings
 ) -> tuple[Sequence[Observation], list[Candidates], Settings, list[str]]:
     """Measure the stars of images, and choose the bright ones among them.
 
     Parameters
     ----------
-    opened : sequence of Observation
+    observations : sequence of Observation
         Images of one camera; their stars count together.
     settings : Settings
 
     Returns
     -------
-    opened : sequence of Observation
+    observations : sequence of Observation
         The images with stamps that hold the stars.
     candidates : list of Candidates
         Measured stars of each image.
@@ -55,25 +55,27 @@ def choose_bright_stars(
     notes = []
     # Choose stars in stamps of the stated size, then in larger ones if these hold too little of
     # their light.
-    relaxed, candidates = collect_enough(opened, settings)
-    if (enlarged := enlarge_stamps(opened, candidates, settings)) is not None:
-        settings, note = enlarged
+    relaxed_settings, candidates = collect_enough(observations, settings)
+    if (enlarged_stamps := enlarge_stamps(observations, candidates, settings)) is not None:
+        settings, note = enlarged_stamps
         notes.append(note)
         side, margin = settings.framing.stamp_px, settings.calibration_stars.margin_px
-        opened = [replace(observation, stamp_px=side, margin=margin) for observation in opened]
-        relaxed, candidates = collect_enough(opened, settings)
+        observations = [
+            replace(observation, stamp_px=side, margin=margin) for observation in observations
+        ]
+        relaxed_settings, candidates = collect_enough(observations, settings)
     # The user learns that stars below the stated S/N take part.
-    least_snr, stated_snr = (s.calibration_stars.least_snr for s in (relaxed, settings))
+    least_snr, stated_snr = (s.calibration_stars.least_snr for s in (relaxed_settings, settings))
     if least_snr < stated_snr:
         notes.append(
             f"few stars: those of S/N {least_snr:g} and above are used, because fewer than 20 have "
             f"S/N {stated_snr:g}; {keyword('snr_min')} sets another limit"
         )
-    return opened, candidates, relaxed, notes
+    return observations, candidates, relaxed_settings, notes
 
 
 def collect_enough(
-    opened: Sequence[Observation], settings: Settings
+    observations: Sequence[Observation], settings: Settings
 ) -> tuple[Settings, list[Candidates]]:
     """Choose stars from the brightest down, until there are enough.
 
@@ -84,7 +86,7 @@ def collect_enough(
 
     Parameters
     ----------
-    opened : sequence of Observation
+    observations : sequence of Observation
         Images of one camera; their stars count together.
     settings : Settings
 
@@ -99,12 +101,12 @@ def collect_enough(
 
     def collect_all(by_core: bool = False, **limits: float) -> tuple[Settings, list[Candidates]]:
         """Choose stars with other limits."""
-        relaxed = calibration.model_copy(update=limits)
+        relaxed_settings = calibration.model_copy(update=limits)
         # Only the stars of all images together must be enough, which is required later.
-        image_limits = relaxed.model_copy(update={"stars_min": 0})
-        return settings.model_copy(update={"calibration_stars": relaxed}), [
+        image_limits = relaxed_settings.model_copy(update={"stars_min": 0})
+        return settings.model_copy(update={"calibration_stars": relaxed_settings}), [
             collect(observation, image_limits, settings.framing, by_core=by_core)
-            for observation in opened
+            for observation in observations
         ]
 
     def bright_count(selection: tuple[Settings, list[Candidates]]) -> int:
@@ -113,7 +115,7 @@ def collect_enough(
 
     selection = collect_all(snr_min=calibration.least_snr)
     # In an image of galaxies, fainter stars cannot be told from galaxies.
-    verdicts = np.concatenate([measured.verdict for measured in selection[1]])
+    verdicts = np.concatenate([image_candidates.verdict for image_candidates in selection[1]])
     has_galaxies = np.count_nonzero(verdicts == Verdict.EXTENDED) > max(9, bright_count(selection))
     if bright_count(selection) >= (MIN_STARS_WITH_ERROR if has_galaxies else ENOUGH_STARS):
         return selection
@@ -135,7 +137,7 @@ def collect_enough(
 
 
 def enlarge_stamps(
-    opened: Sequence[Observation], candidates: Sequence[Candidates], settings: Settings
+    observations: Sequence[Observation], candidates: Sequence[Candidates], settings: Settings
 ) -> tuple[Settings, str] | None:
     """Adapt the settings to stars that are too large for their stamps, or hollow.
 
@@ -143,7 +145,7 @@ def enlarge_stamps(
 
     Parameters
     ----------
-    opened : sequence of Observation
+    observations : sequence of Observation
     candidates : sequence of Candidates
         Measured stars of each observation.
     settings : Settings
@@ -165,7 +167,7 @@ def enlarge_stamps(
     # A stated size of stamps and a stated centring leave nothing to adapt.
     if not calibration.light_min and calibration.centring_px is not None:
         return None
-    largest = _largest_size(opened, candidates, 0.8 if calibration.light_min else 0.0)
+    largest = _largest_size(observations, candidates, 0.8 if calibration.light_min else 0.0)
     if largest is None:
         return None
     # The side of stamps that hold the stated part of the light, at least that of the settings.
@@ -207,7 +209,9 @@ def enlarge_stamps(
             f"{framing.stamp_px} px ({old_part:.0f} %); {keyword('stamp_px')} sets another size"
         )
     # Seeing is at most about 6 arcsec; a pixel may be larger.
-    scale_arcsec = 0.0 if opened[0].scale_assumed else opened[0].pixel_scale_arcsec or 0.0
+    scale_arcsec = (
+        0.0 if observations[0].scale_assumed else observations[0].pixel_scale_arcsec or 0.0
+    )
     if largest.fwhm_px * min(scale_arcsec, 1.0) > 6.0:
         note += "; this is more than seeing makes: they are out of focus, or no stars"
     if largest.hollow:
@@ -216,13 +220,13 @@ def enlarge_stamps(
 
 
 def _largest_size(
-    opened: Sequence[Observation], candidates: Sequence[Candidates], light_min: float
+    observations: Sequence[Observation], candidates: Sequence[Candidates], light_min: float
 ) -> SourceSize | None:
     """Return the size of stars in the image where it is largest; cubes of stamps tell none.
 
     Parameters
     ----------
-    opened : sequence of Observation
+    observations : sequence of Observation
     candidates : sequence of Candidates
         Measured stars of each observation.
     light_min : float
@@ -234,13 +238,13 @@ def _largest_size(
         If these hold less: they hold 98 % of a star of FWHM 23 px, and a small part of a nebula.
     """
     sizes = []
-    for observation, measured in zip(opened, candidates, strict=True):
+    for observation, image_candidates in zip(observations, candidates, strict=True):
         if observation.shape is not None and observation.positions is not None:
             # Stars that are good in small stamps are not saturated; without such stars, all count
             # that are not wider than these.
-            sky, position = observation.sky(), measured.bright.position
+            sky, position = observation.sky(), image_candidates.bright.position
             if len(position) < MIN_STARS_WITH_ERROR:
-                position = measured.position[measured.verdict != Verdict.EXTENDED]
+                position = image_candidates.position[image_candidates.verdict != Verdict.EXTENDED]
             size = measure_size(sky.flat, sky.bad, position)
             if size is not None and size.light_within(size.sides[-1]) < light_min:
                 raise CalibrationStarsError(
@@ -263,15 +267,19 @@ def few_stars_notes(rows: np.ndarray, held_out: np.ndarray) -> list[str]:
         Row of each bright star in its list.
     held_out : ndarray of bool, shape (n,)
     """
-    count, tested = len(rows), int(held_out.sum())
+    count, test_count = len(rows), int(held_out.sum())
     if count >= ENOUGH_STARS:
         return []
     if len(np.unique(rows)) == 1:
         return ["one star: the PSF is this star, tested on itself; its error is not known"]
-    training = count - tested
+    training = count - test_count
     if count >= MIN_STARS_WITH_ERROR:
-        return [f"few stars: {training} train the model, {tested} test it; its errors are rough"]
-    note = f"few stars: the PSF is the mean of {training} stars, tested on {tested}; its error is "
+        return [
+            f"few stars: {training} train the model, {test_count} test it; its errors are rough"
+        ]
+    note = (
+        f"few stars: the PSF is the mean of {training} stars, tested on {test_count}; its error is "
+    )
     return [note + "not known"]
 
 
@@ -290,12 +298,12 @@ def require_unique_names(sources: Sequence[ImageInput]) -> None:
             raise ObservationError(sources[number].path, problem)
 
 
-def require_one_camera(opened: Sequence[Observation]) -> None:
+def require_one_camera(observations: Sequence[Observation]) -> None:
     """Refuse several images with pixels of several sizes, or several cameras or filters.
 
     Parameters
     ----------
-    opened : sequence of Observation
+    observations : sequence of Observation
         A single one is accepted, a cube of stamps as well.
 
     Raises
@@ -303,8 +311,8 @@ def require_one_camera(opened: Sequence[Observation]) -> None:
     ObservationError
         Names the first difference from the first image.
     """
-    first = opened[0]
-    for observation in opened if len(opened) > 1 else ():
+    first = observations[0]
+    for observation in observations if len(observations) > 1 else ():
         if observation.shape is None:
             raise ObservationError(observation.path, "a cube of stamps; expected an image")
         # The pixel scale, then telescope, camera and filter of the headers.
@@ -312,13 +320,16 @@ def require_one_camera(opened: Sequence[Observation]) -> None:
         scales = [image.pixel_scale_arcsec or image.assumed_scale_arcsec for image in images]
         differences = other_instruments(*(image.instrument for image in images))
         if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
-            name, (stated, text) = "the pixel scale", (f"{scale:.6g} arcsec" for scale in scales)
+            name, (first_text, text) = (
+                "the pixel scale",
+                (f"{scale:.6g} arcsec" for scale in scales),
+            )
         elif differences:
-            name, stated, text = (differences[0][0], *map(repr, differences[0][1:]))
+            name, first_text, text = (differences[0][0], *map(repr, differences[0][1:]))
         elif (parts := [image.detector_frames for image in images])[0] != parts[1]:
             # Positions of a star on different parts of the detector would be mixed.
-            name, (stated, text) = "the part of the detector", map(str, parts)
+            name, (first_text, text) = "the part of the detector", map(str, parts)
         else:
             continue
-        problem = f"{name} is {text}, but that of {first.path} is {stated}; a model is of one"
+        problem = f"{name} is {text}, but that of {first.path} is {first_text}; a model is of one"
         raise ObservationError(observation.path, problem)

@@ -136,7 +136,7 @@ class ImageStars:
         """Default name of a model of these stars: that of the image, or "all" of several."""
         return "all" if self.exposures else self.source.name
 
-    def with_settings(self, settings: Settings) -> ImageStars:
+    def replace_settings(self, settings: Settings) -> ImageStars:
         """Return these stars with other settings of methods."""
         # The images are drawn once for all methods.
         stars = replace(self, settings=settings)
@@ -168,8 +168,8 @@ class ImageStars:
             columns = {"image": np.repeat(names, counts), **columns}
         # Columns of the lists, if every image has one.
         lists = [observation.list_columns for observation in observations]
-        listed = [columns_of_list for columns_of_list in lists if columns_of_list is not None]
-        joined_list = vstack(listed) if len(listed) == len(lists) else None
+        list_columns = [columns_of_list for columns_of_list in lists if columns_of_list is not None]
+        joined_list = vstack(list_columns) if len(list_columns) == len(lists) else None
         return star_table(columns, self.observation.unit, joined_list)
 
     @cached_property
@@ -210,7 +210,7 @@ class ImageStars:
         return plain
 
 
-def stars_of_candidates(
+def select_stars(
     source: ImageInput, observation: Observation, candidates: Candidates, settings: Settings
 ) -> ImageStars:
     """Return the bright stars among the measured stars of an observation.
@@ -244,13 +244,13 @@ def stars_of_candidates(
     # Noise levels follow from the noise-equivalent area of the bright stars.
     if len(bright):
         sky_photons = bright.sky_photons(observation.gain, settings.noise.background_photons)
-        settings = with_degraded_levels(settings, bright, sky_photons)
+        settings = degrade_levels(settings, bright, sky_photons)
     # Every fifth star is held out, evenly over the field.
     held_out = held_out_fields(star_grid(bright.position))
     return ImageStars(source, observation, candidates, held_out, settings, tuple(notes))
 
 
-def joined_stars(exposures: Sequence[ImageStars]) -> ImageStars:
+def join_stars(exposures: Sequence[ImageStars]) -> ImageStars:
     """Join the stars of several images of one camera, chosen with the same settings.
 
     A star is held out if it is in its own image.
@@ -285,13 +285,13 @@ def joined_stars(exposures: Sequence[ImageStars]) -> ImageStars:
         observation,
         candidates,
         np.concatenate([image.held_out for image in exposures]),
-        with_degraded_levels(first.settings, candidates.bright, float(np.median(sky_photons))),
+        degrade_levels(first.settings, candidates.bright, float(np.median(sky_photons))),
         [note for image in exposures for note in image.notes],
         exposures=exposures,
     )
 
 
-def with_degraded_levels(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:
+def degrade_levels(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:
     """Return settings with the noise levels λ of the stated S/N, for noise-free stars of flux 1.
 
     S/N = 1 / (κ λ √A), with A the median noise-equivalent area of the bright stars.

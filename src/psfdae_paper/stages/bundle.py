@@ -22,8 +22,8 @@ from psfdae.denoise.bundle import (
     SUFFIX,
     Bundle,
     BundleError,
+    locate_shipped_model,
     read_bundle,
-    shipped_path,
     write_bundle,
 )
 from psfdae.denoise.star_model import StarModel
@@ -93,7 +93,7 @@ def bundle(
     # The errors are measured now, which takes most of the time.
     fitted = method_class.load(place, target, config.evaluation)
     labels = name or out.name.removesuffix(SUFFIX), licence
-    model = packing.model_of(fitted, product, target, config, fit_config, *labels, largest_mb)
+    model = packing.build_model(fitted, product, target, config, fit_config, *labels, largest_mb)
     model.save(out)
 
 
@@ -176,7 +176,7 @@ def ship(config: Config, bundle: tuple[File, ...], stars: File, out: Folder) -> 
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     # Its stars are simulated: it has the licence of the package.
-    name = shipped_path().name
+    name = locate_shipped_model().name
     fields = {"name": name.removesuffix(SUFFIX), "licence": "MIT"}
     info = packed.info.model_copy(update=fields)
     # The package must stay small: the bundle is in every installation.

@@ -206,7 +206,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
             name = str(with_model.name.iloc[number])
             model = load_model(folder / f"{name}{SUFFIX}")
             assert model.image_px is not None  # of a model that was fitted to an image
-            psfs[f"{label}\n{name}"] = model.on_pixels(positions_of_places(model.image_px))
+            psfs[f"{label}\n{name}"] = model.draw_on_pixels(positions_of_places(model.image_px))
     links = os.path.relpath(folder, out.parent)
     write_text(out, night_page(night, psfs, links))
 
@@ -276,7 +276,7 @@ def from_most_usual(
 def model_of_image(stars: ImageStars, start: PsfModel | None) -> PsfModel:
     """Return the field model of an image, changed from that of another image if there is one."""
     from psfdae.api import fit
-    from psfdae.training.exposures import adapted_to_stars
+    from psfdae.training.exposures import adapt_to_stars
     from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
@@ -289,7 +289,7 @@ def model_of_image(stars: ImageStars, start: PsfModel | None) -> PsfModel:
         if 2 <= model.order < 4 and training_stars >= 30:
             model = fit(stars, method="field", orders=[4, 6])
         return model
-    return adapted_to_stars(start, stars)
+    return adapt_to_stars(start, stars)
 
 
 def telescope_state(stars: ImageStars, telescope: Path) -> Row:
@@ -371,7 +371,7 @@ def measured(row: Mapping[str, object], stars: ImageStars, model: PsfModel, fold
     return {
         "time": cards.get("DATE-OBS", cards.get("MJD-OBS", "")),
         "airmass": cards.get("AIRMASS", math.nan),
-        **shapes_at_places(model.on_pixels, (shape[1], shape[0])),
+        **shapes_at_places(model.draw_on_pixels, (shape[1], shape[0])),
         "order": model.order,
         "bright_stars": len(stars),
         "stars": len(table),

@@ -315,9 +315,9 @@ def import_run(
     query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
     slot = client.search_runs([experiment], query)
     # Of these, the ones with the same settings, and the one with the same files as well.
-    of_config = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
+    make_settings = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
     # An import that was killed leaves a run without content_hash.
-    unchanged = [r for r in of_config if r.data.tags.get("content_hash") == run.content_hash]
+    unchanged = [r for r in make_settings if r.data.tags.get("content_hash") == run.content_hash]
     # A run that is there with the same files is left alone but for tags that others decide.
     if unchanged:
         run_id, action = str(unchanged[0].info.run_id), "unchanged"
@@ -327,13 +327,13 @@ def import_run(
                 client.set_tag(run_id, key, tags[key])
     else:
         run_id = create_run(client, experiment, run, tags)
-        action = "updated" if of_config else "created"
+        action = "updated" if make_settings else "created"
     # Other runs of the same settings give way, and so does the training as it was seen live; runs
     # of other settings are superseded.
     for old in slot:
         if old.info.run_id == run_id:
             continue
-        if old in of_config:
+        if old in make_settings:
             forget(client, old.info.run_id)
         elif old.data.tags.get("superseded") != "true":
             client.set_tag(old.info.run_id, "superseded", "true")
