@@ -10,6 +10,7 @@ from psfdae.commands.predict import check_targets
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.image_input import ImageInput, ImageOptions
+from psfdae.training.exposures import exposure as adapt_to_exposure
 
 
 @command("exposure")
@@ -38,8 +39,6 @@ def exposure_command(
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), model), out, overwrite=overwrite)
     loaded = StarModel.load(model)
-
-    from psfdae.training.exposures import exposure as adapt_to_exposure
 
     adapted, sentence = adapt_to_exposure(loaded, source, out.name.removesuffix(SUFFIX))
     adapted.save(out)

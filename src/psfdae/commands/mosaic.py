@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from psfdae.base.errors import Error, words_of_a_command
 from psfdae.base.threads import available_cores
@@ -21,9 +21,7 @@ from psfdae.commands.cli import refusal
 from psfdae.image.catalogue import require_sky
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-
-if TYPE_CHECKING:
-    from psfdae.image.image_input import ImageOptions
+from psfdae.image.image_input import ImageOptions
 
 
 class MosaicError(Error, RuntimeError):

@@ -29,6 +29,7 @@ from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import StarFlag
 from psfdae.psf.interface import PredictionError
+from psfdae.report.plot import read_psf_map
 
 
 def write_list(observation: Observation, path: Path) -> None:
@@ -117,8 +118,6 @@ def predict_command(
             if list_path is not None:
                 write_list(observation, list_path)
             if plot is not None:
-                from psfdae.report.plot import read_psf_map
-
                 write_png(read_psf_map(unfinished), plot)
     except OSError as error:
         name = error.filename or out

@@ -7,7 +7,7 @@ measurement itself is `psfdae.wavefront`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import click
 import numpy as np
@@ -18,7 +18,7 @@ from psfdae.base.options import File
 from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets, write_list
 from psfdae.denoise.star_model import SCALE_TOLERANCE
-from psfdae.image.catalogue import as_catalogue
+from psfdae.image.catalogue import StarList, as_catalogue
 from psfdae.image.detector_frame import find_offset
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.observation import Observation
@@ -26,13 +26,11 @@ from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
 from psfdae.image.stamps import central_pixel
 from psfdae.sensing.output import report_lines, wavefront_hdus
+from psfdae.sensing.plot import wavefront_map
 from psfdae.sensing.results import Wavefronts
 from psfdae.sensing.results import wavefront as measure_wavefronts
 from psfdae.sensing.stars import SensingError
 from psfdae.telescope.settings import OwnTelescope, read_telescope
-
-if TYPE_CHECKING:
-    from psfdae.image.catalogue import StarList
 
 
 @command("wavefront")
@@ -95,8 +93,6 @@ def wavefront_command(
         if list_path is not None:
             write_list(observation, list_path)
         if plot is not None:
-            from psfdae.sensing.plot import wavefront_map
-
             write_png(wavefront_map(wavefronts, f"{source.path.name}: {optics.name}"), plot)
         write_fits(out, wavefront_hdus(wavefronts, source.path.name))
     # Many stars that no wavefront explains mean that the description of the telescope is wrong.

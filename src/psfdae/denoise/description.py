@@ -5,14 +5,10 @@ The command `describe` prints it, and a notebook shows a part of it for a `PsfMo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from psfdae.base.types import Table
 from psfdae.denoise.bundle import Bundle, estimator
 from psfdae.methods import method
 from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 
 def model_facts(bundle: Bundle) -> dict[str, str]:

@@ -18,21 +18,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
 
+from psfdae.base.types import QTable, Table
 from psfdae.base.version import __version__
+from psfdae.denoise.bundle import Bundle
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
 from psfdae.image.stamps import StarFlag
 from psfdae.image.tables import COLUMNS, as_fits, fits_values, html_table, star_table
 from psfdae.methods.bundle_info import FORMAT_VERSION
-
-if TYPE_CHECKING:
-    from astropy.table import QTable, Table
-
-    from psfdae.denoise.bundle import Bundle
 
 
 @dataclass(frozen=True, kw_only=True)

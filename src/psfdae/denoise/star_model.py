@@ -22,6 +22,7 @@ from psfdae.base.progress import task
 from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
 from psfdae.denoise.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.denoise.denoiser import make_denoiser
+from psfdae.denoise.description import error_table, model_facts
 from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.stamp_arrays import make_stamps
@@ -106,8 +107,6 @@ class StarModel(FieldPsfs):
 
     def _repr_html_(self) -> str:
         """Return what `psfdae describe` says of use and training, for a notebook."""
-        from psfdae.denoise.description import error_table, model_facts
-
         # Facts on the file and on conventions are left to the command.
         left_out = {"Name", "Written", "Licence", "SHA-256", "Framing", "Normalisation"}
         left_out |= {"Noise-equivalent area", "Flagged as unlike"}

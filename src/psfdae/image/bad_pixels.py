@@ -10,17 +10,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from psfdae.base.types import Header
 from psfdae.image.interpolation import interpolated
 from psfdae.image.sky_level import SkyLevel, pixel_noise
 from psfdae.stars.moments import robust_scatter
-
-if TYPE_CHECKING:
-    from astropy.io.fits import Header
 
 
 @dataclass(frozen=True)

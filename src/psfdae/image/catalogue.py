@@ -12,11 +12,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from psfdae.base.errors import did_you_mean, keyword
+from psfdae.base.types import Column, DataFrame, SkyCoord, Table
 from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.list_formats import read_list_table
@@ -29,22 +31,17 @@ from psfdae.image.position_columns import (
 )
 from psfdae.image.stamps import StarFlag, raise_flag
 
-if TYPE_CHECKING:
-    from astropy.coordinates import SkyCoord
-    from astropy.table import Column, Table
-    from numpy.typing import ArrayLike
-    from pandas import DataFrame
-
-    StarList: TypeAlias = (
-        str
-        | Path
-        | np.ndarray
-        | Sequence[Sequence[float]]
-        | SkyCoord
-        | Mapping[str, ArrayLike]
-        | Table
-        | DataFrame
-    )
+StarList: TypeAlias = (
+    str
+    | Path
+    | np.ndarray
+    | Sequence[Sequence[float]]
+    | SkyCoord
+    | Mapping[str, ArrayLike]
+    | Table
+    | DataFrame
+)
+"""Star list as the public calls take it; see `as_catalogue`."""
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,16 @@ import io
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from psfdae.base.types import HDUList, Header, ImageHDU, NDData, PrimaryHDU, Quantity
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import PlainFile, temporary_file
 
-if TYPE_CHECKING:
-    from astropy.io import fits
-    from astropy.nddata import NDData
-    from astropy.units import Quantity
-
-    Image: TypeAlias = (
-        str | Path | np.ndarray | NDData | fits.HDUList | fits.PrimaryHDU | fits.ImageHDU
-    )
+Image: TypeAlias = str | Path | np.ndarray | NDData | HDUList | PrimaryHDU | ImageHDU
+"""Image as the public calls take it; see `as_image`."""
 
 
 def as_images(images: Any) -> list[Path | PlainFile | np.ndarray]:
@@ -159,7 +154,7 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
     raise ObservationError(path, f"{name}={value}: expected a number of {target_unit}")
 
 
-def _of_nddata(data: NDData) -> fits.HDUList:
+def _of_nddata(data: NDData) -> HDUList:
     """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS.
 
     What FITS cannot hold is left out: meta that are no numbers or texts, and a WCS of another kind.
@@ -197,8 +192,8 @@ def fits_unit(unit: Any) -> str:
 
 
 def _hdus(
-    data: np.ndarray, header: fits.Header, mask: np.ndarray | None, sigma: np.ndarray | None
-) -> fits.HDUList:
+    data: np.ndarray, header: Header, mask: np.ndarray | None, sigma: np.ndarray | None
+) -> HDUList:
     """Return an image with its mask as DQ and σ as ERR.
 
     Parameters
@@ -225,7 +220,7 @@ def _hdus(
     return hdus
 
 
-def _temporary_fits(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
+def _temporary_fits(name: Path, hdus: Callable[[], HDUList]) -> PlainFile:
     """Return a temporary file with an image, which is called `name` in messages.
 
     Parameters

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Unpack
+from typing import Unpack
 
 import numpy as np
 
 from psfdae.base.arguments import check_arguments
+from psfdae.base.types import QTable
+from psfdae.image.containers import Image
 from psfdae.image.image_input import ImageInput, PixelKeywords
 from psfdae.image.opening import open_observation
 from psfdae.image.tables import star_table
-
-if TYPE_CHECKING:
-    from astropy.table import QTable
-
-    from psfdae.image.containers import Image
 
 
 @check_arguments

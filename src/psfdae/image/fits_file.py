@@ -21,19 +21,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from psfdae.base.errors import require_file
 from psfdae.base.files import find_left_over, temporary_name
+from psfdae.base.types import WCS, BaseCoordinateFrame, HDUList, Header, SkyCoord
 from psfdae.image.errors import ObservationError, reading, shorten
-
-if TYPE_CHECKING:
-    from astropy.coordinates import BaseCoordinateFrame, SkyCoord
-    from astropy.io.fits import HDUList, Header
-    from astropy.wcs import WCS
-    from numpy.typing import DTypeLike
 
 BLOCK_BYTES = 2880
 """Bytes of a block, of which FITS files consist."""

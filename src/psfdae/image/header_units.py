@@ -9,10 +9,9 @@ from __future__ import annotations
 import re
 import warnings
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from astropy.units import UnitBase
+from psfdae.base.types import UnitBase
 
 SPELLINGS = {
     "electron": "e-|e|el|elec|electrons?|photoelectrons?",

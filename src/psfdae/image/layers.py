@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,10 +35,8 @@ from psfdae.image.fits_file import (
     open_hdus,
     open_pixels,
 )
+from psfdae.image.image_input import ImageInput
 from psfdae.image.trails import add_trails
-
-if TYPE_CHECKING:
-    from psfdae.image.image_input import ImageInput
 
 NOISE_MAPS = {"weight": "a weight map", "variance": "a variance map", "error": "a map of σ"}
 """Words for the kinds of maps of noise: 1/σ² but for a factor, σ², σ."""

@@ -15,11 +15,11 @@ import operator
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.errors import needed_by
+from psfdae.base.types import Table
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.fits_file import (
     PlainFile,
@@ -28,10 +28,6 @@ from psfdae.image.fits_file import (
     open_hdus,
     unpack_file,
 )
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-
 
 COLUMNS_MAX = 2000
 """Largest number of columns of a list that is text; LSST's have 1300."""

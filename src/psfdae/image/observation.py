@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from psfdae.base.types import WCS, Table
 from psfdae.image.camera import CameraValue
 from psfdae.image.catalogue import Catalogue
 from psfdae.image.detection import Sky
@@ -38,10 +39,6 @@ from psfdae.image.stamps import (
     sky_around,
 )
 from psfdae.stars.moments import robust_scatter
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-    from astropy.wcs import WCS
 
 
 class ListedStars(NamedTuple):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from psfdae.image.camera import (
     unread_card_remarks,
 )
 from psfdae.image.catalogue import Catalogue, as_catalogue
+from psfdae.image.detection import Sky
 from psfdae.image.errors import ObservationError, shorten, silent
 from psfdae.image.fits_file import ImageFile, find_image
 from psfdae.image.image_input import ImageInput
@@ -39,9 +39,6 @@ from psfdae.image.positions import (
     with_origin,
 )
 from psfdae.image.stamps import StarFlag, raise_flag
-
-if TYPE_CHECKING:
-    from psfdae.image.detection import Sky
 
 
 def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Observation:

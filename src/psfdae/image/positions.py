@@ -8,22 +8,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.errors import keyword
+from psfdae.base.types import WCS
 from psfdae.image.catalogue import Catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, sky_frame
+from psfdae.image.layers import Layers
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
-
-if TYPE_CHECKING:
-    from astropy.wcs import WCS
-
-    from psfdae.image.layers import Layers
 
 SAME_STAR_PX = 0.1
 """Distance below which two rows of a list are one star."""

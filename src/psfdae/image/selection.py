@@ -12,12 +12,12 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.errors import Error, keyword
 from psfdae.base.progress import task
+from psfdae.base.settings import CalibrationStars, Stamp
 from psfdae.image.interpolation import interpolated_stamps
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image, sky_around
@@ -32,9 +32,6 @@ from psfdae.image.star_criteria import (
 )
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import FWHM_OF_SIGMA, shift_stamps, windowed_centres
-
-if TYPE_CHECKING:
-    from psfdae.base.settings import CalibrationStars, Stamp
 
 
 class CalibrationStarsError(Error, ValueError):

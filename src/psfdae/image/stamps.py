@@ -10,14 +10,12 @@ import warnings
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import cache
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
+from psfdae.image.fits_file import Pixels
 from psfdae.stars.moments import FWHM_OF_SIGMA, count_step, dither, remove_dither
-
-if TYPE_CHECKING:
-    from psfdae.image.fits_file import Pixels
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,14 @@ import io
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.files import no_formula, write_bytes
+from psfdae.base.types import BinTableHDU, Column, QTable, Table
 from psfdae.image.containers import fits_unit
 from psfdae.image.errors import ascii_line, silent
-
-if TYPE_CHECKING:
-    from astropy.io.fits import BinTableHDU
-    from astropy.table import Column, QTable, Table
 
 OF_IMAGE = "unit of the image"
 """Stands in `COLUMNS` for the unit of the image's pixels."""

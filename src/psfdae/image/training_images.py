@@ -12,19 +12,15 @@ included; those stars are used as they are.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from psfdae.base.files import Column
+from psfdae.base.settings import Parts, Stamp
 from psfdae.image.stamps import cut
 from psfdae.image.star_criteria import brightest_pixels
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import shift_stamps
 from psfdae.stars.splits import draw_jitter, draw_phase
-
-if TYPE_CHECKING:
-    from psfdae.base.settings import Parts, Stamp
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:

@@ -10,11 +10,11 @@ that a star has beyond its stamp is measured with them (`psfdae.psf.wings`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.progress import steps
+from psfdae.base.types import Table
 from psfdae.denoise.denoiser import MAX_CHI2
 from psfdae.denoise.flux_model import is_faint
 from psfdae.image.observation import Observation
@@ -26,10 +26,6 @@ from psfdae.photometry.wings_fit import StarFluxes, add_model_errors, around_sta
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs, aperture_correction
 from psfdae.psf.wings import Wings, outer_shares
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-
 
 MAX_CHI2_RATIO = 2.5
 """Median χ² of an image's bright stars, over that of the training, from which all are flagged."""

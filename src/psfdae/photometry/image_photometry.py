@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.errors import Error, keyword, warn
+from psfdae.base.types import WCS, CCDData, QTable, Table
 from psfdae.denoise.image_prediction import CAUSES
-from psfdae.image.catalogue import as_catalogue
+from psfdae.image.catalogue import StarList, as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
@@ -27,13 +27,7 @@ from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.photon_noise import with_measured_gain
 from psfdae.psf.interface import FieldPsfs
-
-if TYPE_CHECKING:
-    from astropy.nddata import CCDData
-    from astropy.table import QTable, Table
-    from astropy.wcs import WCS
-
-    from psfdae.image.catalogue import StarList
+from psfdae.stars.moments import robust_scatter
 
 
 class PhotometryError(Error, ValueError):
@@ -271,8 +265,6 @@ def measure_zero_point(
         If fewer than three reference stars are stars of the image.
     """
     from scipy.spatial import cKDTree
-
-    from psfdae.stars.moments import robust_scatter
 
     # Stars of the image with a flux above 0, and reference stars with position and magnitude.
     stars = measured.stars

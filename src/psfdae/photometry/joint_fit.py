@@ -14,15 +14,12 @@ Gauss–Newton steps on one sparse matrix (Stetson 1987, PASP 99, 191, solves th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.progress import steps
+from psfdae.base.types import csc_array
 from psfdae.psf.grid import PsfGrid
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,14 @@ stars tell the last two apart.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.image.camera import CameraValue
+from psfdae.image.observation import Observation
 from psfdae.psf.grid import PsfGrid
+from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import SIGMA_OF_MAD
-
-if TYPE_CHECKING:
-    from psfdae.image.observation import Observation
-    from psfdae.psf.interface import FieldPsfs
 
 
 def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from psfdae.base.types import GriddedPSFModel
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-
-if TYPE_CHECKING:
-    from photutils.psf import GriddedPSFModel
 
 
 def make_photutils_grid(model: FieldPsfs, nodes: int, oversampling: int) -> GriddedPSFModel:

@@ -7,16 +7,13 @@ the report page (`psfdae.report.page`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.types import Table
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.methods import method as method_of
 from psfdae.stars.moments import measure_shapes, shift_stamps
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 MEAN_PSF = "mean_psf"
 """Name, in tables, of the comparison with one mean PSF whose centre is fitted to each star."""

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.types import Figure, Table
 from psfdae.report.checks import MEAN_PSF, method_labels, nearest_snr, size_errors
 from psfdae.report.plot import has_shape
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-    from matplotlib.figure import Figure
 
 
 @styled

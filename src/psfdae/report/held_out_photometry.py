@@ -7,21 +7,17 @@ S/N, of which the report page (`psfdae.report.page`) shows the most important co
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import table_of_rows
 from psfdae.methods.metrics import clustered_mean
 from psfdae.training.calibration import COVERAGE
 from psfdae.training.star_sets import field_positions, own_noise, star_area
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-
-    from psfdae.denoise.star_model import StarModel
-    from psfdae.training.stars import ImageStars
+from psfdae.training.stars import ImageStars
 
 
 def measure_photometry(

@@ -10,17 +10,13 @@ import base64
 from collections.abc import Sequence
 from html import escape
 from io import BytesIO
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.figures import as_png
+from psfdae.base.types import Figure, Table
 from psfdae.image.tables import html_table
 from psfdae.report.checks import Check, method_labels
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-    from matplotlib.figure import Figure
 
 
 def checks_html(rows: Sequence[Check]) -> str:

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.figures import WIDTH_IN, new_figure, styled
+from psfdae.base.types import Axes, Figure, LineCollection
 from psfdae.image.stamps import StarFlag
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
 
 
 def has_shape(flags: np.ndarray) -> np.ndarray:

@@ -10,13 +10,13 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.arguments import check_arguments
 from psfdae.base.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.base.files import write_text
+from psfdae.base.types import Figure, Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.selection import Verdict
@@ -42,10 +42,6 @@ from psfdae.report.page import checks_html, errors_table, image_tag, photometry_
 from psfdae.report.plot import psf_map
 from psfdae.training.star_sets import field_positions, star_area
 from psfdae.training.stars import ImageStars
-
-if TYPE_CHECKING:
-    from astropy.table import Table
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import warn
 from psfdae.base.progress import steps
 from psfdae.base.threads import fixed_threads
+from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import table_of_rows, with_format
@@ -27,9 +28,6 @@ from psfdae.report.report import Report, level_scale
 from psfdae.training.packing import checksum
 from psfdae.training.star_sets import field_positions, noisy_test_images, own_noise, star_area
 from psfdae.training.stars import ImageStars
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 
 @check_arguments

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from psfdae.base.files import Column, Product
 from psfdae.base.rng import stream
 from psfdae.base.settings import Noise
+from psfdae.base.types import QTable
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
@@ -22,15 +23,11 @@ from psfdae.image.selection import Candidates
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
+from psfdae.methods.interface import Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
 from psfdae.training.settings import Settings
 from psfdae.training.star_sets import split_stars, training_set
-
-if TYPE_CHECKING:
-    from astropy.table import QTable
-
-    from psfdae.methods.interface import Method, TrainingSet
 
 
 @dataclass(frozen=True, eq=False)
