@@ -292,7 +292,7 @@ def public_names():
                 names = [
                     n
                     for n, p in inspect.signature(thing).parameters.items()
-                    if p.kind != p.VAR_KEYWORD
+                    if p.kind != p.VAR_KEYWORD and p.default is not ...
                 ]
                 parameters = f"({', '.join(n for n in names if n != 'self')})"
             rows.append([f"{label}{parameters}", " ".join(first_sentence.split())])

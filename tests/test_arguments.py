@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import inspect
 import pickle
 from copy import deepcopy
 from dataclasses import fields
@@ -13,6 +14,8 @@ import pytest
 import psfdae
 import small_field
 from image_training import few_draws
+from psfdae.api import StarKeywords
+from psfdae.base.settings import CalibrationStars, Parts, Stamp
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.opening import open_observation
 from psfdae.report.validation import Report
@@ -78,6 +81,24 @@ def image():
 def test_all_statements_are_tested():
     assert {field.name for field in fields(ImageOptions)} == {*STATEMENTS}
     assert {field.name for field in fields(ImageInput)} - {"image"} <= {*KINDS}
+
+
+def test_calls_on_images_show_every_option():
+    """help(), an editor and a type checker know the options and settings, none by a second name."""
+    options = {field.name for field in fields(ImageOptions)} - {"catalogue"}
+    groups = (CalibrationStars, Stamp, Parts)
+    settings = {name for group in groups for name in group.model_fields} | {"seed"}
+    model = psfdae.PsfModel
+    shown = {
+        call: inspect.signature(call).parameters
+        for call in (model.predict_image, model.photometry, model.residual, model.adapt)
+    }
+    assert all(options < {*parameters} for parameters in shown.values())
+    assert options - {"detect"} < {*inspect.signature(psfdae.detect).parameters}
+    of_stars = {*inspect.signature(psfdae.Stars.from_image).parameters}
+    assert of_stars == options | settings | {"image", "catalogue"}
+    assert shown[model.residual]["gain"].annotation == "Number | None"
+    assert StarKeywords.__annotations__.keys() == options | settings
 
 
 @pytest.mark.parametrize("name", STATEMENTS)

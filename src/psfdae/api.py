@@ -85,6 +85,7 @@ class Stars(ImageStars):
     """
 
     @classmethod
+    @check_arguments
     def from_image(
         cls,
         image: Image | Sequence[Image],
@@ -252,6 +253,7 @@ class PsfModel(StarModel):
         source = ImageInput.of(image, {**options, "catalogue": catalogue})
         return photometry_of_image(self, source, zero_point, reference, magnitude_column).table
 
+    @check_arguments
     def residual(
         self, image: Image, catalogue: StarList | None = None, **options: Unpack[ImageKeywords]
     ) -> CCDData:
@@ -316,7 +318,7 @@ def load_model(path: str | Path | None = None) -> PsfModel:
 
 @check_arguments
 def fit(
-    stars: ImageStars,
+    stars: Stars,
     method: str | None = None,
     *,
     name: str | None = None,
@@ -354,5 +356,5 @@ def fit(
     >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
     StarModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
-    model = fit_model(stars, method, name, licence, settings)
+    model = fit_model(stars, method, name=name, licence=licence, **settings)
     return PsfModel(model.bundle, model.method)

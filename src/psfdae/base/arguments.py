@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import inspect
+import re
 import reprlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -26,7 +27,10 @@ class ArgumentError(Error, TypeError, ValueError):
 
 
 def check_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function that checks its arguments (`check_values`) before it does anything."""
+    """Return a function that checks its arguments (`check_values`) before it does anything.
+
+    Its signature has each of the keywords that `**options: Unpack[…]` stands for.
+    """
     signature = inspect.signature(function)
 
     @wraps(function)
@@ -34,7 +38,39 @@ def check_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments
         check_values(function, signature.bind(*args, **kwargs).arguments)
         return function(*args, **kwargs)
 
+    check_and_call.__signature__ = expand_keywords(function, signature)  # type: ignore[attr-defined]
     return check_and_call
+
+
+def expand_keywords(
+    function: Callable[..., Any], signature: inspect.Signature
+) -> inspect.Signature:
+    """Return a signature with the keys of a TypedDict in place of `**options: Unpack[…]`.
+
+    Parameters
+    ----------
+    function : callable
+        Its module has the TypedDict.
+    signature : Signature
+        Signature of the function; one without such options is returned as it is.
+    """
+    parameters: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        unpacked = re.fullmatch(r"Unpack\[(\w+)\]", str(parameter.annotation))
+        if unpacked is None:
+            parameters.append(parameter)
+            continue
+        # As in a stub file, `...` stands for a default that is described elsewhere.
+        parameters += (
+            parameter.replace(
+                name=name,
+                kind=parameter.KEYWORD_ONLY,
+                default=...,
+                annotation=reference.__forward_arg__,
+            )
+            for name, reference in function.__globals__[unpacked[1]].__annotations__.items()
+        )
+    return signature.replace(parameters=parameters)
 
 
 def check_values(function: Callable[..., Any], values: Mapping[str, Any], **names: Any) -> None:

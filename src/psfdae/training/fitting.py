@@ -31,14 +31,15 @@ Kind = TypeVar("Kind", bound=Method)
 
 def fit_model(
     stars: ImageStars,
-    method: str | None,
-    name: str | None,
-    licence: str,
-    settings: Mapping[str, object],
+    method: str | None = None,
+    *,
+    name: str | None = None,
+    licence: str = "not stated",
+    **settings: object,
 ) -> StarModel:
     """Train a model on the bright stars of images, without those that are held out.
 
-    Parameters are those of `psfdae.fit`; `settings` are the settings of the method.
+    Parameters are those of `psfdae.fit`.
     """
     # Candidates: the stated method, or all of the settings of which one becomes the model.
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]

@@ -37,7 +37,7 @@ from psfdae_paper.evaluation.night import (
 from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
 
 if TYPE_CHECKING:
-    from psfdae.api import PsfModel
+    from psfdae.denoise.star_model import StarModel
     from psfdae.training.stars import ImageStars
 
 Row = dict[str, object]
@@ -130,7 +130,7 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
             row["reason"] = reason_of(error, row)
     for stars_by_name in groups.values():
         sizes = log_sizes(stars_by_name)
-        starts: dict[str, PsfModel] = {}
+        starts: dict[str, StarModel] = {}
         for name in from_most_usual(stars_by_name, sizes):
             try:
                 # Its stars take memory: those of an image that is done are not needed any more.
@@ -273,21 +273,21 @@ def from_most_usual(
     return [most_usual, *(name for name in stars_by_name if name != most_usual)]
 
 
-def model_of_image(stars: ImageStars, start: PsfModel | None) -> PsfModel:
+def model_of_image(stars: ImageStars, start: StarModel | None) -> StarModel:
     """Return the field model of an image, changed from that of another image if there is one."""
-    from psfdae.api import fit
     from psfdae.training.exposures import adapt_to_stars
+    from psfdae.training.fitting import fit_model
     from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
     training_stars = np.count_nonzero(~stars.held_out)
     if start is None or training_stars < MIN_STARS_WITH_ERROR:
-        model = fit(stars, method="field")
+        model = fit_model(stars, method="field")
         # Where wavefronts grow with the square of the place, as Seidel aberrations do, second
         # moments grow with its fourth power: a curved field gets order 4 at least, if there are two
         # stars for each of its 15 terms. Few of the stars that chose the order are in the corners.
         if 2 <= model.order < 4 and training_stars >= 30:
-            model = fit(stars, method="field", orders=[4, 6])
+            model = fit_model(stars, method="field", orders=[4, 6])
         return model
     return adapt_to_stars(start, stars)
 
@@ -331,7 +331,7 @@ def telescope_state(stars: ImageStars, telescope: Path) -> Row:
     return row
 
 
-def measured(row: Mapping[str, object], stars: ImageStars, model: PsfModel, folder: Path) -> Row:
+def measured(row: Mapping[str, object], stars: ImageStars, model: StarModel, folder: Path) -> Row:
     """Write model, catalogue and report page of an image, and return what its row tells.
 
     Parameters
@@ -339,7 +339,7 @@ def measured(row: Mapping[str, object], stars: ImageStars, model: PsfModel, fold
     row : mapping
         Row of the list; its `reference` is a star list with magnitudes.
     stars : ImageStars
-    model : PsfModel
+    model : StarModel
     folder : Path
         Files begin with the row's name.
 
