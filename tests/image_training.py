@@ -1,4 +1,4 @@
-"""A small simulated image and what `from-stars` makes of it: one training for all tests."""
+"""A small simulated image and what `train` makes of it: one training for all tests."""
 
 from __future__ import annotations
 
@@ -86,6 +86,6 @@ class Training:
         words = [*self.words, "--out", str(self.out), "--report", str(self.page), *WORDS]
         with few_draws(), pytest.MonkeyPatch.context() as patch:
             patch.setenv("SOURCE_DATE_EPOCH", "0")
-            result = CliRunner().invoke(main, ["from-stars", *words])
+            result = CliRunner().invoke(main, ["train", *words])
         assert result.exit_code == 0, result.output
         (self.folder / "output.txt").write_text(result.output, encoding="utf-8")

@@ -271,14 +271,16 @@ def test_network_of_another_training_and_stars_that_say_too_little_are_refused(f
     stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 1}})
     with pytest.raises(ProductError, match=r"s\.h5: .*'pixel_scale_arcsec'"):
         pack(folder, tmp_path / "x", stars=stars)
-    line = refused("bundle", "--stars", folder / "stars.h5", "--dae", tmp_path, "--out", "x")
+    line = refused(
+        "paper", "bundle", "--stars", folder / "stars.h5", "--dae", tmp_path, "--out", "x"
+    )
     assert f"{tmp_path}/dae.safetensors: no such file" in line
 
 
 def test_commands_pack_and_describe(folder, tmp_path):
     path = tmp_path / "mine.psf.safetensors"
     inputs = ["--stars", folder / "stars.h5", "--dae", folder / "dae"]
-    printed("bundle", *inputs, "--out", path, *TINY)
+    printed("paper", "bundle", *inputs, "--out", path, *TINY)
     text = psfdae("describe", path).output
     for fact in ("mine", "12 × 12 px of 0.1 arcsec (0.881 λ/D)", "not stated", "1000 simulated"):
         assert fact in text

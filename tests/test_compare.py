@@ -126,7 +126,7 @@ def recorded(tmp_path, monkeypatch):
     def write_run(**scale):
         path = tmp_path / "run/evaluation/d/random-realisation.csv"
         write_text(path, mean_errors(**scale).to_csv(index=False))
-        return psfdae("compare", tmp_path / "run", tmp_path / "record")
+        return psfdae("paper", "compare", tmp_path / "run", tmp_path / "record")
 
     return write_run
 
@@ -200,7 +200,7 @@ def test_command_compares_networks_and_whole_results(results):
     runs = [str(results / name) for name in ("one", "two")]
     for arguments in (runs, [f"{run}/dae/dataset3/random-realisation" for run in runs]):
         out = results / "compare.md"
-        output = printed("compare", *arguments, "--out", out)
+        output = printed("paper", "compare", *arguments, "--out", out)
         assert output == out.read_text()
         assert all(
             word in output for word in ("train.lr", "NOT COMPARABLE", "star by star", "worse")
@@ -218,4 +218,4 @@ def test_command_compares_networks_and_whole_results(results):
 def test_refusals_are_one_line(results, arguments, message):
     damaged = results / "two/evaluation/dataset5/random-template.parquet"
     damaged.write_bytes(damaged.read_bytes()[:100])
-    assert message in refused("compare", *(results / a for a in arguments))
+    assert message in refused("paper", "compare", *(results / a for a in arguments))

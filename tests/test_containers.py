@@ -26,7 +26,7 @@ from command_line import psfdae, refused
 from docs_pages import read
 from image_training import WORDS, few_draws
 from psfdae import Error, Stars, fit
-from psfdae.commands import from_stars
+from psfdae.commands import train
 from psfdae.image.fits_file import science_images
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
@@ -166,14 +166,14 @@ def test_an_image_of_the_tutorials_table_gives_what_it_says(
     small.stetson([(k, x + 1, y + 1) for k, (x, y) in enumerate(place)], tmp_path / "list.als")
     if not is_trained:
         monkeypatch.setattr(
-            from_stars, "write_model", lambda a, b, *_: "\n".join(collect_stars(b, a).notes)
+            train, "write_model", lambda a, b, *_: "\n".join(collect_stars(b, a).notes)
         )
     output = ""
     for option in ["", *re.findall("`(--[a-z]+[- ][^`]*)`", row[2])]:
         words = [*option.split(), *([] if "--catalogue" in option else ["--detect"])]
         words += [*WORDS, "--method", "field", "--out", "m", "--overwrite"]
         with few_draws():
-            process = psfdae("from-stars", "image.fits", *words)
+            process = psfdae("train", "image.fits", *words)
         assert process.exit_code == (2 if "refused" in row[1] else 0), process.output
         output += process.output
     assert all(words_of_page in output for words_of_page in re.findall("`([^`]+)`[.,]", row[1])), (
@@ -382,6 +382,6 @@ def test_one_plane_is_an_image(tmp_path, image, place):
 
 def test_an_undebayered_frame_is_refused_in_one_line(tmp_path, image):
     path = write(tmp_path / "osc.fits", image, BAYERPAT="RGGB")
-    line = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
+    line = refused("train", path, "--detect", "--out", tmp_path / "m")
     assert line.startswith(f"psfdae: {path}: ") and "debayer" in line
     assert not (tmp_path / "m").exists()

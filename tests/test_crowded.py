@@ -77,7 +77,7 @@ def sky(tmp_path_factory):
     settings = ["methods=[noisy,field]", "framing.stamp_px=10", "field.orders=[0]", "field.modes=8"]
     settings += [f"parts.{name}={count}" for name, count in COUNTS.items()]
     with few_draws():
-        printed("from-stars", folder / "i.fits", *words, *settings)
+        printed("train", folder / "i.fits", *words, *settings)
     true = Table({"x": place[:, 0], "y": place[:, 1], "flux": light})
     true["pair"] = np.concatenate([paired, np.ones(len(companions), bool)])
     return folder, folder / "model/i.psf.safetensors", true

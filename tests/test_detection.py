@@ -98,7 +98,7 @@ def test_commands_need_no_list_and_no_card(field, tmp_path):
     image, model, out = field[0] / "image.fits", tmp_path / "model", tmp_path / "psf.fits"
     words = [image, "--detect"]
     with few_draws():
-        output = printed("from-stars", *words, "--out", model, *TINY)
+        output = printed("train", *words, "--out", model, *TINY)
     camera = "image.fits: pixel scale 1 arcsec (assumed), gain not known, read noise not known"
     assert camera in output
     bundle = model / "image.psf.safetensors"
@@ -261,7 +261,7 @@ LIST = ["--catalogue", "stars.csv"]
 )
 def test_from_stars_refuses_in_one_line(bad, monkeypatch, words, named):
     monkeypatch.chdir(bad)
-    assert named in refused("from-stars", *words, "--out", "model", *TINY)
+    assert named in refused("train", *words, "--out", "model", *TINY)
     assert not (bad / "model").exists()
 
 

@@ -19,7 +19,7 @@ from psfdae.denoise.bundle import read_bundle
 from workflow_runs import clone, shell
 
 SMALL = ("parts.train_stars=60", "parts.test_stars=20")
-"""Makes `psfdae from-stars` quick."""
+"""Makes `psfdae train` quick."""
 
 TESTED_ELSEWHERE = {
     **{f"docs/{name}.md": "test_from_stars.py" for name in ("train", "photometry", "exposures")},
@@ -39,7 +39,7 @@ DRY = {
         f"make reproduce TARGETS=dataset3 RESULTS=results/{words}"
         for words in (
             "trial SET=train.lr=2e-3 telescope=wfsat_literal",
-            "best SET=$(psfdae best dae_width)",
+            "best SET=$(psfdae paper best dae_width)",
             "lr2e-3 SET=train.lr=2e-3",
         )
     ),

@@ -62,7 +62,7 @@ def simulated(folder, name, seed, count, width, **cards):
 
 def trained(*words):
     with few_draws():
-        printed("from-stars", *words, *FEW_STARS)
+        printed("train", *words, *FEW_STARS)
 
 
 @pytest.fixture(scope="module")
@@ -123,12 +123,12 @@ def test_the_command_writes_a_model_that_predict_takes(sky):
     folder, _, _ = sky
     of = (folder / "sparse.fits", "--catalogue", folder / "sparse.csv")
     out, model = folder / "sparse.psf.safetensors", folder / "m/rich.psf.safetensors"
-    process = psfdae("exposure", *of, "--model", model, "--out", out)
+    process = psfdae("adapt", *of, "--model", model, "--out", out)
     assert process.exit_code == 0 and "10 stars of sparse.fits" in process.output, process.output
     assert "sparse.fits, by 10 of its stars" in psfdae("describe", out).output
     assert psfdae("predict", *of, "--model", out, "--out", folder / "p.fits").exit_code == 0
     words = ("--model", out, "--out", folder / "second.psf.safetensors")
-    assert "itself adapted to sparse.fits" in refused("exposure", *of, *words)
+    assert "itself adapted to sparse.fits" in refused("adapt", *of, *words)
 
 
 def test_models_of_other_pixels_or_without_a_field_are_not_adapted(sky):
@@ -252,7 +252,7 @@ def test_several_images_that_belong_to_no_training_are_refused(sky, night, tmp_p
         ([rich, poor, "--catalogue", folder / "rich.csv"], "sky coordinates"),
         ([rich, poor, "--detect", "--out", out], "--overwrite"),
     ):
-        assert message in refused("from-stars", "--out", tmp_path / "m", *words, *FEW_STARS)
+        assert message in refused("train", "--out", tmp_path / "m", *words, *FEW_STARS)
 
 
 def test_wings_of_several_images_are_one_profile():

@@ -452,7 +452,7 @@ def image(tmp_path_factory):
     words += ["parts.test_stars=30", "field.orders=[2]", "field.modes=16", "--method", "field"]
     words += ["--catalogue", folder / "bright.csv", "--out", folder / "model"]
     with few_draws():
-        printed("from-stars", folder / "i.fits", *words)
+        printed("train", folder / "i.fits", *words)
     inside = flux * truth(position, centre, SIDE).sum(axis=(1, 2))
     true = {"position": position, "flux": flux, "inside": inside}
     true = {name: values[~is_bright] for name, values in true.items()}

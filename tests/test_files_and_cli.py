@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from psfdae.base import progress
 from psfdae.base.files import (
     Column,
@@ -206,7 +206,7 @@ def test_the_manifest_of_a_run_shows_which_files_have_changed(tmp_path):
     for name in (*names, "runtime.csv", "tables/.b.csv.0.tmp"):
         write_text(tmp_path / name, f"content of {name}\n")
     for _ in range(2):  # the second time there is a manifest, which is no product
-        assert psfdae("manifest", tmp_path).exit_code == 0
+        assert psfdae("paper", "manifest", tmp_path).exit_code == 0
     line = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
     check = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert check.stdout.splitlines() == ["data/a.h5: OK", "tables/b.csv: OK"]
@@ -342,9 +342,9 @@ program(long)
 
 def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path):
     out = tmp_path / "t.h5"
-    line = refused("templates", "--out", out, "telescope.wavelength_m=-1")
+    line = refused("paper", "templates", "--out", out, "telescope.wavelength_m=-1")
     assert line.startswith("psfdae: telescope.wavelength_m = -1: ")
-    line = refused("stars", "--templates", "none.h5", "--out", out)
+    line = refused("paper", "stars", "--templates", "none.h5", "--out", out)
     assert line == "psfdae: none.h5: no such file\n"
     assert not out.exists()
 
@@ -353,12 +353,58 @@ def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path
     ("words", "message"),
     [
         ("predct", "No such command 'predct'; did you mean predict?"),
-        ("config -m train.lr=1e-3,2e-3", "-m: several values are a sweep: .*config sweep=NAME"),
-        ("fit --multirun train.lr=1e-3,2e-3", "--multirun: several values are a sweep"),
-        ("config --cfg job", "--cfg: psfdae config OVERRIDES prints the composed configuration"),
+        (
+            "paper config -m train.lr=1e-3,2e-3",
+            "-m: several values are a sweep: .*config sweep=NAME",
+        ),
+        ("paper fit --multirun train.lr=1e-3,2e-3", "--multirun: several values are a sweep"),
+        (
+            "paper config --cfg job",
+            "--cfg: psfdae paper config OVERRIDES prints the composed configuration",
+        ),
     ],
 )
 def test_a_mistyped_command_and_options_of_hydra_are_answered(words, message):
     result = psfdae(*words.split())
     assert result.exit_code == 2
     assert re.search(f"Error: {message}".replace("?", r"\?"), result.output), result.output
+
+
+def test_the_help_lists_the_calls_of_python_and_the_stages_below_paper():
+    """A user's commands are verbs of Python's calls; the workflow's are one group."""
+    output = printed("--help")
+    words = re.findall(r"^  ([a-z]+)  ", output, re.MULTILINE)
+    assert len(words) <= 16 and output.count("\n") < 50
+    verbs = {"train", "validate", "detect", "predict", "photometry", "residual", "adapt"}
+    assert verbs | {"psf", "wavefront", "describe", "example", "paper"} <= {*words}
+    # Stages are below `paper`, none beside it.
+    stages = set(re.findall(r"^  ([a-z-]+)  ", printed("paper", "--help"), re.MULTILINE))
+    assert {"fit", "stars", "evaluate", "bounds"} < stages and not stages & {*words}
+
+
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ("from-stars", "train"),
+        ("exposure", "adapt"),
+        ("example-field", "example field"),
+        ("fit", "paper fit"),
+        ("evaluate", "paper evaluate"),
+        ("alignment states", "paper alignment states"),
+    ],
+)
+def test_a_former_name_of_a_command_works_and_says_the_present_one(former, present):
+    word, *more = former.split()
+    new_word = " ".join(present.split()[: len(present.split()) - len(more)])
+    output = psfdae(*former.split(), "--help").output
+    line, _, help_text = output.partition("\n")
+    assert line == f"psfdae: {word} is now psfdae {new_word}"
+    assert f" {present} " in help_text.splitlines()[0]
+    assert help_text == psfdae(*present.split(), "--help").output
+
+
+def test_options_of_the_image_are_one_group_at_the_end_of_the_help():
+    for name in ("train", "validate", "detect", "predict", "photometry", "residual", "adapt"):
+        own, _, of_image = printed(name, "--help").partition("\nOptions of an image")
+        assert "--out" in own and "--gain" in of_image, name
+        assert "--gain" not in own and "--out" not in of_image, name

@@ -21,8 +21,8 @@ from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.base.files import read_product, write_product
 from psfdae.base.rng import stream
-from psfdae.commands import from_stars as stage
-from psfdae.commands.from_stars import locked_folder
+from psfdae.commands import train as stage
+from psfdae.commands.train import locked_folder
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
@@ -174,7 +174,7 @@ def best_match(psf, image):
 
 
 def run(*words):
-    return psfdae("from-stars", *words)
+    return psfdae("train", *words)
 
 
 def test_command_leaves_a_model_and_a_report(training):
@@ -240,7 +240,7 @@ def test_a_model_is_replaced_on_request_only(training, tmp_path):
     bundle_file = out / training.bundle.name
     words = [*training.words, "--out", out, *WORDS, "--method", "gmm"]
     bytes_before = {path: path.read_bytes() for path in out.rglob("*")}
-    message = refused("from-stars", *words, "--name", "other")
+    message = refused("train", *words, "--name", "other")
     assert str(bundle_file) in message and "--overwrite" in message
     assert {path: path.read_bytes() for path in out.rglob("*")} == bytes_before
     with few_draws():
@@ -256,7 +256,7 @@ def test_a_killed_command_leaves_no_output_and_is_repeated(training, tmp_path, m
     shutil.copytree(training.out, out)
     bundle_file = out / training.bundle.name
     bundle_file.unlink()
-    monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "field.h5"))
+    monkeypatch.setattr(stage, "fit_method", lambda stars, kind, _: kind.load(out / "field.h5"))
     monkeypatch.setattr(stage, "pack_model", lambda *args: training.model)
     monkeypatch.setattr(Report, "page", lambda self: "page")
     words = [*training.words, "--out", out, "--report", page, *WORDS]
@@ -292,14 +292,14 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.from_stars import locked_folder\n"
+        "from psfdae.commands.train import locked_folder\n"
         "with locked_folder(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "mine\n"
-        message = refused("from-stars", *training.words, "--out", out, *WORDS)
+        message = refused("train", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
     with locked_folder(out):
@@ -335,7 +335,7 @@ def test_what_cannot_be_used_ends_in_one_line(training, tmp_path, monkeypatch, w
     monkeypatch.chdir(tmp_path)
     write_cube("cube.fits", np.ones((4, 16, 16), np.float32))
     words = [word.format(image=training.image, stars=training.catalogue) for word in words]
-    assert message in refused("from-stars", *words, "--out", "model")
+    assert message in refused("train", *words, "--out", "model")
     assert [path.name for path in tmp_path.iterdir()] == ["cube.fits"]
 
 

@@ -332,7 +332,7 @@ def endless(request, tmp_path):
         "predict {good}/cube.fits --mask {} --out out.fits",
         "predict {good}/image.fz --catalogue {} --out out.fits",
         "predict {good}/cube.fits --model {} --out out.fits",
-        "from-stars {good}/image.fz --catalogue {} --out m",
+        "train {good}/image.fz --catalogue {} --out m",
         "photometry {good}/image.fz --catalogue {good}/stars.csv --model {} --out out.csv",
         "psf {} --grid 3x3 --out out.fits",
         "describe {}",
@@ -576,7 +576,7 @@ def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
     for words in (
         ["predict", cube, "--model", model, "--out", model, "--overwrite"],
         ["predict", cube, "--mask", cube, "--out", cube, "--overwrite"],
-        ["from-stars", cube, "--catalogue", field, "--pixel-scale", 1, "--report", field],
+        ["train", cube, "--catalogue", field, "--pixel-scale", 1, "--report", field],
     ):
         out = [] if "--out" in words else ["--out", tmp_path / "model"]
         assert "is an input, too" in refused(*words, *out)

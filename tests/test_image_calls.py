@@ -15,7 +15,7 @@ from astropy.table import QTable
 
 import psfdae as library
 import small_field
-from command_line import psfdae, refused
+from command_line import printed, psfdae, refused
 from image_training import few_draws
 
 
@@ -66,6 +66,28 @@ def test_predictions_and_fluxes_are_those_of_the_commands(image, model):
     sky = small_field.TANGENT.pixel_to_world(10.0, 20.0)
     for wcs in (residual.wcs, CCDData.read(without_stars).wcs):
         np.testing.assert_allclose(wcs.world_to_pixel(sky), (10.0, 20.0), atol=1e-6)
+
+
+def test_commands_of_detected_stars_residual_and_report_are_the_calls(image, stars, model):
+    """The image of the training: validation takes the stars that the training held out."""
+    bundle, table = image.with_name("sky.psf.safetensors"), image.with_name("detected.ecsv")
+    printed("detect", image, "--threshold", 8, "--out", table)
+    detected = library.detect(image, threshold=8.0)
+    np.testing.assert_array_equal(QTable.read(table)["x"], detected["x"])
+    without_stars = image.with_name("without_stars.fits")
+    printed("residual", image, "--detect", "--model", bundle, "--out", without_stars)
+    residual = model.residual(image, detect=True)
+    np.testing.assert_array_equal(fits.getdata(without_stars), residual.data)
+    page = image.with_name("report.html")
+    lines = printed("validate", image, "--detect", "--model", bundle, "--out", page).splitlines()
+    report = library.validate(model, stars)
+    # A page of a command has the names of options, one of Python those of keywords.
+    assert page.read_text("utf-8").replace("--stamp-px 8", "stamp_px=8") == report.page()
+    assert lines[-1] == str(report)
+    words = ("--model", bundle, "--out", page)
+    assert "stars.csv: no such file" in refused(
+        "validate", image, "--catalogue", "stars.csv", *words
+    )
 
 
 def test_detected_stars_are_a_star_list(image, model):
@@ -124,7 +146,7 @@ def test_a_refusal_names_keywords_in_python_and_options_in_a_command(
     with pytest.raises(library.Error) as refusal:
         library.Stars.from_image(image, **statements)
     assert python in str(refusal.value) and "--" not in str(refusal.value)
-    assert command in refused("from-stars", image, *words, "--out", tmp_path / "model")
+    assert command in refused("train", image, *words, "--out", tmp_path / "model")
 
 
 def test_what_a_user_holds_is_shown_in_a_line_and_in_short_numbers(image, stars, model):

@@ -32,7 +32,7 @@ OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
 SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
 """Options that make a command quick."""
 
-EXAMPLE = "psfdae example-field --out image.fits --catalogue stars.csv"
+EXAMPLE = "psfdae example field --out image.fits --catalogue stars.csv"
 NOTEBOOK = ROOT / "docs/first_session.ipynb"
 
 PREPARATION = {
@@ -155,8 +155,8 @@ def test_help_lists_what_works_here_and_names_the_extra_for_the_others(light, tm
         'with the extra "paper": pip install',
     ):
         assert heading in lines
-    assert "from-stars" in lines and "snakemake" not in lines and "  fit " not in lines
-    refusal = run(light, tmp_path, "psfdae fit dae --stars a.h5 --out b 2>&1 || test $? = 2")
+    assert "train" in lines and "snakemake" not in lines and "  fit " not in lines
+    refusal = run(light, tmp_path, "psfdae paper fit dae --stars a.h5 --out b 2>&1 || test $? = 2")
     assert re.fullmatch(
         r'psfdae: this command needs hydra-core: pip install ".*\.whl\[paper\]"\n', refusal
     )

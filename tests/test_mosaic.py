@@ -1,4 +1,4 @@
-"""All CCDs of a mosaic in one call of `from-stars` and `predict`."""
+"""All CCDs of a mosaic in one call of `train` and `predict`."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_images_that_fail_or_are_killed_are_named_at_the_end_and_stop_no_other(c
     ("command", "words", "named"),
     [
         ("predict", ["--detect", "--mask", "DQ"], "m.fits: --all-extensions excludes --mask"),
-        ("from-stars", ["--detect", "--extension", 1], "--all-extensions excludes --extension"),
+        ("train", ["--detect", "--extension", 1], "--all-extensions excludes --extension"),
         ("predict", ["--detect", "--model", "."], "CCD1: "),
     ],
 )
@@ -135,7 +135,7 @@ def test_a_mosaic_from_its_stars_to_their_psfs(tmp_path):
     image = mosaic_file(tmp_path / "m.fits", *images, empty)
     out = tmp_path / "model"
     words = [image, "--all-extensions", "--detect"]
-    process = psfdae("from-stars", *words, "--out", out, "--report", tmp_path / "page.html", *TINY)
+    process = psfdae("train", *words, "--out", out, "--report", tmp_path / "page.html", *TINY)
     assert process.exit_code == 2
     assert process.output.endswith("1 of 3 images failed: EMPTY\n")
     for k in (1, 2):

@@ -131,7 +131,7 @@ def folder(tmp_path_factory):
     words = ("--catalogue", out / "train.csv", "--origin", 0, "--method", "field")
     settings = (f"framing.stamp_px={STAMP}", "field.orders=[0]", "field.modes=10")
     with few_draws():
-        printed("from-stars", out / "train.fits", *words, *settings, "--out", out / "model")
+        printed("train", out / "train.fits", *words, *settings, "--out", out / "model")
     words = (out / "image.fits", "--catalogue", out / "image.csv", "--origin", 0)
     words += ("--model", bundle(out))
     printed("predict", *words, "--out", out / "predict.fits")

@@ -78,7 +78,7 @@ def sky(tmp_path_factory):
     out = image_case.folder / "model"
     words = ("--catalogue", image_case.list, "--method", "field", "--out", out)
     with few_draws():
-        printed("from-stars", image_case.image, *words, "methods=[noisy,field]", *TINY)
+        printed("train", image_case.image, *words, "methods=[noisy,field]", *TINY)
     image_case.model = out / "sky.psf.safetensors"
     process, table = image_case.predicted(image_case.list)
     assert process.exit_code == 0, process.output
@@ -132,7 +132,7 @@ def test_list_of_another_crowded_image_teaches_nothing(sky, tmp_path):
     x, y = sky.position.T
     catalogue = sky.listed("two_off", x + 2, y)
     words = ("--catalogue", catalogue, "--out", tmp_path / "model", "methods=[noisy,field]", *TINY)
-    assert "by x -2.0" in refused("from-stars", sky.image, *words)
+    assert "by x -2.0" in refused("train", sky.image, *words)
 
 
 @pytest.mark.parametrize(("level", "is_flagged"), [(SKY, False), (0.0, True)])

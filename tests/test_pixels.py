@@ -480,7 +480,7 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
     clipped = np.clip(np.rint(image - SKY), 0, None)
     path = tmp_path / "clipped.fits"
     fits.writeto(path, clipped.astype(np.uint16))
-    message = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
+    message = refused("train", path, "--detect", "--out", tmp_path / "m")
     assert "of the pixels have the least value, 0: the sky was clipped" in message
     assert not (tmp_path / "m").exists()
     with pytest.raises(ObservationError, match="clipped"):

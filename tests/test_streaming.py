@@ -145,11 +145,11 @@ def test_number_of_cpus_does_not_change_a_product(tmp_path):
     """Two threads of linear algebra, as configured, on two CPUs and on one."""
     sizes = ["grid.points=3", "stars.count=48", "optics.threads=2"]
     templates = tmp_path / "templates.h5"
-    assert psfdae("templates", "--out", templates, "scene=seidel", *sizes).exit_code == 0
+    assert psfdae("paper", "templates", "--out", templates, "scene=seidel", *sizes).exit_code == 0
     products = []
     for cpus, threads in (("0,1", "2"), ("0", "1")):
         out = tmp_path / f"{threads}.h5"
-        line = ["taskset", "--cpu-list", cpus, "psfdae", "stars", "--templates", templates]
+        line = ["taskset", "--cpu-list", cpus, "psfdae", "paper", "stars", "--templates", templates]
         variables = environment(OMP_NUM_THREADS=threads)
         run = captured([*line, "--out", out, *sizes], env=variables)
         assert run.returncode == 0, run.stderr

@@ -18,7 +18,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("typed")
     words = ["--side", 200, "--bright", 5, "--faint", 5]
     words += ["--out", folder / "image.fits", "--catalogue", folder / "stars.csv"]
-    assert psfdae("example-field", *words).exit_code == 0
+    assert psfdae("example", "field", *words).exit_code == 0
     telescope = (ROOT / "config/telescope/example_zernike.yaml").read_text()
     (folder / "telescope.yaml").write_text(telescope.replace("diameter_m", "diametre_m"))
     return folder
@@ -30,14 +30,14 @@ LISTED = "image.fits --catalogue stars.csv --origin 0"
 @pytest.mark.parametrize(
     ("line", "meant"),
     [
-        ("from-star image.fits", "did you mean from-stars?"),
+        ("trian image.fits", "did you mean train?"),
         ("alignment state", "did you mean states?"),
-        ("from-stars image.fits --detct --out o", "'--detect'"),
+        ("train image.fits --detct --out o", "'--detect'"),
         (f"predict {LISTED} --flux-colum flux --out o.fits", "'--flux-column'"),
-        ("from-stars image.fits --detect --method feild --out o", "did you mean field?"),
-        ("from-stars image.fits --detect --out o snr_min=20", "calibration_stars.snr_min?"),
-        ("from-stars image.fits --detect --out o field.order=[1]", "did you mean field.orders?"),
-        ("from-stars image.fits --detect --out o methods=[gmn]", "did you mean gmm?"),
+        ("train image.fits --detect --method feild --out o", "did you mean field?"),
+        ("train image.fits --detect --out o snr_min=20", "calibration_stars.snr_min?"),
+        ("train image.fits --detect --out o field.order=[1]", "did you mean field.orders?"),
+        ("train image.fits --detect --out o methods=[gmn]", "did you mean gmm?"),
         (f"predict {LISTED} --flux-column X_IMAG --out o.fits", "did you mean X_IMAGE?"),
         ("predict imag.fits --detect --out o.fits", "did you mean image.fits?"),
         ("predict image.fits --catalogue star.csv --out o.fits", "did you mean stars.csv?"),
@@ -54,7 +54,7 @@ LISTED = "image.fits --catalogue stars.csv --origin 0"
         ("config train.lrr=1", "did you mean train.lr?"),
         ("config -m train.lr=1e-3,2e-3", "snakemake sweep --config sweep=NAME"),
         ("config --multirun", "snakemake sweep --config sweep=NAME"),
-        ("config --cfg job", "psfdae config OVERRIDES"),
+        ("config --cfg job", "psfdae paper config OVERRIDES"),
     ],
 )
 def test_a_mistyped_word_of_a_command_is_answered_with_the_one_meant(

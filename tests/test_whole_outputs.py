@@ -23,7 +23,7 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import Stars
 from psfdae.base import files
-from psfdae.commands import from_stars, photometry, predict, wavefront
+from psfdae.commands import photometry, predict, train, wavefront
 from psfdae.commands.cli import main
 from psfdae.image.errors import ObservationError
 from psfdae.image.tables import write_table
@@ -136,14 +136,14 @@ def inputs(tmp_path_factory):
     words = ("--catalogue", folder / "i.csv", "--origin", 0, "--method", "field")
     settings = ("framing.stamp_px=12", "field.orders=[0]", "field.modes=8")
     with few_draws(), pytest.MonkeyPatch.context() as patch:
-        printed("from-stars", folder / "i.fits", *words, *settings, "--out", folder / "model")
+        printed("train", folder / "i.fits", *words, *settings, "--out", folder / "model")
         simulated = ["telescope=example_zernike", "--image-snr", 80, "grid.points=3"]
         printed("simulate", *simulated, "--out", folder / "sky")
         once(patch, photometry, "photometry_of_image")
         once(patch, predict, "open_for_model")
         once(patch, wavefront, "measure_wavefronts")
-        once(patch, from_stars, "fitted_to", "pack_model", "for_exposures", "validate")
-        patch.setattr(from_stars, "collect_stars", once_of(from_stars.collect_stars))
+        once(patch, train, "fit_method", "pack_model", "adapt_to_exposures", "validate")
+        patch.setattr(train, "collect_stars", once_of(train.collect_stars))
         yield folder
 
 
@@ -170,7 +170,7 @@ def commands(folder):
     model = ("--model", folder / "model/i.psf.safetensors")
     telescope = config_dir() / "telescope" / "example_zernike.yaml"
     sensed = ("--catalogue", folder / "sky/stars.csv", "--telescope", telescope)
-    trained = ("from-stars", image, "--method", "field", "--report", out / "p.html", *by_list)
+    trained = ("train", image, "--method", "field", "--report", out / "p.html", *by_list)
     settings = ("framing.stamp_px=12", "field.orders=[0]", "field.modes=8")
     residual = ("--residual", out / "r.fits")
     plot = ("--plot", out / "p.png", "--out", out / "a.fits")
@@ -178,23 +178,20 @@ def commands(folder):
         "photometry": ("photometry", image, *by_list, *model, *residual, "--out", out / "a.csv"),
         "predict": ("predict", image, "--detect", *model, *plot),
         "wavefront": ("wavefront", folder / "sky/image.fits", *sensed, *plot),
-        "from-stars": (*trained, "--out", out / "m", *settings),
-        "exposure": ("exposure", folder / "j.fits", "--detect", *model, "--out", out / "j"),
+        "train": (*trained, "--out", out / "m", *settings),
+        "adapt": ("adapt", folder / "j.fits", "--detect", *model, "--out", out / "j"),
         "psf": ("psf", model[1], "--at", "9,9", "--out", out / "a.fits"),
-        "night table": ("night", "table", folder / "part.csv", "--out", out / "a.csv"),
-        "example-field": (
-            *("example-field", "--side", 100, "--bright", 1, "--faint", 2, "--seed", 1),
+        "night table": ("paper", "night", "table", folder / "part.csv", "--out", out / "a.csv"),
+        "example field": (
+            *("example", "field", "--side", 100, "--bright", 1, "--faint", 2, "--seed", 1),
             *("--catalogue", out / "a.csv", "--out", out / "a.fits"),
         ),
     }
 
 
 NAMES = (
-    *("photometry", "predict", "psf", "night table", "example-field"),
-    *(
-        pytest.param(name, marks=pytest.mark.slow)
-        for name in ("from-stars", "exposure", "wavefront")
-    ),
+    *("photometry", "predict", "psf", "night table", "example field"),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("train", "adapt", "wavefront")),
 )
 
 

@@ -20,4 +20,4 @@ done
 [ ! -d results/paper ] || plan paper --config preset=paper -- psf_metrics
 
 for file in "$plans"/*; do set -- "$@" --plan "$file"; done
-psfdae reference --results results --out results/reference "$@"
+psfdae paper reference --results results --out results/reference "$@"

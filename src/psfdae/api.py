@@ -190,7 +190,7 @@ class PsfModel(StarModel):
         name: str | None = None,
         **options: Unpack[ImageKeywords],
     ) -> Self:
-        """Return this model adapted to another exposure, as `psfdae exposure` does.
+        """Return this model adapted to another exposure, as `psfdae adapt` does.
 
         The stars of the exposure show how its PSF differs from that of the model; ten may be
         enough.

@@ -25,7 +25,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     """Log the model of a run with all its files, and register one that restores single stamps.
 
     A model that is registered has a bundle among its files, which `psfdae.load_model` reads. It
-    has no errors, which take a minute to measure (`psfdae bundle`); no PSF depends on them.
+    has no errors, which take a minute to measure (`psfdae paper bundle`); no PSF depends on them.
 
     Parameters
     ----------

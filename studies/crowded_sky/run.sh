@@ -5,7 +5,7 @@ here=$(cd "$(dirname "$0")" && pwd)
 stem=crowded_$1
 sky() { python "$here/crowded_sky.py" "$@"; }
 model() {  # name
-    psfdae from-stars "$stem.fits" --catalogue "$stem.csv" --origin 0 --method field --out "$stem-$1" --overwrite
+    psfdae train "$stem.fits" --catalogue "$stem.csv" --origin 0 --method field --out "$stem-$1" --overwrite
     psfdae psf "$stem-$1/$stem.psf.safetensors" --grid 7x7 --out "$stem-$1.fits" --overwrite
 }
 sky image "$1" "$stem"

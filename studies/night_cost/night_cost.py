@@ -3,8 +3,8 @@
     python night_cost.py TABLE SIDE BRIGHT FAINT   # adds a row for eight images of SIDE × SIDE px
 
 Eight exposures of the simulated night, with so many bright and faint stars, are one job of
-`psfdae night images`. Seconds are those of the processor, of one thread; memory is the peak of the
-job, some of whose images are fitted and the others start from these.
+`psfdae paper night images`. Seconds are those of the processor, of one thread; memory is the peak
+of the job, some of whose images are fitted and the others start from these.
 """
 
 from __future__ import annotations
@@ -44,7 +44,16 @@ def main(table: Path, side_px: int, bright: int, faint: int) -> None:
         rows = folder / "rows.csv"
         pd.DataFrame(listed_images(f"{folder}/*.fits")).to_csv(rows, index=False)
         # One thread; the job's processor time and peak of memory are those of the child.
-        command = ["psfdae", "night", "images", "--rows", rows, "--folder", folder / "images"]
+        command = [
+            "psfdae",
+            "paper",
+            "night",
+            "images",
+            "--rows",
+            rows,
+            "--folder",
+            folder / "images",
+        ]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         job = subprocess.Popen([*command, "--out", folder / "out.csv"], env=environment)
         _, status, used = os.wait4(job.pid, 0)

@@ -2,7 +2,7 @@
 
 usage: faint.py IMAGE SELECTION OUT.npz [SIDE] [COPIES]
 
-SELECTION is the selection.csv that `psfdae from-stars` leaves: id, x, y (0-based), part. OUT has
+SELECTION is the selection.csv that `psfdae train` leaves: id, x, y (0-based), part. OUT has
 `noisy<S/N>` (copies, side, side) of flux FLUX without sky, `sigma<S/N>`, their noise, `truth`,
 their PSFs of sum 1, `star` (copies,), the star of each among the held-out ones, `id` and `at`
 (stars, 2), their brightest pixels (x, y), `own` (copies,), the noise of the truth. Every frame is

@@ -1,6 +1,6 @@
-"""`psfdae from-stars`, with another fifth of the stars held out: `ours.py SPLIT …`, SPLIT 0 to 4.
+"""`psfdae train`, with another fifth of the stars held out: `ours.py SPLIT …`, SPLIT 0 to 4.
 
-Everything after SPLIT is the command line of `psfdae from-stars`; with 0 it is that command.
+Everything after SPLIT is the command line of `psfdae train`; with 0 it is that command.
 """
 
 import sys

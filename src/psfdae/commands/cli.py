@@ -40,6 +40,7 @@ from psfdae.base.errors import Error, did_you_mean, install_line, missing, words
 from psfdae.base.joined import joined
 from psfdae.base.progress import displayed_by
 from psfdae.base.version import __version__
+from psfdae.commands import FORMER_NAMES
 from psfdae.commands.terminal import bar_or_lines
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -134,7 +135,7 @@ class Commands(Careful):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the words that may follow those of the group."""
-        # Commands have one, two or three words; the first ones are those of the group.
+        # Commands have up to four words; the first ones are those of the group.
         prefix = self.prefix.split()
         size = len(prefix)
         names = [name.split() for name in command_modules()]
@@ -150,7 +151,13 @@ class Commands(Careful):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is typed; UsageError names one that is like an unknown one."""
+        """Return the command that is typed; UsageError names one that is like an unknown one.
+
+        A former name works, with a line that says the new one.
+        """
+        if not self.prefix and (words := present_name(args[0])) != args[:1]:
+            click.echo(f"psfdae: {args[0]} is now psfdae {' '.join(words)}", err=True)
+            args = [*words, *args[1:]]
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -185,6 +192,22 @@ class SettingsCommand(click.Command):
     """
 
     foreign_options: Mapping[str, str]
+    field_options: Mapping[str, list[click.Parameter]]
+    """Options that are fields of a dataclass, by the heading of their group in the help."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the options of the command, then those of each dataclass below a heading."""
+        grouped = [option for options in self.field_options.values() for option in options]
+        own: list[click.Parameter] = [
+            option
+            for option in self.get_params(ctx)
+            if isinstance(option, click.Option) and option not in grouped
+        ]
+        for heading, options in {"Options": own, **self.field_options}.items():
+            records = [option.get_help_record(ctx) for option in options]
+            if rows := [record for record in records if record is not None]:
+                with formatter.section(heading):
+                    formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; `--quiet` is no parameter of its function."""
@@ -231,7 +254,7 @@ def command_modules() -> dict[str, tuple[str, str]]:
 
     They are found in the text of the modules, none of which is imported.
     """
-    # Lines such as @command("from-stars", …), perhaps with the name on the next line; then the
+    # Lines such as @command("train", …), perhaps with the name on the next line; then the
     # docstring of the function.
     pattern = re.compile(
         r'^@command\(\s*"([^"]+)".*?"""(.*?)(?:\n\n|""")', re.MULTILINE | re.DOTALL
@@ -254,7 +277,7 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
     """Return the first words of commands that this installation can run, by their heading.
 
     The packages' `SECTIONS` have the commands of each heading, and their `REQUIRED` the module
-    that a command needs; a command in no section is a stage of the paper.
+    that a command needs.
 
     Parameters
     ----------
@@ -273,10 +296,6 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
         for heading, commands in getattr(package, "SECTIONS", {}).items():
             headings.setdefault(heading, []).extend(commands)
         required |= getattr(package, "REQUIRED", {})
-    paper_words = {*words}.difference(*headings.values())
-    headings["The paper's stages"] = [word for word in words if word in paper_words]
-    # What is in no section belongs to the paper; the module "*" is that of all these commands.
-    required |= dict.fromkeys(paper_words, required.get("*", ""))
     available: dict[str, list[str]] = {}
     for heading, commands in headings.items():
         for word in commands:
@@ -284,6 +303,18 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
             if word in words and (not module or find_spec(module) is not None):
                 available.setdefault(heading, []).append(word)
     return available
+
+
+def present_name(word: str) -> list[str]:
+    """Return the words of the command that was called by a word, or still is.
+
+    The stages of the reproduction had no `paper` before their names.
+    """
+    names = {name.partition(" ")[0] for name in command_modules()}
+    stages = {name.split()[1] for name in command_modules() if name.startswith("paper ")}
+    if word not in names and word in stages:
+        return ["paper", word]
+    return FORMER_NAMES.get(word, word).split()
 
 
 @cache
@@ -309,13 +340,16 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     # Parameters of the function are options; a dataclass has an option for each of its fields.
     help_text, meanings = described_parameters(function)
     dataclasses: dict[str, Any] = {}
+    field_options: dict[str, list[click.Parameter]] = {}
     parameters: list[click.Parameter] = []
     for name, hint, default in _parameters(function):
         if name == "config":
             continue
         if is_dataclass(hint):
             dataclasses[name] = hint
-            parameters += [_option(*field) for field in _parameters(hint)]
+            heading = cleandoc(hint.__doc__ or "").partition(";")[0].partition(".")[0]
+            field_options[heading] = [_option(*field) for field in _parameters(hint)]
+            parameters += field_options[heading]
         else:
             parameters.append(_option(name, hint, default, meanings.get(name)))
     # A parameter `config` comes from a file, or from words group.key=value.
@@ -323,7 +357,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     if read_settings is not None:
         path = click.Path(path_type=Path, dir_okay=False)
         file_help = "Settings as the workflow writes them, instead of overrides."
-        parameters.append(click.Option(["--config", "settings"], type=path, help=file_help))
+        parameters.append(click.Option(["--settings", "--config"], type=path, help=file_help))
         if not any(p.nargs == -1 for p in parameters):
             parameters.append(click.Argument(["overrides"], nargs=-1))
     quiet_help = "Print neither progress nor summary."
@@ -335,7 +369,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         if read_settings is not None:
             file, overrides = values.pop("settings"), _settings(parameters, values)
             if file is not None and overrides:
-                raise click.UsageError("--config and overrides exclude each other")
+                raise click.UsageError("--settings and overrides exclude each other")
             config["config"] = read_settings(values, file, overrides)
         # Options of a dataclass become one value again.
         for name, dataclass_type in dataclasses.items():
@@ -346,6 +380,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     # The last word is the command's own; the others are those of its groups.
     word = spec.name.split()[-1]
     click_command = SettingsCommand(word, callback=run, params=parameters, help=help_text)
+    click_command.field_options = field_options
     click_command.foreign_options = getattr(spec.settings, "foreign_options", {})
     return click_command
 

@@ -297,7 +297,7 @@ class StarModel(FieldPsfs):
         """Return the method as one that knows the PSF at every place of the field."""
         field = self.method
         if not field.knows_field:
-            training = call("psfdae.fit with method='field'", "psfdae from-stars --method field")
+            training = call("psfdae.fit with method='field'", "psfdae train --method field")
             raise PredictionError(
                 f"the model {self.name!r}: {field.look.title}: knows the PSF of a star alone, "
                 f"not that of a place; {training} makes one that does"
@@ -364,7 +364,7 @@ class StarModel(FieldPsfs):
             If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
         """
         model_scale = self.info.pixel_scale_arcsec
-        advice = f"; {call('psfdae.fit', 'psfdae from-stars')} trains one on an image of yours"
+        advice = f"; {call('psfdae.fit', 'psfdae train')} trains one on an image of yours"
         if pixel_scale_arcsec is None:
             raise PredictionError(
                 f"{source}: neither a WCS nor the header gives the pixel scale; "

@@ -46,10 +46,13 @@ def detect(image: Image, threshold: float = 5.0, **options: Unpack[PixelKeywords
     >>> len(detected), detected.colnames
     (36, ['id', 'x', 'y', 'flux_iso', 'background'])
     """
+    return find_stars(ImageInput.of(image, {**options, "detect": threshold}))
+
+
+def find_stars(source: ImageInput) -> QTable:
+    """Return the table of `detect` for an image with its options, of which `detect` is set."""
     # Stamps are not needed here: the least side that an image may have.
-    observation = open_observation(
-        ImageInput.of(image, {**options, "detect": threshold}), stamp_px=8
-    )
+    observation = open_observation(source, stamp_px=8)
     assert observation.detections is not None
     stars = observation.detections.table
     # SExtractor's X_IMAGE counts from 1.

@@ -93,7 +93,7 @@ class FieldMixture(FieldLaw, Method):
         if data.bright is None:
             raise FitError(
                 "it learns from the bright stars of an image: "
-                + call("psfdae.Stars.from_image", "psfdae from-stars")
+                + call("psfdae.Stars.from_image", "psfdae train")
             )
         # The field is fitted in frames with a margin, so that residuals can be moved by 2 px.
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]

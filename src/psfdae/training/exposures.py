@@ -22,7 +22,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.psf.interface import PredictionError
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.training.packing import checksum
-from psfdae.training.settings import make_settings
+from psfdae.training.settings import Settings, make_settings
 from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 from psfdae.training.stars import ImageStars
 
@@ -70,16 +70,7 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
             f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
             "exposure it was trained on"
         )
-    # The settings by which the stars of the training were chosen.
-    try:
-        training_config = info.config["stars"]
-        settings = make_settings(
-            {key: training_config[key] for key in ("calibration_stars", "framing")}
-        )
-    except (KeyError, TypeError):
-        raise PredictionError(
-            f"the model {model.name!r} does not say how its stars were chosen"
-        ) from None
+    settings = read_training_settings(model)
     # Its bright stars, chosen as those of the training, but few are enough.
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
@@ -105,6 +96,25 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     warn(warnings)
     lines = [*observation.remarks, *filter(None, [offset_note]), *warnings, sentence]
     return _adapt(model, observation, bright, name), "\n".join(lines)
+
+
+def read_training_settings(model: StarModel) -> Settings:
+    """Return the settings by which the training stars of a model were chosen.
+
+    Raises
+    ------
+    PredictionError
+        If the model does not have them, because its training stars were simulated.
+    """
+    try:
+        training_config = model.info.config["stars"]
+        return make_settings(
+            {key: training_config[key] for key in ("seed", "calibration_stars", "framing", "parts")}
+        )
+    except (KeyError, TypeError):
+        raise PredictionError(
+            f"the model {model.name!r} does not say how its stars were chosen"
+        ) from None
 
 
 def note_empty_quarters(low: np.ndarray, high: np.ndarray, position: np.ndarray) -> list[str]:

@@ -42,7 +42,7 @@ class Groups:
             "several values are a sweep: name them in a file config/sweep/NAME.yaml, then "
             "snakemake sweep --config sweep=NAME (docs/sweeps.md)",
         ),
-        "--cfg": "psfdae config OVERRIDES prints the composed configuration",
+        "--cfg": "psfdae paper config OVERRIDES prints the composed configuration",
     }
 
     def names(self, options: Mapping[str, Any]) -> tuple[str, ...]:
@@ -98,16 +98,16 @@ def command(
 ) -> Callable[[Function], Function]:
     """Make a function the command `name`; its `config` has groups of the configuration.
 
-    See `psfdae.commands.cli.command`, and `Groups` for `reads`. Those of "alignment …" are for
-    scene 3 alone, and choose its dataset.
+    See `psfdae.commands.cli.command`, and `Groups` for `reads`. Those of "paper alignment …" are
+    for scene 3 alone, and choose its dataset.
 
     Parameters
     ----------
     name : str
-        Up to three words, such as "alignment figure stamps".
+        Up to four words, such as "paper alignment figure stamps".
     reads : tuple of str, or callable
         Groups that the function gets as `config`; none if it has no such parameter.
     """
-    choice = ("dataset=alignment",) if name.startswith("alignment ") else ()
+    choice = ("dataset=alignment",) if name.startswith("paper alignment ") else ()
     # The command line calls `Groups` with the options, the file and the words that are left.
     return cli.command(name, Groups(reads, choice))

@@ -416,7 +416,7 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     if missing and _is_alignment(tree):
         raise ConfigError(
             "dataset = alignment: scene 3 has no simulated stars, which are needed here; "
-            "its commands are `psfdae alignment …`, its target is scene3"
+            "its commands are `psfdae paper alignment …`, its target is scene3"
         )
     if missing:
         raise ConfigError(f"{missing[0]}: missing")

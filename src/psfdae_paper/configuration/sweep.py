@@ -150,8 +150,9 @@ class Axis(Group):
 class Sweep(Group):
     """Points of one model that are trained alike and compared by one metric.
 
-    It is a file `config/sweep/NAME.yaml`. `psfdae sweep list NAME` prints its points, the target
-    `sweep` of the workflow trains and compares them, and `psfdae best NAME` prints the best one.
+    It is a file `config/sweep/NAME.yaml`. `psfdae paper sweep list NAME` prints its points, the
+    target `sweep` of the workflow trains and compares them, and `psfdae paper best NAME` prints the
+    best one.
     """
 
     # What is trained, and on which data.

@@ -44,7 +44,7 @@ StatesFile = Annotated[File, "Product of `alignment states`."]
 TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-@command("alignment model", reads=("telescope", "prescription", "alignment"))
+@command("paper alignment model", reads=("telescope", "prescription", "alignment"))
 def model(config: Config, out: File) -> None:
     """Fit the quadratic model to few ray-traced states, verify it on the grid.
 
@@ -145,7 +145,7 @@ def read_states(
     return product
 
 
-@command("alignment states", reads=Alignment.state_groups)
+@command("paper alignment states", reads=Alignment.state_groups)
 def states(
     config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
@@ -220,7 +220,7 @@ def _geometry(config: Config) -> dict[str, Column]:
     }
 
 
-@command("alignment telescope", reads=("telescope", "alignment"))
+@command("paper alignment telescope", reads=("telescope", "alignment"))
 def telescope(config: Config, model: ModelFile, grid: File, uniform: File, out: File) -> None:
     """Tabulate key figures of telescope, model and stamps.
 

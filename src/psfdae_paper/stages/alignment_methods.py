@@ -63,7 +63,7 @@ Trained = Annotated[Folder, "Folder for weights, config and history."]
 DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 
 
-@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"))
+@command("paper alignment train-dae", reads=("seed", "noise", "dae", "dae_train"))
 def train_dae(
     config: Config, grid: File, train: File, checkpoint: Checkpoint, out: Trained
 ) -> None:
@@ -125,7 +125,7 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-network", reads=network_groups)
+@command("paper alignment train-network", reads=network_groups)
 def train_network(
     config: Config,
     kind: Annotated[str, click.Choice(trained_networks())],
@@ -350,7 +350,7 @@ def network_predictor(
     return partial(predict_states, model, mirrors=mirrors)
 
 
-@command("alignment estimate", reads=("seed", "noise", "evaluation"))
+@command("paper alignment estimate", reads=("seed", "noise", "evaluation"))
 def estimate(
     config: Config,
     test_set: TestSet,
@@ -433,7 +433,7 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
 
 
 @command(
-    "alignment fit",
+    "paper alignment fit",
     reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
 )
 def fit_alignment_method(
@@ -541,7 +541,7 @@ def fit_alignment_method(
     _write_times(times, rows)
 
 
-@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"))
+@command("paper alignment bound", reads=("telescope", "alignment", "optics", "noise"))
 def bound(
     config: Config, test_set: TestSet, states: StatesFile, model: ModelFile, out: File
 ) -> None:

@@ -179,7 +179,7 @@ def _require_states(product: Product, reference: Product) -> None:
     raise ProductError(f"{product.path}: {difference}")
 
 
-@command("alignment tables")
+@command("paper alignment tables")
 def tables(
     states: StatesFile,
     estimates: Estimates,
@@ -236,7 +236,7 @@ def tables(
         write_csv(path, frame)
 
 
-@command("alignment paper-tables")
+@command("paper alignment paper-tables")
 def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Folder) -> None:
     """Set measured errors beside the paper's tables.
 
@@ -275,7 +275,7 @@ def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Fol
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
 
-@command("alignment time-table")
+@command("paper alignment time-table")
 def time_table(
     times: tuple[File, ...],
     histories: Annotated[tuple[str, ...], {"flag": "--history", "metavar": "NAME=FILE"}],
@@ -316,7 +316,7 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"))
+@command("paper alignment figure stamps", reads=("seed", "noise", "evaluation"))
 def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
@@ -341,7 +341,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     write_png(alignment_figures.stamp_rows(rows, titles), out)
 
 
-@command("alignment figure predicted")
+@command("paper alignment figure predicted")
 def predicted(
     estimates: File, fits: Annotated[tuple[File, ...], {"flag": "--fit"}], out: Png
 ) -> None:
@@ -368,7 +368,7 @@ def predicted(
     write_png(alignment_figures.predicted_against_true(truth, by_method), out)
 
 
-@command("alignment figure errors")
+@command("paper alignment figure errors")
 def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     """Draw errors against the size of the misalignment, with the Cramér-Rao bound.
 
@@ -393,7 +393,8 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 
 
 @command(
-    "alignment figure twin", reads=("telescope", "prescription", "alignment", "optics", "noise")
+    "paper alignment figure twin",
+    reads=("telescope", "prescription", "alignment", "optics", "noise"),
 )
 def twin(config: Config, table: File, out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.
@@ -471,7 +472,7 @@ def _stamps_of_multiples(
     return state, operator(tracer(multiples[:, None] * state))[0]
 
 
-@command("alignment figure correlation")
+@command("paper alignment figure correlation")
 def correlation(correlation: ErrorTable, out: Png) -> None:
     """Draw measured and predicted correlations of errors beside the paper's.
 

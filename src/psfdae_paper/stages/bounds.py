@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from psfdae_paper.methods.wavefront import Wavefront
 
 
-@command("bank", reads=(*SIMULATION, "bounds"))
+@command("paper bank", reads=(*SIMULATION, "bounds"))
 def bank(config: Config, out: File) -> None:
     """Simulate the bank of fresh stars behind the posterior mean.
 
@@ -71,7 +71,7 @@ def bank(config: Config, out: File) -> None:
     write_product(out, "bank", columns, config.model_dump())
 
 
-@command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
+@command("paper bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
 def bounds(
     config: Config,
     dataset: str,
@@ -146,7 +146,7 @@ def bounds(
     write_parquet(per_star, pd.concat(bound.per_star, ignore_index=True))
 
 
-@command("optics", reads=(*SIMULATION, "noise", "parts", "bounds", "evaluation"))
+@command("paper optics", reads=(*SIMULATION, "noise", "parts", "bounds", "evaluation"))
 def optics(
     config: Config, dataset: str, stars: File, bank: File, per_star: File, out: File
 ) -> None:
@@ -205,7 +205,7 @@ def optics(
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
 
-@command("collect-bounds")
+@command("paper collect-bounds")
 def collect_bounds(out: File, parts: Annotated[tuple[File, ...], {"argument": True}]) -> None:
     """Join the tables of several datasets' bounds; all must have the columns of the first.
 
@@ -219,7 +219,7 @@ def collect_bounds(out: File, parts: Annotated[tuple[File, ...], {"argument": Tr
     write_csv(out, read_tables(parts))
 
 
-@command("efficiency")
+@command("paper efficiency")
 def efficiency(
     bounds: tuple[File, ...],
     bounds_per_star: tuple[File, ...],
@@ -272,7 +272,7 @@ def efficiency(
     write_csv(out, pd.DataFrame(rows).drop(columns="split"))
 
 
-@command("paper-rows")
+@command("paper paper-rows")
 def paper_rows_table(bounds: File, efficiency: File, out: File) -> None:
     """Set the paper's errors beside the posterior mean of the simulated scenes.
 

@@ -41,7 +41,7 @@ SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
 
 
-@command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
+@command("paper bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
 def bundle(
     config: Config,
     stars: File,
@@ -122,7 +122,9 @@ def _fit_config(
     # Files that the fit consists of.
     for path in fits.own_files(method_class, place):
         if not path.is_file():
-            raise BundleError(f"{path}: no such file; psfdae fit {method_class.name} writes it")
+            raise BundleError(
+                f"{path}: no such file; psfdae paper fit {method_class.name} writes it"
+            )
     # A fit is a folder or one file.
     path = place / CONFIG if place.is_dir() else place
     fit_config = method_class.described(place)
@@ -140,7 +142,7 @@ def _fit_config(
     return fit_config
 
 
-@command("ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
+@command("paper ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
 def ship(config: Config, bundle: tuple[File, ...], stars: File, out: Folder) -> None:
     """Make the bundle with the smallest error on validation stars the package's bundle.
 

@@ -41,7 +41,7 @@ from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 
-@command("scan", reads=(*SIMULATION, "noise", "calibration"))
+@command("paper scan", reads=(*SIMULATION, "noise", "calibration"))
 def scan(config: Config, dataset: str, out: File) -> None:
     """Scan parameters that the paper does not state against its original-noise rows.
 
@@ -192,7 +192,7 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
     return NoiseModel(kappa, background).draw(images, level, rng)
 
 
-@command("calibrate", reads=("seed", "noise", "evaluation"))
+@command("paper calibrate", reads=("seed", "noise", "evaluation"))
 def calibrate(
     config: Config,
     scans: Annotated[tuple[File, ...], {"flag": "--scan"}],

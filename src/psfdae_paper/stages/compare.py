@@ -55,7 +55,7 @@ class Run:
     errors: pd.DataFrame
 
 
-@command("compare")
+@command("paper compare")
 def compare(
     runs: Annotated[tuple[Folder, ...], {"argument": True}], out: File | None = None
 ) -> None:

@@ -16,7 +16,7 @@ from psfdae_paper.configuration.command import Groups, command
 from psfdae_paper.configuration.compose import load, load_stage
 
 
-@command("config")
+@command("paper config")
 def config(
     overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
     only: Annotated[str | None, {"flag": "--stage"}] = None,

@@ -55,17 +55,18 @@ else:
                 method_class.name,
                 Annotated[
                     (Folder if method_class.storage.files else File) | None,
-                    f"Result of `psfdae fit {method_class.name}`.",
+                    f"Result of `psfdae paper fit {method_class.name}`.",
                 ],
                 None,
             )
             for method_class in registered()
             if method_class.storage
         ],
+        namespace={"__doc__": "Fits of the methods."},
     )
 
 
-@command("evaluate", reads=READS)
+@command("paper evaluate", reads=READS)
 def evaluate(
     config: Config,
     dataset: str,
@@ -203,7 +204,7 @@ Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]
 
 
-@command("collect")
+@command("paper collect")
 def collect(evaluations: Evaluations, out: File) -> None:
     """Join evaluations into one tidy table, with the scatter of each method between seeds.
 
@@ -224,7 +225,7 @@ def collect(evaluations: Evaluations, out: File) -> None:
     write_csv(out, table[[*MeasuredStars.columns[:-1], "seed_stderr", "n"]])
 
 
-@command("held-out")
+@command("paper held-out")
 def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: File) -> None:
     """Compare errors in held-out fields with those in training fields, star by star.
 
@@ -244,7 +245,7 @@ def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: Fil
     write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
 
 
-@command("paper-tables")
+@command("paper paper-tables")
 def paper_tables(
     dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:

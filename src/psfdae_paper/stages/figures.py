@@ -37,7 +37,7 @@ Bounds = Annotated[File, "CSV of the stage bounds."]
 Efficiency = Annotated[File, "CSV of the stage efficiency."]
 
 
-@command("figure templates")
+@command("paper figure templates")
 def figure_templates(templates: Templates, out: Png) -> None:
     """Draw the static PSFs at their field positions, without the margin for centring errors.
 
@@ -52,7 +52,7 @@ def figure_templates(templates: Templates, out: Png) -> None:
     write_png(template_map(psf, product["grid"], product["field"], title), out)
 
 
-@command("figure energy")
+@command("paper figure energy")
 def figure_energy(templates: Templates, out: Png) -> None:
     """Draw the light inside the stamp over the field."""
     product = read_product(templates, "templates", ("energy", "grid", "field"))
@@ -60,7 +60,7 @@ def figure_energy(templates: Templates, out: Png) -> None:
     write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
 
 
-@command("figure strip")
+@command("paper figure strip")
 def figure_strip(
     restored: Restored,
     levels: Annotated[tuple[Annotated[float, AboveZero], ...], {"flag": "--level"}],
@@ -97,7 +97,7 @@ def figure_strip(
     write_png(restoration_strip(rows, columns, title), out)
 
 
-@command("figure headline")
+@command("paper figure headline")
 def figure_headline(
     restored: Restored,
     level: Annotated[float, AboveZero],
@@ -176,7 +176,7 @@ def restored_rows(
     return rows
 
 
-@command("figure curves")
+@command("paper figure curves")
 def figure_curves(
     labels: Annotated[tuple[str, ...], {"flag": "--label"}],
     histories: Annotated[tuple[File, ...], {"argument": True}],
@@ -203,7 +203,7 @@ def figure_curves(
     write_png(curves.training_curves(tables, "Training of the denoising autoencoders"), out)
 
 
-@command("figure errors")
+@command("paper figure errors")
 def figure_errors(
     dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:
@@ -227,20 +227,20 @@ def figure_errors(
         write_png(curves.error_against_noise(metrics, published("psf"), dataset, metric), path)
 
 
-@command("figure bounds")
+@command("paper figure bounds")
 def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' errors above the bounds, against the noise level."""
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
     write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
 
 
-@command("figure efficiency")
+@command("paper figure efficiency")
 def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' efficiency against the noise level."""
     write_png(bound_figures.efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
 
 
-@command("figure bank-growth")
+@command("paper figure bank-growth")
 def figure_bank_growth(dataset: DatasetName, growth: File, out: Png) -> None:
     """Draw the posterior mean's error against the size of the bank.
 

@@ -38,7 +38,7 @@ def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
     return groups_of(name) if name else ("seed", "noise", "parts", *all_groups())
 
 
-@command("fit", reads=groups_read)
+@command("paper fit", reads=groups_read)
 def fit(
     config: Config,
     name: Annotated[str, {"argument": True, "metavar": "METHOD"}],

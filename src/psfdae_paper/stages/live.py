@@ -1,8 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
 A training logs where the environment asks for it (`psfdae.methods.networks.training.listener`).
-Its run lasts until `psfdae track` imports the finished one. The path of a checkpoint goes in, which
-says whose training it is, and a function of the rows of the history comes out.
+Its run lasts until `psfdae paper track` imports the finished one. The path of a checkpoint goes in,
+which says whose training it is, and a function of the rows of the history comes out.
 """
 
 from __future__ import annotations

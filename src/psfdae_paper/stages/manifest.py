@@ -9,7 +9,7 @@ from psfdae.base.options import Folder
 from psfdae_paper.configuration.command import command
 
 
-@command("manifest")
+@command("paper manifest")
 def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
     """Write the checksums of a run to SHA256SUMS.
 

@@ -96,7 +96,7 @@ def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
     return [{str(name): text for name, text in row.items()} for row in table.to_dict("records")]
 
 
-@command("night images")
+@command("paper night images")
 def night_images(rows: File, folder: Folder, out: File) -> None:
     """Model images that follow each other in time, and measure all of their stars.
 
@@ -152,7 +152,7 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
     write_csv(out, DataFrame(list(results.values())))
 
 
-@command("night table")
+@command("paper night table")
 def night_table(
     parts: Annotated[tuple[File, ...], {"argument": True}],
     out: File,
@@ -182,7 +182,7 @@ def night_table(
     write_table(out.with_suffix(".ecsv"), table)
 
 
-@command("night page")
+@command("paper night page")
 def write_night_page(table: File, folder: Folder, out: File) -> None:
     """Draw what an observer wants to know in the morning: bad images, and how the PSF moved.
 
@@ -211,7 +211,7 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
     write_text(out, night_page(night, psfs, links))
 
 
-@command("night count")
+@command("paper night count")
 def night_count(table: Annotated[File, {"argument": True}]) -> None:
     """Print how many images are good, poor and failed; refuse a night without any model.
 

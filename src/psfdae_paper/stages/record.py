@@ -39,7 +39,7 @@ MAY_STAY = re.compile(r"(sweeps|paper)/.+")
 """Names of products that may stay from an earlier record: they take too long for every record."""
 
 
-@command("runtime")
+@command("paper runtime")
 def runtime(results: Folder, out: File) -> None:
     """Collect wall time, CPU time and memory of a run's jobs.
 
@@ -93,7 +93,7 @@ def _last_run(benchmark: Path) -> pd.Series[float]:
     return read_table(benchmark, "s", "max_rss", sep="\t", na_values=["-"]).iloc[-1]
 
 
-@command("reference")
+@command("paper reference")
 def reference(
     results: Folder, out: Folder, plans: Annotated[tuple[File, ...], {"flag": "--plan"}]
 ) -> None:

@@ -127,7 +127,7 @@ def simulate(
     print(f"{folder}: {', '.join(names)}")
 
 
-@command("figure telescope")
+@command("paper figure telescope")
 def figure_telescope(templates: File, table: File, out: File) -> None:
     """Draw the static PSFs of a telescope with their light and their width, and tabulate them.
 
@@ -360,7 +360,7 @@ def write_image(
     )
 
 
-@command("example-field")
+@command("example field")
 def write_example_field(
     catalogue: File,
     seed: Annotated[int, click.IntRange(min=0)] = 1,
@@ -428,7 +428,7 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     return field
 
 
-@command("example-night")
+@command("example night")
 def example_night(
     out: Folder,
     seed: Annotated[int, click.IntRange(min=0)] = 1,

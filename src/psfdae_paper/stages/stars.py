@@ -27,7 +27,7 @@ STARS_AT_A_TIME = 1024
 """Stars that are propagated before they are written; they limit the memory."""
 
 
-@command("templates", reads=STATIC)
+@command("paper templates", reads=STATIC)
 def templates(config: Config, out: File) -> None:
     """Propagate the static PSF of every field point.
 
@@ -67,7 +67,7 @@ def templates(config: Config, out: File) -> None:
     write_product(out, "templates", columns, config.model_dump())
 
 
-@command("stars", reads=SIMULATION)
+@command("paper stars", reads=SIMULATION)
 def stars(config: Config, templates: File, out: File) -> None:
     """Simulate noise-free stars with random aberrations.
 

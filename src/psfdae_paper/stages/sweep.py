@@ -68,7 +68,7 @@ class Trial:
 Overrides = Annotated[tuple[str, ...], {"argument": True}]
 
 
-@command("sweep list")
+@command("paper sweep list")
 def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = ()) -> None:
     """List the points of a sweep as tab-separated text, without running it.
 
@@ -80,7 +80,7 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
         print("\t".join([entry.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
 
 
-@command("sweep point")
+@command("paper sweep point")
 def sweep_point(
     name: Annotated[str, {"argument": True}],
     data: tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
@@ -91,7 +91,8 @@ def sweep_point(
     """Train one point of a sweep and measure it.
 
     A point is named by the hash of all that decides its result, and found by the name of OUT; give
-    the overrides with which the sweep was planned. `psfdae sweep list NAME` prints the points.
+    the overrides with which the sweep was planned. `psfdae paper sweep list NAME` prints the
+    points.
 
     The folder gets result.json with metrics and settings, cost.json with seconds, tables of errors,
     and the files of the model. A training that fails is a result, too.

@@ -25,7 +25,7 @@ from psfdae_paper.sweeps.measured import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
 
 
-@command("sweep summary")
+@command("paper sweep summary")
 def sweep_summary(
     name: Annotated[str, {"argument": True}],
     points: Folder,
@@ -36,7 +36,7 @@ def sweep_summary(
 
     All points must be finished; one that failed has a row with the reason.
 
-    best.yaml has the best point as overrides, as `psfdae best` prints them.
+    best.yaml has the best point as overrides, as `psfdae paper best` prints them.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ def sweep_summary(
     summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
 
 
-@command("best")
+@command("paper best")
 def best(name: Annotated[str, {"argument": True}], results: Folder = Path("results")) -> None:
-    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae best NAME)".
+    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae paper best NAME)".
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def best_overrides(results: Path, name: str) -> list[str]:
     return [str(override) for override in overrides]
 
 
-@command("sweep figure")
+@command("paper sweep figure")
 def sweep_figure(
     kind: Annotated[Literal["parallel", "response"], {"argument": True}],
     definition: File,

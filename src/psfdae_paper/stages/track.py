@@ -55,7 +55,7 @@ class TrackingError(Error, RuntimeError):
     """The MLflow database cannot be used."""
 
 
-@command("track")
+@command("paper track")
 def track(
     results: Folder,
     preset: str,

@@ -1,4 +1,4 @@
-"""Command `from-stars`: train a PSF model on the bright stars of an image, in one call."""
+"""Command `train`: train a PSF model on the bright stars of an image, in one call."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ class ModelFiles:
         return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
 
 
-@command("from-stars", SettingsReader())
-def from_stars(
+@command("train", SettingsReader())
+def train_command(
     config: Settings | Mapping[str, Any],
     image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
     options: ImageOptions,
@@ -182,7 +182,7 @@ def from_stars(
             }
             for extension, image_options in options_by_image(image[0], options).items()
         }
-        run_for_images(from_stars, jobs, image[0])
+        run_for_images(train_command, jobs, image[0])
     else:
         # One image, or exposures that share a model; the same is stated of all.
         sources = ImageInput(image[0], **vars(options)).of_each(image)
@@ -208,7 +208,7 @@ def next_command(
 ) -> str:
     """Return the command that applies the model to all stars of the image, or first exposure.
 
-    Parameters are those of `from_stars`.
+    Parameters are those of `train_command`.
     """
     # A list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
@@ -328,7 +328,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise FolderError(f"{folder}: another psfdae from-stars works there") from None
+            raise FolderError(f"{folder}: another psfdae train works there") from None
         yield
     finally:
         # A folder with files in it is no empty one, and stays.

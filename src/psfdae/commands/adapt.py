@@ -1,4 +1,4 @@
-"""Command `exposure`: adapt a field model to another exposure by its own bright stars."""
+"""Command `adapt`: adapt a field model to another exposure by its own bright stars."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.training.exposures import exposure as adapt_to_exposure
 
 
-@command("exposure")
-def exposure_command(
+@command("adapt")
+def adapt_command(
     image: Annotated[File, {"argument": True}],
     options: ImageOptions,
     overwrite: bool = False,
