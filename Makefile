@@ -110,10 +110,10 @@ reproduce: env ## Build everything of the preset: datasets, models, tables, repo
 	@case "$$TRACK" in '') ;; live) export PSFDAE_EPOCHS=psfdae_paper.stages.live:logger ;; \
 	    *) echo "TRACK=$$TRACK: live, or nothing"; exit 2;; esac; \
 	  $(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
-	@psfdae manifest "$$PSFDAE_RESULTS"
+	@psfdae paper manifest "$$PSFDAE_RESULTS"
 	@$(MAKE) --no-print-directory report
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
-	  psfdae compare results results/reference || true
+	  psfdae paper compare results results/reference || true
 	@show() { [ ! -e "$$1" ] || printf '  %-36s %s\n' "$${3:-$$1}" "$$2"; }; \
 	  mlflow="make mlflow"; [ "$$PSFDAE_RESULTS" = results ] || mlflow="$$mlflow RESULTS=$$PSFDAE_RESULTS"; \
 	  echo "To open:"; \

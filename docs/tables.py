@@ -37,7 +37,12 @@ from psfdae.methods import all_methods
 from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose
-from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
+from psfdae_paper.evaluation.comparison import (
+    FIT_KEYS,
+    SIGNIFICANT,
+    add_seed_stderr,
+    read_seed_scatter,
+)
 from psfdae_paper.stars.example import FieldRecipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,8 +51,8 @@ MARK = re.compile(r"<!--n:(?P<key>\w+)-->(?P<line>\n?)(?P<old>(?:(?!<!--).)*)<!-
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
 ALIGNERS = {
-    name: aligner.look.label
-    for name, aligner in aligners.ALIGNERS.items()
+    name: estimator.look.label
+    for name, estimator in aligners.ESTIMATORS.items()
     if name != "cramer_rao_pooled"
 }
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
@@ -193,7 +198,7 @@ def config(*overrides):
 
 
 def field_recipe():
-    """What the image of `psfdae example-field` shows."""
+    """What the image of `psfdae example field` shows."""
     return vars(FieldRecipe())
 
 
@@ -453,7 +458,7 @@ def _in_1e5(row):
 
 def seeds():
     """Relative scatter of the MSE between seeds of every method, by dataset and reference."""
-    table = pd.Series(seed_scatter()).rename_axis(FITTED).unstack()
+    table = pd.Series(read_seed_scatter()).rename_axis(FIT_KEYS).unstack()
     return table.reset_index().sort_values(["dataset", "reference"])
 
 
@@ -468,7 +473,7 @@ def costs():
 def errors(name="tables/psf_metrics.csv"):
     """MSE of every method, with its scatter between seeds (`…_sd`)."""
     keys = ["dataset", "split", "reference", "noise_level"]
-    rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
+    rows = add_seed_stderr(csv(name).query("metric == 'mse'"), read_seed_scatter())
     mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
     table = mse.join(sd.add_suffix("_sd")).reset_index()
     return table.sort_values(keys, ascending=[True, False, True, True])

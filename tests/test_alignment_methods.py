@@ -12,18 +12,18 @@ from psfdae_paper.alignment.emulator import StampEmulator
 from psfdae_paper.alignment.likelihood import (
     StateLikelihood,
     StateOptics,
-    bound_covariances,
-    deviance_and_information,
-    expected_abs_error,
+    compute_bounds,
+    compute_deviance,
+    compute_mean_abs_error,
     refit_twins,
 )
 from psfdae_paper.alignment.networks import (
     AlignmentCnn,
     NetworkTraining,
     TrainingStates,
+    make_training,
     predict_states,
     scale_stamps,
-    training_of,
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
@@ -99,7 +99,7 @@ def _training(scene3, epochs, data, seed=3, network=CNN):
     settings = defaults.model_copy(
         update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
     )
-    return training_of(network, TrainingStates(states, stamps), settings, seed, "test")
+    return make_training(network, TrainingStates(states, stamps), settings, seed, "test")
 
 
 def _train(path, *arguments, report=lambda row: None):
@@ -182,7 +182,7 @@ def test_components_are_those_of_mirrored_noisy_stamps(scene3, noise, stamps, st
     level = 0.005
     draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
     for data in (TrainingStates(states, draws), TrainingStates(states, stamps, noise, [level])):
-        training = training_of(network, data, settings, 1, "x")
+        training = make_training(network, data, settings, 1, "x")
         scaled = scale_stamps(np.asarray(stamps, np.float32))
         parts = training.parts[0].sum(axis=1)
         assert parts == pytest.approx(training.model.components(scaled).numpy(), abs=1e-3)
@@ -200,7 +200,7 @@ def test_components_are_those_of_mirrored_noisy_stamps(scene3, noise, stamps, st
 def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     state = np.array([[0.3, -0.5, 0.4, 0.2]])
     stamps, slopes = StateOptics(model, exact_operator)(state)
-    _, _, fisher = deviance_and_information(noise, 0.002, stamps, stamps, slopes)
+    _, _, fisher = compute_deviance(noise, 0.002, stamps, stamps, slopes)
     step = 1e-4
     plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
     slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
@@ -213,7 +213,7 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 ):
     """More decentre along x is hidden by less tilt about y, along y by more tilt about x."""
     optics = StateOptics(model, operator)
-    bounds = bound_covariances(optics, noise, [0.002], states, [False])[0, 0]
+    bounds = compute_bounds(optics, noise, [0.002], states, [False])[0, 0]
     sigma = np.sqrt(np.diagonal(bounds, axis1=1, axis2=2))
     matrix = (bounds / (sigma[:, :, None] * sigma[:, None, :])).mean(axis=0)
     assert -0.9 < matrix[0, 3] < -0.6
@@ -226,14 +226,14 @@ def test_noise_free_parameters_are_recovered(model, scene3, noise, movable):
     """The start is 0.08 of the range aside; with flux and place unknown, they are found, too."""
     optics = StateOptics(model, _optics(scene3, movable, "complex128"))
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
-    parameters = optics.parameters_of(truth)
+    parameters = optics.to_parameters(truth)
     parameters[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, parameters[:, 4:].shape)
     images, _ = optics(parameters)
     flux = 1 + parameters[:, 4::3] if movable else np.ones((2, 9))
     assert images.sum(axis=(2, 3)) == pytest.approx(flux)
     likelihood = StateLikelihood(optics, noise, 0.002, images)
     settings = scene3.fit.model_copy(update={"iterations": 25, "tolerance": 1e-7})
-    fit = likelihood.maximise(optics.parameters_of(truth + 0.08), settings)
+    fit = likelihood.maximise(optics.to_parameters(truth + 0.08), settings)
     assert fit.converged.all()
     assert fit.parameters == pytest.approx(parameters, abs=1e-6)
     assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
@@ -246,9 +246,9 @@ def test_scatter_of_the_fit_is_the_bound(model, scene3, noise, states, stamps, m
     level, truth = 2e-4, states[:20]
     images = noise.draw(stamps[:20], level, np.random.default_rng(7))
     fit = StateLikelihood(optics, noise, level, images).maximise(
-        optics.parameters_of(truth + 0.01), scene3.fit
+        optics.to_parameters(truth + 0.01), scene3.fit
     )
-    covariances = bound_covariances(optics, noise, [level], truth, [movable])[0, 0]
+    covariances = compute_bounds(optics, noise, [level], truth, [movable])[0, 0]
     error = fit.parameters[:, :4] - truth
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
     assert 45 < chi2 < 128
@@ -262,11 +262,11 @@ def test_scatter_of_the_fit_is_the_bound(model, scene3, noise, states, stamps, m
 def test_free_flux_and_place_cost_precision(model, scene3, operator, noise, states):
     """Errors grow by a quarter to a third, and shrink in no direction."""
     movable, fixed = StateOptics(model, _optics(scene3, True)), StateOptics(model, operator)
-    covariances = bound_covariances(movable, noise, [0.002], states[:12], [False, True])
+    covariances = compute_bounds(movable, noise, [0.002], states[:12], [False, True])
     known_flux, unknown = covariances[:, 0]
-    without_flux = bound_covariances(fixed, noise, [0.002], states[:12], [False])[0, 0]
+    without_flux = compute_bounds(fixed, noise, [0.002], states[:12], [False])[0, 0]
     assert known_flux == pytest.approx(without_flux, rel=1e-3)
-    ratio = expected_abs_error(unknown).mean() / expected_abs_error(known_flux).mean()
+    ratio = compute_mean_abs_error(unknown).mean() / compute_mean_abs_error(known_flux).mean()
     assert 1.2 < ratio < 1.35
     assert np.linalg.eigvalsh(unknown - known_flux).min() > -1e-9
 
@@ -290,11 +290,11 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, scene3, noise, mova
     optics = StateOptics(model, _optics(scene3, movable))
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt), tilt])
-    images, _ = optics(optics.parameters_of(truth))
+    images, _ = optics(optics.to_parameters(truth))
     likelihood = StateLikelihood(optics, noise, 0.002, images)
     settings = scene3.fit.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
-    twin = optics.parameters_of(twin_states(model, truth))
+    twin = optics.to_parameters(twin_states(model, truth))
     stuck = likelihood.maximise(twin, settings.model_copy(update={"iterations": 1}))
     fit, in_range = refit_twins(likelihood, stuck, model, settings)
     assert in_range.all()

@@ -8,12 +8,12 @@ import pytest
 
 from command_line import psfdae
 from psfdae.base.files import ProductError, read_product
-from psfdae_paper.configuration.aligners import ALIGNERS, aligners_of, trained_networks
+from psfdae_paper.configuration.aligners import ESTIMATORS, list_estimators, trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
-from psfdae_paper.tracking import runs_of_alignment
+from psfdae_paper.tracking import read_alignment_runs
 
 pytestmark = pytest.mark.workflow
 
@@ -27,7 +27,7 @@ CELL = {"test_set": "uniform", "noise_level": 0.002}
 
 def test_rows_of_errors_and_bounds_agree_on_normal_errors():
     key, unit = {**CELL, "method": "dae"}, np.array([1e-3, 1e-3, 2e-3, 2e-3])
-    table = pd.DataFrame(alignment_tables.error_rows(key, ERRORS, unit))
+    table = pd.DataFrame(alignment_tables.tabulate_errors(key, ERRORS, unit))
     assert list(table.columns) == [
         *("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias"),
         *("variance", "variance_abs", "unit", "n"),
@@ -40,7 +40,7 @@ def test_rows_of_errors_and_bounds_agree_on_normal_errors():
     )
     assert metres.variance["decenter_y"] == pytest.approx(1e-6 * ranges.variance["decenter_y"])
     covariances = np.broadcast_to(COVARIANCE, (5, 4, 4))
-    bound = pd.DataFrame(alignment_tables.bound_rows(key, covariances, unit))
+    bound = pd.DataFrame(alignment_tables.tabulate_bounds(key, covariances, unit))
     expected = bound[bound.unit == "range"].set_index("parameter")
     # Of normal errors, whose absolute values have the mean σ √(2/π) and 1 − 2/π of the variance.
     assert expected.mean_abs_error.to_numpy() == pytest.approx(0.02 * np.sqrt(2 / np.pi))
@@ -51,8 +51,8 @@ def test_rows_of_errors_and_bounds_agree_on_normal_errors():
 
 def test_measured_correlations_are_those_predicted():
     errors, covariances = ERRORS[:600], np.broadcast_to(COVARIANCE, (600, 4, 4))
-    measured = pd.DataFrame(alignment_tables.measured_correlations(CELL, errors))
-    predicted = pd.DataFrame(alignment_tables.predicted_correlations(CELL, covariances))
+    measured = pd.DataFrame(alignment_tables.tabulate_error_correlations(CELL, errors))
+    predicted = pd.DataFrame(alignment_tables.tabulate_bound_correlations(CELL, covariances))
     assert len(measured) == 16
     pooled = predicted[predicted.method == "cramer_rao_pooled"].reset_index(drop=True)
     assert pooled.correlation[[3, 6]].tolist() == pytest.approx([-0.75, 0.75])
@@ -141,12 +141,12 @@ def test_words_that_do_not_fit_scene_3_are_refused(words, message, tmp_path, mon
 def test_tables_hold_every_method(results):
     """Flux and place are free for uniform states only."""
     errors = alignment_table(results, "errors")
-    everyone = set(ALIGNERS) - {"cramer_rao_pooled"}
+    everyone = set(ESTIMATORS) - {"cramer_rao_pooled"}
     with_free_flux = {name for name in everyone if name.endswith("_free")}
     for (kind, level), rows in errors.groupby(["test_set", "noise_level"]):
         assert (rows.groupby("method").size() == 8).all()
         noisy = everyone if kind == "uniform" else everyone - with_free_flux
-        clean = {"constant", *(method.name for method in aligners_of("estimates"))}
+        clean = {"constant", *(method.name for method in list_estimators("estimates"))}
         assert set(rows.method) == (noisy if level else clean)
     assert set(errors.noise_level) == {0, 0.002, 0.005}
 
@@ -169,7 +169,7 @@ def test_twin_is_closer_in_focus(results):
 
 
 def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
-    runs = {run.kind: run for run in runs_of_alignment(results)}
+    runs = {run.kind: run for run in read_alignment_runs(results)}
     assert set(runs) == {"dae", *trained_networks()}
     for kind, run in runs.items():
         history = pd.read_csv(results / "alignment" / kind / "history.csv")
@@ -177,4 +177,4 @@ def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
         assert float(run.epochs[1][curve]) == history[curve][1]
         assert "uniform_tilt_x_bias_0.002" in run.metrics
     with pytest.raises(ProductError, match="snakemake scene3"):
-        runs_of_alignment(tmp_path)
+        read_alignment_runs(tmp_path)

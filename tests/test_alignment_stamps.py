@@ -11,7 +11,12 @@ from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.telescope.raytracing import annulus_points, misalign
-from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
+from psfdae_paper.alignment.stamps import (
+    AlignmentStamps,
+    EnergyError,
+    centre_modes,
+    mean_slope,
+)
 from psfdae_paper.alignment.telescope import uniform_states
 
 OBSCURATION = 0.42
@@ -25,9 +30,9 @@ def shown_zernikes(tracer):
 
 def test_mean_slope_of_zernikes_over_the_annulus():
     x, y, weights = annulus_points(36, OBSCURATION)
-    modes = [centred_modes(22, OBSCURATION, x + h, y) for h in (1e-5, -1e-5)]
+    modes = [centre_modes(22, OBSCURATION, x + h, y) for h in (1e-5, -1e-5)]
     assert ((modes[0] - modes[1]) / 2e-5) @ weights == pytest.approx(0, abs=1e-8)
-    modes = [centred_modes(22, OBSCURATION, x, y + h) for h in (1e-5, -1e-5)]
+    modes = [centre_modes(22, OBSCURATION, x, y + h) for h in (1e-5, -1e-5)]
     assert ((modes[0] - modes[1]) / 2e-5) @ weights == pytest.approx(0, abs=1e-8)
     # Z8 = √8 (3r³ − 2r) cosθ over the full disc: mean slope √8.
     assert mean_slope(8, 0.0) == pytest.approx((np.sqrt(8), 0.0))
@@ -42,7 +47,7 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, scene3):
         pupil = annular_pupil(samples, OBSCURATION)
         pixel = 2 / pupil.spacing / samples
         sampling = PeriodSampling(pupil, samples, pixel, "complex128")
-        modes = partial(centred_modes, 22, OBSCURATION)
+        modes = partial(centre_modes, 22, OBSCURATION)
         images = ModalStamps(pupil, modes, sampling, pixel).stamps(zernikes)
         parseval = (pupil.amplitude**2).sum() / pupil.amplitude.sum()
         assert images.sum(axis=(1, 2)) == pytest.approx(parseval, abs=1e-12)
@@ -75,7 +80,7 @@ def test_derivatives_by_coefficients_are_differences(kind, product_cost):
     pupil = annular_pupil(48, 0.3)
     sampling = kind(pupil, 8, 2.0, "complex128")
     sampling.product_cost = product_cost
-    modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
+    modal = ModalStamps(pupil, partial(centre_modes, 11, 0.3), sampling, 2.0)
     rng = np.random.default_rng(0)
     coefficients = 0.2 * rng.standard_normal((2, 8))
     stamps, slopes = modal.derivatives(coefficients, np.eye(8)[None])

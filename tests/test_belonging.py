@@ -14,7 +14,7 @@ from psfdae.base.files import Column, ProductError, write_product
 from psfdae.commands.cli import stage
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
-from psfdae_paper.stages.alignment_results import products_of_one_test
+from psfdae_paper.stages.alignment_results import read_products
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1")
@@ -201,14 +201,14 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
         return [tmp_path / f"{name}.h5"]
 
     estimates, fit = written("e", "estimate", states), written("f", "fit", states)
-    products_of_one_test(estimates, fit, written("b", "bound", states))
+    read_products(estimates, fit, written("b", "bound", states))
     bound = written("o", "bound", states, "telescope.diameter_m=2")
     with pytest.raises(ProductError, match=r"o\.h5: telescope\.diameter_m = 2\.0, but .* 1\.5"):
-        products_of_one_test(estimates, fit, bound)
+        read_products(estimates, fit, bound)
     for message, file, *override in (
         (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, "seed=2"),
         (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states),
         (r"number of states = 2, but .*e\.h5 has 3", states[:2]),
     ):
         with pytest.raises(ProductError, match=message):
-            products_of_one_test(estimates, written("o", "fit", file, *override), [])
+            read_products(estimates, written("o", "fit", file, *override), [])

@@ -8,10 +8,10 @@ import pytest
 
 from psfdae_paper.evaluation import calibration
 from psfdae_paper.evaluation.calibration import (
+    compute_scale_residuals,
     fit_scales,
-    kappa_of_mse,
-    original_noise_rows,
-    residuals_by_scale,
+    read_original_noise,
+    solve_kappa,
 )
 
 
@@ -25,9 +25,9 @@ def scan(monkeypatch):
     """A scan of what SSIM values that range 0.7 and scales 0.11 and 0.16 explain."""
     columns = [
         row._replace(ssim=model(row.noise_level, 0.16 if row.dataset == "dataset8" else 0.11, 0.7))
-        for row in original_noise_rows()
+        for row in read_original_noise()
     ]
-    monkeypatch.setattr(calibration, "original_noise_rows", lambda: columns)
+    monkeypatch.setattr(calibration, "read_original_noise", lambda: columns)
     grid = [
         {
             "experiment": "scene2" if row.dataset == "dataset8" else "scene1",
@@ -48,7 +48,7 @@ def scan(monkeypatch):
 def test_kappa_of_the_noise_model_s_own_error(noise, gaussian_stars):
     level = 3e-5
     expected = noise.variance(gaussian_stars, level).mean()
-    assert kappa_of_mse(expected, level, 256, noise.background) == pytest.approx(4.98, rel=1e-6)
+    assert solve_kappa(expected, level, 256, noise.background) == pytest.approx(4.98, rel=1e-6)
 
 
 def test_fit_recovers_range_and_scales(scan):
@@ -61,7 +61,7 @@ def test_fit_recovers_range_and_scales(scan):
 
 
 def test_best_scanned_scale_has_the_smallest_residual(scan):
-    table = residuals_by_scale(scan, 0.7)
+    table = compute_scale_residuals(scan, 0.7)
     least_rms = table.loc[table.groupby("experiment").rms.idxmin()].set_index("experiment")
     assert least_rms.pixel_scale_arcsec["scene1"] in (0.1, 0.12)
     assert least_rms.pixel_scale_arcsec["scene2"] == 0.15

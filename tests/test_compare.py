@@ -14,7 +14,7 @@ from psfdae.base.files import write_text
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import (
     compare_evaluations,
-    held_out_ratios,
+    measure_held_out_ratios,
 )
 
 FIELDS, STARS = 20, 400
@@ -118,7 +118,7 @@ def mean_errors(n=500, **scale):
 @pytest.fixture
 def recorded(tmp_path, monkeypatch):
     """A run of evaluations alone, and a record of tables; a function that writes the run."""
-    monkeypatch.setattr(comparison, "seed_scatter", lambda: MEASURED)
+    monkeypatch.setattr(comparison, "read_seed_scatter", lambda: MEASURED)
     table = tmp_path / "record/tables/psf_metrics.csv"
     foreign = mean_errors().assign(dataset="not in the run")
     write_text(table, pd.concat([mean_errors(), foreign]).to_csv(index=False))
@@ -167,12 +167,12 @@ def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
     unseen.loc[network, "mse"] *= 1.25
     unseen.loc[unseen.star >= 300, "mse"] = 0.0
     single = random.assign(dataset="one split only")
-    table = held_out_ratios(pd.concat([random, unseen, single])).set_index("method")
+    table = measure_held_out_ratios(pd.concat([random, unseen, single])).set_index("method")
     assert set(table.dataset) == {"d"}
     assert table.ratio.to_dict() == pytest.approx({"noisy": 1.0, "dae": 1.25})
     assert table.stderr.to_numpy() == pytest.approx([0, 0], abs=1e-12)
     assert set(table.n) == {200}
-    assert held_out_ratios(single).empty
+    assert measure_held_out_ratios(single).empty
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from psfdae.methods.metrics import (
     mse,
     ssim,
 )
-from psfdae_paper.evaluation.alignment_tables import error_correlation
-from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
+from psfdae_paper.evaluation.alignment_tables import correlate_errors
+from psfdae_paper.evaluation.paper import format_paper_table, paper_table
 
 
 @pytest.fixture(scope="module")
@@ -87,19 +87,19 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
     assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
     assert set(table.source) == {"paper", "psfdae"}
-    assert "2.7568e-05" in paper_table_markdown(table, "dataset3", "mse")
+    assert "2.7568e-05" in format_paper_table(table, "dataset3", "mse")
 
 
 def test_correlation_is_pearson_s_with_fisher_s_interval():
     rng = np.random.default_rng(0)
     errors = rng.standard_normal((40, 4)) @ rng.standard_normal((4, 4))
-    matrix, low, high = error_correlation(errors)
+    matrix, low, high = correlate_errors(errors)
     assert matrix == pytest.approx(np.corrcoef(errors.T), abs=1e-12)
     expected = pearsonr(errors[:, 0], errors[:, 2]).confidence_interval(0.95)
     assert (low[0, 2], high[0, 2]) == pytest.approx((expected.low, expected.high), rel=1e-6)
     assert (low <= matrix).all()
     assert (matrix <= high).all()
     with pytest.raises(ValueError, match="finite"):
-        error_correlation(errors * np.nan)
+        correlate_errors(errors * np.nan)
     with pytest.raises(ValueError, match="at least one"):
-        error_correlation(errors[:0])
+        correlate_errors(errors[:0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae_paper.evaluation.figures import template_map
+from psfdae_paper.evaluation.figures import draw_templates
 from psfdae_paper.stars.fields import square_grid
 
 
@@ -33,7 +33,7 @@ def test_template_map_shows_the_bright_pixel_where_it_belongs():
     row, column = 3, 0
     index, field = small_field()
     bright = int(np.flatnonzero((index == [2, 0]).all(axis=1))[0])
-    figure = template_map(one_bright_pixel(9, bright, row, column), index, field, "templates")
+    figure = draw_templates(one_bright_pixel(9, bright, row, column), index, field, "templates")
     axes = figure.axes[0]
     x, y = np.rad2deg(field[bright])
     pixel = 1.1 / 5  # four pixels and a gap per field

@@ -15,24 +15,24 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from psfdae import api
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae_paper.evaluation.night import LIMITS, night_page, read_night, with_verdicts
+from psfdae.denoise import star_model as psf_model
+from psfdae_paper.evaluation.night import LIMITS, add_verdicts, night_page, read_night
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,
     NightError,
     bright_stars,
-    listed_images,
+    fit_telescope,
+    list_images,
     night_count,
     night_images,
     night_table,
-    telescope_state,
     write_night_page,
 )
 from psfdae_paper.stages.simulate import example_night
 from psfdae_paper.stars.nights import PLACES
-from psfdae_paper.tracking import runs_of_night
+from psfdae_paper.tracking import read_night_runs
 from workflow_runs import QUIET, captured, copy_of_sources, environment
 
 
@@ -74,7 +74,7 @@ def rows(folder, truth, similar_exposures):
     further = [{"image": path} for path in (first_image, other, folder / "none.fits")]
     path, out = folder / "list.csv", folder / "rows.csv"
     pd.concat([listed, pd.DataFrame(further)]).to_csv(path, index=False)
-    pd.DataFrame(listed_images(str(path))).to_csv(out, index=False)
+    pd.DataFrame(list_images(str(path))).to_csv(out, index=False)
     return out
 
 
@@ -174,7 +174,7 @@ def table_of(count, **columns):
 
 
 def test_verdicts_name_what_is_unlike_the_neighbours_in_time():
-    night = with_verdicts(
+    night = add_verdicts(
         table_of(40, fwhm_px_centre=(5, 4.5), ellipticity_centre=(12, 0.5), mag_20th=(30, -9.0))
     )
     poor = night[night.verdict == "poor"].reason
@@ -185,12 +185,12 @@ def test_verdicts_name_what_is_unlike_the_neighbours_in_time():
 def test_a_slow_change_of_the_focus_makes_no_image_poor():
     night = table_of(40)
     night["fwhm_px_centre"] += np.linspace(0.0, 4.0, 40)
-    assert (with_verdicts(night).verdict == "good").all()
+    assert (add_verdicts(night).verdict == "good").all()
 
 
 def test_a_night_without_any_model_is_refused(tmp_path, capsys):
     """It has a table and a page nevertheless, which say why."""
-    night = with_verdicts(pd.DataFrame({"image": ["a.fits"], "name": ["a"], "reason": ["empty"]}))
+    night = add_verdicts(pd.DataFrame({"image": ["a.fits"], "name": ["a"], "reason": ["empty"]}))
     assert [*night.verdict] == ["failed"]
     assert "empty" in night_page(night, {}, "images")
     night.to_csv(tmp_path / "night.csv")
@@ -205,12 +205,12 @@ def test_list_without_images_is_refused(tmp_path, monkeypatch, text, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "list.csv").write_text("file\na.fits\n")
     with pytest.raises(Exception, match=message):
-        listed_images(text)
+        list_images(text)
 
 
 def test_images_of_one_name_have_files_of_different_names(tmp_path):
     (tmp_path / "list.csv").write_text("image\na/x.fits\nb/x.fits\nx_2.fits\na/x.fits\n")
-    rows = listed_images(str(tmp_path / "list.csv"))
+    rows = list_images(str(tmp_path / "list.csv"))
     assert [row["name"] for row in rows] == ["x", "x_2", "x_2_2", "x_3"]
     assert [row["reason"] for row in rows] == ["", "", "", "listed twice"]
 
@@ -228,13 +228,13 @@ def test_a_wrong_telescope_makes_no_image_bad(folder, similar_exposures, tmp_pat
     coarse_camera, text = tmp_path / "coarse.yaml", (folder / "telescope.yaml").read_text()
     coarse_camera.write_text(text.replace("pixel_scale_arcsec: 1.2", "pixel_scale_arcsec: 2.4"))
     stars = bright_stars({"image": similar_exposures.image.iloc[0]})
-    rows = [telescope_state(stars, path) for path in (coarse_camera, tmp_path / "none.yaml")]
+    rows = [fit_telescope(stars, path) for path in (coarse_camera, tmp_path / "none.yaml")]
     assert "pixels of 1.2 arcsec" in rows[0]["telescope_reason"]
     assert "none.yaml" in rows[1]["telescope_reason"]
     measured = {"telescope_z4_wave": 0.1, "telescope_z4_wave_error": 0.01, "time": ""}
     shapes = {f"{quantity}_{p}": 2.0 for p in PLACES for quantity in ("fwhm_px", "ellipticity")}
     names = {"name": "a", "reason": "", "mag_20th": -9.0, "bright_stars": 9, **shapes}
-    night = with_verdicts(pd.DataFrame([{**names, **rows[0]}, {**names, **measured}]))
+    night = add_verdicts(pd.DataFrame([{**names, **rows[0]}, {**names, **measured}]))
     page = night_page(night, {}, "images")
     assert page.count("<img") == 1 and "pixels of 1.2 arcsec" in page
 
@@ -276,7 +276,7 @@ def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch
         opened.append(path.name.removesuffix(".psf.safetensors"))
         return SimpleNamespace(image_px=(300, 200), draw_on_pixels=lambda _: np.ones((5, 8, 8)))
 
-    monkeypatch.setattr(api, "load_model", load)
+    monkeypatch.setattr(psf_model, "load_model", load)
     write_night_page(out, tmp_path / "images", tmp_path / "night.html")
     by_size = sorted(rows, key=lambda row: row["fwhm_px_centre"])
     middle = by_size[len(rows) // 2]
@@ -285,7 +285,7 @@ def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch
     assert all(f'{escape(name)}.html">{escape(name)}</a>' in page for name in NAMES)
     for name in NAMES:
         write_text(tmp_path / f"night/images/{name}.psf.safetensors", "")
-    assert [run.name for run in runs_of_night(tmp_path)] == NAMES
+    assert [run.name for run in read_night_runs(tmp_path)] == NAMES
 
 
 @pytest.mark.parametrize("name", ["a$b$c", "$x^$", "one $", r"\$\frac$", "$$", "100 %", "_^{"])
@@ -294,7 +294,7 @@ def test_names_are_drawn_as_they_are(name):
     night = table_of(12, fwhm_px_centre=(5, 9.0))
     shapes = {f"{quantity}_{p}": night.fwhm_px_centre for p in PLACES for quantity in ("fwhm_px",)}
     shapes |= {f"ellipticity_{p}": night.ellipticity_centre for p in PLACES}
-    night = with_verdicts(night.assign(**shapes, name=name, bright_stars=9, time=""))
+    night = add_verdicts(night.assign(**shapes, name=name, bright_stars=9, time=""))
     night["telescope_a$_wave"] = night["telescope_a$_wave_error"] = 0.1
     psfs = dict.fromkeys([f"best\n{name}", f"worst\n{name}"], np.ones((5, 8, 8)))
     assert night_page(night, psfs, "images").count("<img") == 3

@@ -29,7 +29,7 @@ from psfdae.telescope.field import terms_of
 from psfdae.telescope.settings import Prior
 from psfdae_paper.evaluation.night import TABLE_COLUMNS, read_night
 from psfdae_paper.stages import night
-from psfdae_paper.stars.nights import PLACES, shapes_at_places
+from psfdae_paper.stars.nights import PLACES, measure_places
 from test_sensing import SKY, field_of, imaged, sensed, three_terms
 
 STAMP, ZERO_POINT = 14, 25.0
@@ -396,7 +396,7 @@ def test_columns_of_the_night(folder, stars, true, model, monkeypatch):
     row = {"image": str(out / "a.fits"), "name": "a", "reason": ""}
     row |= {"reference": str(out / "reference.csv"), "catalogue": str(out / "stars.csv")}
     write_csv(out / "rows.csv", DataFrame([row]))
-    monkeypatch.setattr(night, "model_of_image", lambda stars, start: model)
+    monkeypatch.setattr(night, "fit_image", lambda stars, start: model)
     report = SimpleNamespace(save=lambda path: path.write_text(""))
     monkeypatch.setattr(validation, "validate", lambda model, stars: report)
     night.night_images(out / "rows.csv", out, out / "part.csv")
@@ -439,7 +439,7 @@ def test_shapes_of_the_night_are_those_of_their_places():
             -0.5 * (column / major[:, None, None]) ** 2 - 0.5 * (row / minor[:, None, None]) ** 2
         )
 
-    shapes = shapes_at_places(psf_at, (columns, rows))
+    shapes = measure_places(psf_at, (columns, rows))
     for place, (x, y) in PLACES.items():
         ratio_of_axes = 1 - 0.5 * y
         assert shapes[f"ellipticity_{place}"] == pytest.approx(1 - ratio_of_axes, abs=0.01)

@@ -21,7 +21,7 @@ from psfdae_paper.configuration.sweep import point_groups
 from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
-from psfdae_paper.sweeps.measured import Task
+from psfdae_paper.sweeps.measurement import Task
 from test_track import site  # noqa: F401
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
@@ -220,7 +220,7 @@ OVERRIDES = ("preset=smoke", "train.epochs=3")
 def summarise(root, outcomes=OUTCOMES, **changes):
     out = root / "sweeps/tried"
     files = write_points(root, outcomes)
-    sweep_summary.summary("tried", {**DEFINITION, **changes}, OVERRIDES, files, out)
+    sweep_summary.tabulate_points("tried", {**DEFINITION, **changes}, OVERRIDES, files, out)
     return out
 
 

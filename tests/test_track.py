@@ -15,7 +15,7 @@ import yaml
 from psfdae.base.files import Column, write_product, write_text
 from psfdae_paper import registry
 from psfdae_paper.stages import track
-from psfdae_paper.tracking import runs_of_datasets
+from psfdae_paper.tracking import read_dataset_runs
 
 TABLES = ("runs", "metrics", "params", "tags", "inputs", "logged_models", "model_versions")
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -125,7 +125,7 @@ def site(tmp_path, empty_database, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(registry, "bundle_of", lambda *arguments: None)
+    monkeypatch.setattr(registry, "make_bundle", lambda *arguments: None)
     monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
     return Site(tmp_path, empty_database)
 
@@ -245,15 +245,15 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys):
 
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     stars = write_tree(tmp_path)
-    _, first = runs_of_datasets(tmp_path, stars)
+    _, first = read_dataset_runs(tmp_path, stars)
     config, content_hash = first.files["model/config.yaml"], first.content_hash
     tree = yaml.safe_load(config.read_text())
     config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
-    attempt = runs_of_datasets(tmp_path, stars)[1]
+    attempt = read_dataset_runs(tmp_path, stars)[1]
     assert attempt.config_hash == first.config_hash
     assert attempt.content_hash != content_hash
     write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
-    assert runs_of_datasets(tmp_path, stars)[1].config_hash != first.config_hash
+    assert read_dataset_runs(tmp_path, stars)[1].config_hash != first.config_hash
 
 
 def test_moved_results_and_a_damaged_database_are_refused(site):

@@ -17,7 +17,7 @@ from psfdae_paper.stars.turbulence import (
     SPECTRUM_FACTOR,
     Footprints,
     draw_waves,
-    fitted_planes,
+    fit_planes,
     layer_r0,
 )
 
@@ -187,7 +187,7 @@ def test_planes_in_closed_form_agree_with_a_fit():
     wavevector = np.array([[1e-9, 0.0], [0.3, -0.2], [2.0, 3.0], [-12.0, 5.0]])
     plane = np.stack([np.ones_like(x), x, y], axis=1)
     fitted, *_ = np.linalg.lstsq(plane, np.exp(1j * np.stack([x, y], axis=1) @ wavevector.T))
-    assert np.abs(fitted_planes(wavevector, 0.4) - fitted.T).max() < 2e-3
+    assert np.abs(fit_planes(wavevector, 0.4) - fitted.T).max() < 2e-3
 
 
 # --- scene ----------------------------------------------------------------------------

@@ -17,9 +17,9 @@ from psfdae.base.files import read_product, write_text
 from psfdae.denoise.bundle import read_bundle
 from psfdae.methods import method
 from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars
-from psfdae_paper.configuration.aligners import aligners_of
+from psfdae_paper.configuration.aligners import list_estimators
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.evaluation.comparison import seed_scatter
+from psfdae_paper.evaluation.comparison import read_seed_scatter
 from workflow_runs import captured, command, copy_of_sources, environment, planned, snakemake
 
 pytestmark = pytest.mark.workflow
@@ -39,7 +39,7 @@ def test_smoke_builds_everything(smoke):
     assert set(metrics.metric[sure]) == errors | {"coverage68", "evidence"}
     assert metrics.drop(columns="seed_stderr").notna().all().all()
     fits = zip(metrics.dataset, metrics.reference, metrics.method, strict=True)
-    scattered = metrics.metric.isin(errors) & np.array([fit in seed_scatter() for fit in fits])
+    scattered = metrics.metric.isin(errors) & np.array([fit in read_seed_scatter() for fit in fits])
     assert (metrics.seed_stderr.notna() == scattered).all()
 
 
@@ -119,7 +119,7 @@ def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path
     config = load(["dataset=dataset7", "preset=smoke"])
     for label in (
         *(method(name).look.label for name in config.methods),
-        aligners_of("estimates")[0].look.label,
+        list_estimators("estimates")[0].look.label,
     ):
         assert label in words
 

@@ -1,6 +1,6 @@
 """Models of runs in MLflow, logged with their runs and registered by dataset and method.
 
-A run goes in, and out come a model with its files in MLflow and, if it restores single stamps, a
+A run with a model becomes a logged model with its files and, if it denoises single stamps, a
 version of the registered models of its dataset and method. The best version has the alias "best".
 """
 
@@ -22,44 +22,47 @@ if TYPE_CHECKING:
 
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRun) -> str | None:
-    """Log the model of a run with all its files, and register one that restores single stamps.
+    """Log the model of a run with all its files; register it if it denoises single stamps.
 
-    A model that is registered has a bundle among its files, which `psfdae.load_model` reads. It
-    has no errors, which take a minute to measure (`psfdae paper bundle`); no PSF depends on them.
+    A registered model has a bundle among its files, which `psfdae.load_model` reads. The bundle
+    lacks the errors, which take a minute to measure (`psfdae paper bundle`) and do not change its
+    PSFs.
 
     Parameters
     ----------
     client : MlflowClient
+        Client of the database or server.
     experiment, run_id : str
         MLflow's ids of the experiment and of the run.
     run : TrackedRun
+        Run with its files; `fit` is None if no bundle can be made of it.
 
     Returns
     -------
     str or None
-        Id of the model in MLflow; None if the run has no model, such as that of a sweep.
+        Id of the model in MLflow; None for a run without a model, such as a whole sweep.
     """
     from mlflow.entities import LoggedModelOutput
 
     if not run.model_files:
         return None
     # Pending until its files are there (READY, below).
-    name = registered_name(run)
-    logged = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
-    model_id: str = logged.model_id
+    name = make_model_name(run)
+    logged_model = client.create_logged_model(experiment, name, run_id, model_type=run.kind)
+    model_id: str = logged_model.model_id
     client.log_outputs(run_id, [LoggedModelOutput(model_id, 0)])
     # Its files, with a bundle for all that can be put into one.
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        link(run.model_files, folder)
+        link_files(run.model_files, folder)
         if run.fit is not None:
-            write_bundle(bundle_of(run), folder / f"{name}{SUFFIX}")
+            write_bundle(make_bundle(run), folder / f"{name}{SUFFIX}")
         client.log_model_artifacts(model_id, temporary)
     client.finalize_logged_model(model_id, "READY")
     # The model becomes a version of the models of its dataset and method.
     if run.fit is not None:
         if not client.search_registered_models(f"name = '{name}'"):
-            # MLflow lists it beside the name.
+            # MLflow lists it next to the name.
             description = f"PSFs of stamps of {run.dataset}, restored by {run.kind}."
             client.create_registered_model(name, description=description)
         tags = {"split": run.split, "reference": run.reference}
@@ -72,7 +75,7 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     return model_id
 
 
-def bundle_of(run: TrackedRun) -> Bundle:
+def make_bundle(run: TrackedRun) -> Bundle:
     """Return the bundle, without errors, of a run that has a fit and the stars of its training.
 
     Raises
@@ -81,24 +84,25 @@ def bundle_of(run: TrackedRun) -> Bundle:
         If the fit or the stars are damaged.
     """
     assert run.fit is not None and run.data is not None
-    method_class, place = run.fit
-    described, product = method_class.described(place), read_stars(run.data, run.reference)
-    # Groups of settings that tell which stars a fit was trained on, and with which noise.
+    method_class, path = run.fit
+    fit_config, product = method_class.described(path), read_stars(run.data, run.reference)
+    # Groups of settings that decide which stars a fit was trained on, and with which noise.
     groups = ("seed", "noise", "parts")
-    config = part(groups, {group: described[group] for group in groups})
+    config = part(groups, {group: fit_config[group] for group in groups})
     # The bundle is named like the registered model.
-    fitted, name = method_class.load(place, run.reference), registered_name(run)
-    return build_uncalibrated(
-        fitted, product, run.reference, config, described, name, "not stated"
-    )[0]
+    fit, name = method_class.load(path, run.reference), make_model_name(run)
+    bundle, _ = build_uncalibrated(
+        fit, product, run.reference, config, fit_config, name, "not stated"
+    )
+    return bundle
 
 
-def registered_name(run: TrackedRun) -> str:
+def make_model_name(run: TrackedRun) -> str:
     """Return the name of the models of a dataset and method."""
     return f"{run.dataset}-{run.kind}"
 
 
-def link(files: Mapping[str, Path], folder: Path) -> None:
+def link_files(files: Mapping[str, Path], folder: Path) -> None:
     """Make links to files in a folder, by their names.
 
     MLflow copies a folder; links save a copy of large files.
@@ -108,6 +112,7 @@ def link(files: Mapping[str, Path], folder: Path) -> None:
     files : mapping of str to Path
         Files by names, which may have folders.
     folder : Path
+        Folder that receives the links; it exists.
     """
     for name, path in files.items():
         target = folder / name
@@ -118,8 +123,8 @@ def link(files: Mapping[str, Path], folder: Path) -> None:
 def choose_best(client: MlflowClient, name: str) -> None:
     """Give the alias "best" to the version with the smallest error on its test stars.
 
-    Versions of superseded runs do not count. Errors to templates have another truth than
-    errors to realisations; they count if there are no others.
+    Versions of superseded runs are left out. Errors to templates have another truth than
+    errors to realisations, and are used only if there are no others.
     """
     candidates = [
         version
@@ -127,7 +132,7 @@ def choose_best(client: MlflowClient, name: str) -> None:
         if "test_mse" in version.tags
         and client.get_run(str(version.run_id)).data.tags.get("superseded") != "true"
     ]
-    # Truths first: any version that restores realisations is before those that restore templates.
+    # Versions that are tested on realisations precede versions that are tested on templates.
     if candidates:
         winner = min(
             candidates, key=lambda v: (v.tags["reference"] == "template", float(v.tags["test_mse"]))

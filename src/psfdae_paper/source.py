@@ -1,8 +1,7 @@
-"""Hash of the code of a stage, with which a workflow finds out that it has changed; git commit.
+"""Hash of the code of a stage, by which a workflow detects that it has changed; git commit.
 
-Names of commands, modules or programs go in; a hash of their code, and of all code of the packages
-that it imports, comes out. A rule of the workflow has it among its parameters, so that a job runs
-again when the hash has changed.
+The hash covers commands, modules or programs, and all code of the packages that they import. A rule
+of the workflow has it among its parameters, so that a job runs again when the hash has changed.
 """
 
 from __future__ import annotations
@@ -23,12 +22,13 @@ SOURCES = Path(__file__).resolve().parents[1]
 def source_hash(*names: str) -> str:
     """Return the hash of modules and of all modules of the packages on which they depend.
 
-    These are the modules that they import, the modules that those import, and so on. Docstrings,
-    comments and formatting do not count, nor do imports that only annotations or decorators use.
-    Four kinds of imports cannot be recognised, so that their modules have to be named, too: by a
-    computed name, such as that of the method that is fitted; relative ones; those of all names; and
-    those of a module that only passes names on, which it does not use itself. Packages above a
-    module count only where a name is imported from them: their `__init__.py` computes nothing.
+    These are the modules that they import, the modules that these import, and so on. Docstrings,
+    comments and formatting are left out, and so are imports that only annotations or decorators
+    use. Four kinds of imports cannot be recognised, so that their modules have to be named, too: by
+    a computed name, such as the name of the method that is fitted; relative imports; imports of all
+    names (`*`); and imports of names that a module re-exports without using them. Packages above a
+    module are included only where a name is imported from them: their `__init__.py` computes
+    nothing.
 
     Parameters
     ----------
@@ -44,17 +44,17 @@ def source_hash(*names: str) -> str:
     Raises
     ------
     ValueError
-        If there is no such command, module or file.
+        If a command, module or file does not exist.
     """
-    # A command stands for the module of its function.
+    # A command is hashed by the module of its function.
     commands = command_modules()
     queue = [commands[name][0] if name in commands else name for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)
     for name in queue:
-        digests[name], imported = module_digest(name)
-        queue += [module for module in imported if module not in digests]
-        digests |= {module: digests.get(module) for module in imported}
+        digests[name], modules = module_digest(name)
+        queue += [module for module in modules if module not in digests]
+        digests |= {module: digests.get(module) for module in modules}
     lines = "\n".join(f"{name} {digest}" for name, digest in sorted(digests.items()))
     return hashlib.sha256(lines.encode()).hexdigest()[:16]
 
@@ -66,7 +66,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
     Raises
     ------
     ValueError
-        If there is no such module or file.
+        If the module or file does not exist.
     """
     path = SOURCES.parent / name if name.endswith(".py") else _path(name)
     if path is None or not path.is_file():
@@ -88,7 +88,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
     program_folder = path.parent if name.endswith(".py") else None
     # Code and tables together.
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    return digest, [*imported_modules(tree, program_folder)]
+    return digest, [*find_imports(tree, program_folder)]
 
 
 def _path(module: str) -> Path | None:
@@ -99,8 +99,8 @@ def _path(module: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
-    """Yield the modules of the packages that a module imports, and files beside a program."""
+def find_imports(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
+    """Yield the modules of the packages that a module imports, and files next to a program."""
     # Nodes below annotations of arguments and variables, return types and decorators: names that
     # only these use are taken not to decide a result.
     ignored_nodes = set()
@@ -119,7 +119,7 @@ def imported_modules(tree: ast.Module, program_folder: Path | None) -> Iterator[
             candidates = [[f"{node.module}.{name}", f"{node.module}"] for name in imports]
         else:
             continue
-        # Modules of other packages are passed over; a program may import files beside it.
+        # Modules of other packages are skipped; a program may import files in its folder.
         for modules in candidates:
             yield from [module for module in modules if _path(module)][:1]
             file = program_folder and program_folder / f"{modules[-1]}.py"
@@ -152,7 +152,7 @@ def git(*arguments: str) -> str:
     subprocess.CalledProcessError
         If git fails.
     OSError
-        If there is no git.
+        If git is not installed.
     """
     command = ["git", "-C", str(SOURCES.parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,7 +1,7 @@
 """Runs as MLflow shows them, read from the files in the results folder.
 
-The results folder goes in, and each `TrackedRun` that comes out names its files, settings and
-metrics. Nothing here knows MLflow's database.
+Each `TrackedRun` names its files, settings and metrics in the results folder. This module does not
+use MLflow's database.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.methods.interface import CONFIG, HISTORY, Method
-from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, swept_networks, trained_networks
+from psfdae_paper.configuration.aligners import (
+    ESTIMATORS,
+    Estimator,
+    swept_networks,
+    trained_networks,
+)
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.evaluation.night import read_night
-from psfdae_paper.sweeps.points import hash_of
+from psfdae_paper.sweeps.points import compute_hash
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
@@ -52,9 +57,9 @@ class TrackedRun:
     name, experiment : str
         Name of the run, and of MLflow's experiment that holds it.
     files : mapping of str to Path
-        Files by their names within the run; those of its model begin with `model_prefix`.
+        Files by their names within the run; names of model files begin with `model_prefix`.
     config : mapping
-        Configuration of the training, with that of its stars.
+        Configuration of the training and of its stars.
     last_file : Path or None
         File that the run has written last; None while it runs.
     metrics : mapping of str to float
@@ -62,7 +67,7 @@ class TrackedRun:
     epochs : sequence of mappings
         Rows of the training history.
     seconds : float or None
-        Duration of the job that made the run; by default that up to the last epoch.
+        Duration of the job that made the run; by default the time up to the last epoch.
     status : str
         Status in MLflow.
     parent : str
@@ -74,7 +79,7 @@ class TrackedRun:
     fit : tuple of a type of Method and a Path, or None
         Fit that a model bundle can hold, and its folder or file.
     averaged : tuple of str
-        Metrics of which a run has the mean over the noise levels, too.
+        Metrics whose means over the noise levels are also metrics of a run.
 
     Raises
     ------
@@ -83,7 +88,7 @@ class TrackedRun:
     """
 
     model_prefix: ClassVar = "model/"
-    averaged: ClassVar = ("mse", "ssim")
+    averaged_metrics: ClassVar = ("mse", "ssim")
 
     kind: str
     dataset: str
@@ -105,7 +110,7 @@ class TrackedRun:
     fit: tuple[type[Method], Path] | None = None
 
     def __post_init__(self) -> None:
-        # A run is read as a whole or not at all.
+        """Require all files: a run is read as a whole or not at all."""
         for path in (*self.files.values(), self.last_file):
             if path is not None and not path.is_file():
                 raise ProductError(f"{path}: no such file")
@@ -122,7 +127,7 @@ class TrackedRun:
     @cached_property
     def config_hash(self) -> str:
         """Hash of the settings alone."""
-        return hash_of(self.config)
+        return compute_hash(self.config)
 
     @cached_property
     def content_hash(self) -> str:
@@ -130,7 +135,7 @@ class TrackedRun:
         # 4 is a version: raise it when other metrics or settings are read from the files, and all
         # runs are imported again.
         contents = {name: sha256_of(path) for name, path in self.files.items()}
-        return hash_of([4, self.config_hash, contents])
+        return compute_hash([4, self.config_hash, contents])
 
     @property
     def end_ms(self) -> int:
@@ -147,7 +152,7 @@ class TrackedRun:
         return self.end_ms - int(1000 * seconds)
 
 
-def tracked_metric(name: str, value: float) -> tuple[str, int, float]:
+def convert_metric(name: str, value: float) -> tuple[str, int, float]:
     """Return a metric as MLflow shows it: name, step and value.
 
     MLflow prints five decimals: a mean squared error is given in 1e-6, as its name says. The step
@@ -164,18 +169,18 @@ def tracked_metric(name: str, value: float) -> tuple[str, int, float]:
     )
 
 
-def job_seconds(benchmark: Path) -> float | None:
+def read_job_seconds(benchmark: Path) -> float | None:
     """Return the duration of a job from Snakemake's table of its cost; None without the table."""
     # A job that was repeated has a row for each time.
     return read_table(benchmark, "s", sep="\t").s.iloc[-1] if benchmark.is_file() else None
 
 
-def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
+def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
     """Read the finished runs of datasets.
 
-    An evaluation is the last file of a run, so that models still in training have none. A method
-    that is fitted once for both references is measured against each of them; each of these
-    measurements is a run, so that the metrics of all methods with the same tags can be compared.
+    An evaluation is the last file of a run; models still in training lack it. A method that is
+    fitted once for both references is measured against each of them; each of these measurements is
+    a run, so that the metrics of all methods with the same tags can be compared.
 
     Parameters
     ----------
@@ -187,8 +192,8 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Tracke
     Raises
     ------
     ProductError
-        If a dataset has no evaluation, a file is missing or damaged, or a model was
-        trained on other stars.
+        If an evaluation or another file is missing or damaged, or a model was trained on
+        other stars.
     """
     runs = []
     for dataset, stars in datasets.items():
@@ -200,27 +205,29 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Tracke
         for path in evaluations:
             # Every method in the table of errors that leaves files is a run.
             split, reference = path.stem.split("-", 1)
-            evaluated = {*read_table(path, "method").method}
+            method_names = {*read_table(path, "method").method}
             for kind in registered():
-                if kind.storage and kind.name in evaluated:
+                if kind.storage and kind.name in method_names:
                     runs.append(
-                        _run_of_fit(results, kind, (dataset, split, reference), stars, path)
+                        _read_fit_run(results, kind, (dataset, split, reference), stars, path)
                     )
     return runs
 
 
-def _run_of_fit(
+def _read_fit_run(
     results: Path, kind: type[Method], key: tuple[str, str, str], stars: Path, evaluation: Path
 ) -> TrackedRun:
     """Read a fit to the stars of a dataset, and its evaluation.
 
-    Its config is that of the model together with that of its stars: a network trained on
-    the stars of another telescope is another run.
+    Its config holds the settings of the model and of its stars: a network trained on the
+    stars of another telescope is another run.
 
     Parameters
     ----------
     results : Path
+        Folder that the workflow writes to.
     kind : type of Method
+        Class of the fitted method.
     key : tuple of three str
         Dataset, split and reference of the training.
     stars, evaluation : Path
@@ -231,7 +238,8 @@ def _run_of_fit(
     model = results / fits.place_of(kind, *key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
-    # The settings of the model are beside it, those of its stars in their product.
+    # The settings of the model are in a file of the fit, the settings of its stars in their
+    # product.
     settings = kind.described(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
@@ -240,7 +248,7 @@ def _run_of_fit(
     table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
     rows = table[table.method == kind.name]
     metrics: dict[str, float] = {}
-    for metric in TrackedRun.averaged:
+    for metric in TrackedRun.averaged_metrics:
         if metric in {*rows.metric}:
             metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
     for row in rows.to_dict("records"):
@@ -273,19 +281,19 @@ def _run_of_fit(
         data=stars,
         fit=(kind, model) if kind.packing else None,
         epochs=_epochs(history) if history else (),
-        seconds=job_seconds(results / f"benchmarks/{job}.tsv"),
+        seconds=read_job_seconds(results / f"benchmarks/{job}.tsv"),
     )
 
 
-def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
+def _model_files(kind: type[Method], path: Path) -> dict[str, Path]:
     """List the files of a fit by their names within the run; `model/` is what the method loads."""
-    model = {f"{TrackedRun.model_prefix}{path.name}": path for path in fits.own_files(kind, place)}
+    model = {f"{TrackedRun.model_prefix}{file.name}": file for file in fits.own_files(kind, path)}
     # Course of the training and the like, which `load` does not need.
     diagnostics = fits.storage_of(kind).diagnostics
-    return model | {name: fits.path_beside(kind, place, name) for name in diagnostics}
+    return model | {name: fits.path_beside(kind, path, name) for name in diagnostics}
 
 
-def runs_of_alignment(results: Path) -> list[TrackedRun]:
+def read_alignment_runs(results: Path) -> list[TrackedRun]:
     """Read the trained networks of scene 3.
 
     Raises
@@ -300,12 +308,12 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
     table = read_table(errors, *columns, "mean_abs_error", "bias", "variance")
     # All networks share the table of errors and the figures of the scene.
     figures = sorted((results / "figures/alignment").glob("*.png"))
-    shared = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
+    scene_files = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
     runs = []
     for kind in ("dae", *trained_networks()):
-        weights = DAE_WEIGHTS if kind == "dae" else Aligner.weights_file
+        weights = DAE_WEIGHTS if kind == "dae" else Estimator.weights_file
         folder = results / "alignment" / kind
-        # As for datasets, the number of the start that succeeded is no setting.
+        # As for datasets, the number of the start that succeeded is not a setting.
         config = read_yaml(folder / CONFIG)
         config.pop("attempt", None)
         # Errors of the state parameters in units of their range, by test set and noise level.
@@ -318,7 +326,7 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
             for name in ("mean_abs_error", "bias", "variance")
         }
         # The set of states on which it was trained.
-        states = "grid" if kind == "dae" else ALIGNERS[kind].states
+        states = "grid" if kind == "dae" else ESTIMATORS[kind].states
         runs.append(
             TrackedRun(
                 kind=kind,
@@ -328,13 +336,13 @@ def runs_of_alignment(results: Path) -> list[TrackedRun]:
                 source=f"alignment/{kind}",
                 name=f"alignment {kind}",
                 experiment="scene3",
-                files={**_network_files(folder, weights), **shared},
+                files={**_network_files(folder, weights), **scene_files},
                 config=config,
                 last_file=folder / weights,
                 metrics=metrics,
                 data=results / f"data/alignment/{states}.h5",
                 epochs=_epochs(folder / HISTORY),
-                seconds=job_seconds(results / f"benchmarks/alignment/{kind}.tsv"),
+                seconds=read_job_seconds(results / f"benchmarks/alignment/{kind}.tsv"),
             )
         )
     return runs
@@ -346,7 +354,7 @@ def _network_files(folder: Path, weights: str) -> dict[str, Path]:
     return model | {HISTORY: folder / HISTORY}
 
 
-def runs_of_night(results: Path) -> list[TrackedRun]:
+def read_night_runs(results: Path) -> list[TrackedRun]:
     """Read the images of a night that have a model, each a run of the experiment "night".
 
     Raises
@@ -382,13 +390,13 @@ def runs_of_night(results: Path) -> list[TrackedRun]:
     return runs
 
 
-def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
+def read_sweep_runs(results: Path, name: str) -> list[TrackedRun]:
     """Read a sweep and the points in its summary, the parent first.
 
     Raises
     ------
     ProductError
-        If the sweep has no summary, or a point no result.
+        If the summary of the sweep or the result of a point is missing.
     """
     folder = results / "sweeps" / name
     summary = folder / "summary.csv"
@@ -397,7 +405,7 @@ def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
     # A row of the summary for each point, and a run of its own.
     table = read_table(summary, "point", "status", dtype=str)
     # The parent has the split and the reference of its points, which all are the same.
-    points = [_run_of_point(results, name, point) for point in table.point]
+    points = [_read_point_run(results, name, point) for point in table.point]
     tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
     paths = [*tables, *sorted((folder / "figures").glob("*.png"))]
     # Metrics of the best point, and numbers of points by their status.
@@ -423,9 +431,9 @@ def runs_of_sweep(results: Path, name: str) -> list[TrackedRun]:
     return [parent, *points]
 
 
-def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
-    """Read a point of the sweep `name`. A failed point has no files but its result and cost."""
-    from psfdae_paper.sweeps.measured import fit_in
+def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:
+    """Read a point of the sweep `name`; a failed point has only files of its result and cost."""
+    from psfdae_paper.sweeps.measurement import locate_fit
 
     # A point has a folder with all its files.
     folder = results / "sweeps" / name / "points" / point
@@ -434,10 +442,10 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     # Files of the model, and the product with its training data if the workflow made it.
     data = None
     if model in swept_networks():
-        model_files = _network_files(folder, Aligner.weights_file)
-        data = results / f"data/alignment/{ALIGNERS[model].states}.h5"
+        model_files = _network_files(folder, Estimator.weights_file)
+        data = results / f"data/alignment/{ESTIMATORS[model].states}.h5"
     else:
-        model_files = _model_files(method(model), fit_in(method(model), folder))
+        model_files = _model_files(method(model), locate_fit(method(model), folder))
         with suppress(KeyError):
             data = results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
     # A point that was stopped or failed lacks some of these.
@@ -457,7 +465,7 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
         last_file=folder / "result.json",
         metrics=result["metrics"],
         epochs=_epochs(history) if history.is_file() else (),
-        seconds=job_seconds(results / f"benchmarks_on_request/sweep/{name}/{point}.tsv"),
+        seconds=read_job_seconds(results / f"benchmarks_on_request/sweep/{name}/{point}.tsv"),
         status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
@@ -465,16 +473,16 @@ def _run_of_point(results: Path, name: str, point: str) -> TrackedRun:
     )
 
 
-def settings_of(run: TrackedRun, preset: str) -> dict[str, str]:
+def select_settings(run: TrackedRun, preset: str) -> dict[str, str]:
     """Return the settings that distinguish a run from others, by their dotted names.
 
-    These are its method, those by which datasets differ, and those that are not the
-    configuration's for this dataset and preset. The choice does not depend on other runs.
+    These are its method, the settings in which datasets differ, and the settings that differ from
+    the configuration of this dataset and preset. The choice does not depend on other runs.
     """
-    # Always shown: what tells the paper's datasets from each other.
+    # Always shown: the settings in which the paper's datasets differ.
     dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
     defaults = {}
-    # Stars that are none of the datasets, such as those of a user, have no defaults.
+    # Stars other than the datasets, such as a user's own, lack defaults.
     if run.dataset in dataset_names() and (config_dir() / f"preset/{preset}.yaml").is_file():
         # Settings of the dataset as the preset alone has them.
         defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
@@ -508,13 +516,13 @@ def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[
     metrics = [
         Metric(f"epoch/{name}", value, start_ms + int(1000 * row["seconds"]), int(row["epoch"]))
         for row in epochs
-        for name, _, value in starmap(tracked_metric, row.items())
+        for name, _, value in starmap(convert_metric, row.items())
         if name not in ("epoch", "step", "seconds", "cpu_seconds")
     ]
     # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
     errors = [m for m in metrics if "/validation_mse" in m.key and math.isfinite(m.value)]
     if errors:
-        stored = min(errors, key=lambda m: m.value)
-        name = stored.key.replace("epoch/", "best_")
-        metrics.append(Metric(name, stored.value, stored.timestamp, stored.step))
+        best_metric = min(errors, key=lambda m: m.value)
+        name = best_metric.key.replace("epoch/", "best_")
+        metrics.append(Metric(name, best_metric.value, best_metric.timestamp, best_metric.step))
     return metrics

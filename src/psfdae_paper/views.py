@@ -1,8 +1,7 @@
 """Tables of runs that open by links in the description of an MLflow experiment.
 
 MLflow stores a view of its table of runs that a user shares as a tag of the experiment, and opens
-it by an address with the tag's name. Views are made here in the same form: runs go in, and tags of
-their experiment come out.
+it by an address with the tag's name. This module makes views of runs in the same form.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from psfdae_paper.tracking import TrackedRun, tracked_metric
+from psfdae_paper.tracking import TrackedRun, convert_metric
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -24,6 +23,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -
     Parameters
     ----------
     client : MlflowClient
+        Client of the database or server.
     experiment : str
         Id of the experiment.
     records : sequence of TrackedRun
@@ -44,8 +44,8 @@ def show(client: MlflowClient, experiment: str, records: Sequence[TrackedRun]) -
 
 
 def views(records: Sequence[TrackedRun]) -> dict[str, str]:
-    """Return the views of all runs with a model, and of those of each dataset by its name."""
-    # A sweep itself has no model, and its points are in no view of a dataset.
+    """Return the view of all runs with a model, and the view of each dataset, by name."""
+    # A sweep itself lacks a model; its points are not in the view of a dataset.
     with_model = [r for r in records if r.model_files]
     by_name = {"all": _view(with_model, "")} if with_model else {}
     for dataset in dict.fromkeys(r.dataset for r in with_model if r.fit and not r.parent):
@@ -72,14 +72,14 @@ def _view(records: Sequence[TrackedRun], condition: str) -> str:
     """
     # Metrics that have the same meaning for every run; without them, the first eight.
     common = [
-        *(f"test_{name}" for name in TrackedRun.averaged),
+        *(f"test_{name}" for name in TrackedRun.averaged_metrics),
         "best_validation_mse",
         "validation_mse",
     ]
     metrics = [name for name in common if any(name in r.metrics for r in records)]
     metrics = metrics or list(records[0].metrics)[:8]
-    metrics = list(dict.fromkeys(tracked_metric(name, 0.0)[0] for name in metrics))
-    # Axes of a sweep come first: they are what its points differ in.
+    metrics = list(dict.fromkeys(convert_metric(name, 0.0)[0] for name in metrics))
+    # Axes of a sweep come first: its points differ in them.
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
     columns = [f"params.`{axis}`" for axis in axes] + [f"metrics.`{name}`" for name in metrics]
     state = {

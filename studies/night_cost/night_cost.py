@@ -22,8 +22,8 @@ import pandas as pd
 from astropy.io import fits
 
 from psfdae_paper.source import git_commit
-from psfdae_paper.stages.night import listed_images
-from psfdae_paper.stars.nights import NightRecipe, reference_stars, simulated_night
+from psfdae_paper.stages.night import list_images
+from psfdae_paper.stars.nights import NightRecipe, simulate_night, simulate_reference_stars
 
 EXPOSURES, SEED = 8, 1  # the ninth of the simulated night is cloudy
 
@@ -34,15 +34,15 @@ def main(table: Path, side_px: int, bright: int, faint: int) -> None:
     recipe = replace(
         recipe, field=replace(recipe.field, side_px=side_px, bright=bright, faint=faint)
     )
-    stars = reference_stars(recipe, SEED)
+    stars = simulate_reference_stars(recipe, SEED)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        exposures = itertools.islice(simulated_night(recipe, stars, SEED), EXPOSURES)
+        exposures = itertools.islice(simulate_night(recipe, stars, SEED), EXPOSURES)
         for number, (counts, cards, _) in enumerate(exposures):
             image = fits.PrimaryHDU(counts, fits.Header(list(cards.items())))
             image.writeto(folder / f"image_{number}.fits")
         rows = folder / "rows.csv"
-        pd.DataFrame(listed_images(f"{folder}/*.fits")).to_csv(rows, index=False)
+        pd.DataFrame(list_images(f"{folder}/*.fits")).to_csv(rows, index=False)
         # One thread; the job's processor time and peak of memory are those of the child.
         command = [
             "psfdae",

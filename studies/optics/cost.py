@@ -81,7 +81,7 @@ def main(results: Path, out: Path, picture: Path) -> None:
     for optics in ("wavefront", "wavefront_position"):
         kind = method(optics)
         data = training_set(config, kind, product, "random", REFERENCE)
-        fitted = kind.with_bank(bank, config, data)
+        fitted = kind.from_bank(bank, config, data)
         _ = fitted.mixture  # fitted here, where no clock runs
         for effort in EFFORTS:
             starts = effort["starts"]

@@ -82,7 +82,7 @@ def misses(config, product, bank, optics) -> dict:
     """Return by noise level the stars whose better mode is missed, and those that are flagged."""
     kind = method(optics)
     data = training_set(config, kind, product, "random", "realisation")
-    fitted = kind.with_bank(bank, config, data)
+    fitted = kind.from_bank(bank, config, data)
     stars = bounded_stars(config, product)
     position, count = field_positions(product)[stars.star], len(stars.star)
     truth = true_modes(fitted.model, product, stars)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from psfdae.methods.metrics import all_metrics, ssim
-from psfdae_paper.evaluation.alignment_tables import error_correlation
+from psfdae_paper.evaluation.alignment_tables import correlate_errors
 
 EPS = float(np.finfo(np.float64).eps)
 C1 = 0.01**2  # of SSIM's luminance term (Wang et al. 2004, IEEE Trans. Image Process. 13, 600)
@@ -40,17 +40,17 @@ def test_correlations(bench, record):
     rng = bench.stream("correlation")
     errors = rng.standard_normal((100, 4))
     errors[:, 1], errors[:, 3] = 0.1, -2 * errors[:, 2]
-    matrix, *_ = error_correlation(errors)
+    matrix, *_ = correlate_errors(errors)
     undefined = np.isnan(matrix)
     undefined_count = undefined.sum() if (undefined[1] & undefined[:, 1]).all() else "other rows"
     record.equal("errors without variance", "NaN in their row and column alone", undefined_count, 7)
-    change = np.nanmax(np.abs(error_correlation(errors * 1e-200)[0] - matrix))
+    change = np.nanmax(np.abs(correlate_errors(errors * 1e-200)[0] - matrix))
     case = "errors in units of 1e-200"
     record.at_most(case, "largest change of a correlation", change, 100 * EPS)
     covered = 0
     for _ in range(400):
         sample = rng.standard_normal((30, 2)) @ np.array([[1.0, 0.6], [0.0, 0.8]])
-        _, low, high = error_correlation(sample)
+        _, low, high = correlate_errors(sample)
         covered += low[0, 1] <= 0.6 <= high[0, 1]
     # Binomial: 95 % ± 4 × 1.1 %.
     record.at_most("95 % intervals", "|coverage − 0.95|", abs(covered / 400 - 0.95), 0.044)

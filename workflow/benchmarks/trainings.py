@@ -100,11 +100,11 @@ def scatter(
 
 def pooled(errors):
     """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
-    from psfdae_paper.evaluation.comparison import FITTED
+    from psfdae_paper.evaluation.comparison import FIT_KEYS
 
-    cells = errors.groupby([*FITTED, "noise_level"], sort=False)
-    relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)
-    table = cells.seed.nunique().groupby(FITTED, sort=False).min().rename("seeds").to_frame()
+    cells = errors.groupby([*FIT_KEYS, "noise_level"], sort=False)
+    relative = (cells.mse.std() / cells.mse.mean()).groupby(FIT_KEYS, sort=False)
+    table = cells.seed.nunique().groupby(FIT_KEYS, sort=False).min().rename("seeds").to_frame()
     return table.assign(scatter=relative.agg(lambda s: np.sqrt((s**2).mean()))).reset_index()
 
 

@@ -21,7 +21,7 @@ rule alignment_model:
     message:
         "Fitting the wavefront of scene 3 to ray-traced states"
     shell:
-        "psfdae alignment model --config {params.config} --out {output} > {log} 2>&1"
+        "psfdae paper alignment model --config {params.config} --out {output} > {log} 2>&1"
 
 
 # The many states that networks are trained on take their wavefronts from the model.
@@ -46,7 +46,7 @@ rule alignment_states:
     message:
         "Simulating the stamps of scene 3, set {wildcards.states}"
     shell:
-        "psfdae alignment states --config {params.config} --set {params.kind}"
+        "psfdae paper alignment states --config {params.config} --set {params.kind}"
         " {params.inputs:q} --out {output} > {log} 2>&1"
 
 
@@ -68,7 +68,7 @@ rule alignment_telescope:
     message:
         "Tabulating key figures of scene 3"
     shell:
-        "psfdae alignment telescope --config {params.config} {params.inputs:q}"
+        "psfdae paper alignment telescope --config {params.config} {params.inputs:q}"
         " --out {output} > {log} 2>&1"
 
 
@@ -97,15 +97,15 @@ rule alignment_dae:
     message:
         "Training the DAE of scene 3"
     shell:
-        "psfdae alignment train-dae --config {params.config} {params.inputs:q}"
+        "psfdae paper alignment train-dae --config {params.config} {params.inputs:q}"
         " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
 
 
 rule alignment_network:
     input:
-        states=lambda w: f"{ALIGNMENT_DATA}/{ALIGNERS[w.network].states}.h5",
+        states=lambda w: f"{ALIGNMENT_DATA}/{ESTIMATORS[w.network].states}.h5",
         dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"]
-        * ALIGNERS[w.network].denoised,
+        * ESTIMATORS[w.network].denoised,
     output:
         **network_files("{network}", "network.safetensors"),
     log:
@@ -126,7 +126,7 @@ rule alignment_network:
     message:
         "Training the network {wildcards.network} of scene 3"
     shell:
-        "psfdae alignment train-network --kind {wildcards.network}"
+        "psfdae paper alignment train-network --kind {wildcards.network}"
         " --config {params.config} {params.inputs:q} --checkpoint {params.checkpoint}"
         " --out {params.folder} > {log} 2>&1"
 
@@ -151,7 +151,7 @@ rule alignment_bound:
     message:
         "Bounding the errors of misalignments, set {wildcards.test_set}"
     shell:
-        "psfdae alignment bound --config {params.config} --set {wildcards.test_set}"
+        "psfdae paper alignment bound --config {params.config} --set {wildcards.test_set}"
         " {params.inputs:q} --out {output} > {log} 2>&1"
 
 
@@ -181,7 +181,7 @@ rule alignment_estimate:
     message:
         "Estimating misalignments with the networks, set {wildcards.test_set}"
     shell:
-        "psfdae alignment estimate --config {params.config} --set {wildcards.test_set}"
+        "psfdae paper alignment estimate --config {params.config} --set {wildcards.test_set}"
         " {params.inputs:q} --times {output.times} --out {output.out} > {log} 2>&1"
 
 
@@ -190,7 +190,7 @@ rule alignment_fit:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         train=f"{ALIGNMENT_DATA}/train.h5",
         model=rules.alignment_model.output,
-        network=f"{ALIGNMENT}/{ALIGNERS['max_likelihood'].network}/network.safetensors",
+        network=f"{ALIGNMENT}/{ESTIMATORS['max_likelihood'].network}/network.safetensors",
     output:
         out=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}.h5",
         times=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}_times.csv",
@@ -208,6 +208,6 @@ rule alignment_fit:
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"
     shell:
-        "psfdae alignment fit --config {params.config} --set {wildcards.test_set}"
+        "psfdae paper alignment fit --config {params.config} --set {wildcards.test_set}"
         " --level {wildcards.level} {params.inputs:q} --times {output.times}"
         " --out {output.out} > {log} 2>&1"

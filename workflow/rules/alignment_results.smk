@@ -20,7 +20,7 @@ rule alignment_tables:
     message:
         "Tabulating errors of misalignments"
     shell:
-        "psfdae alignment tables {params.inputs:q} --errors {output.errors}"
+        "psfdae paper alignment tables {params.inputs:q} --errors {output.errors}"
         " --correlation {output.correlation} > {log} 2>&1"
 
 
@@ -55,7 +55,7 @@ rule alignment_paper_tables:
     message:
         "Setting the paper's tables of scene 3 beside ours"
     shell:
-        "psfdae alignment paper-tables {params.inputs:q} --out {params.folder}"
+        "psfdae paper alignment paper-tables {params.inputs:q} --out {params.folder}"
         " > {log} 2>&1"
 
 
@@ -84,7 +84,7 @@ rule alignment_time:
     message:
         "Tabulating what the estimates of scene 3 cost"
     shell:
-        "psfdae alignment time-table {params.times:q} {params.histories:q} --out {output}"
+        "psfdae paper alignment time-table {params.times:q} {params.histories:q} --out {output}"
         " > {log} 2>&1"
 
 
@@ -108,7 +108,7 @@ rule figure_alignment_predicted:
     message:
         "Drawing estimates against the truth"
     shell:
-        "psfdae alignment figure predicted {params.inputs:q} --out {output} > {log} 2>&1"
+        "psfdae paper alignment figure predicted {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule figure_alignment_errors:
@@ -130,7 +130,7 @@ rule figure_alignment_errors:
     message:
         "Drawing errors against misalignment"
     shell:
-        "psfdae alignment figure errors {params.inputs:q} --out {output} > {log} 2>&1"
+        "psfdae paper alignment figure errors {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule figure_alignment_correlation:
@@ -150,7 +150,7 @@ rule figure_alignment_correlation:
     message:
         "Drawing correlations of errors"
     shell:
-        "psfdae alignment figure correlation {params.inputs:q} --out {output} > {log} 2>&1"
+        "psfdae paper alignment figure correlation {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule figure_alignment_stamps:
@@ -177,7 +177,7 @@ rule figure_alignment_stamps:
     message:
         "Drawing stamps of scene 3"
     shell:
-        "psfdae alignment figure stamps --config {params.config} {params.inputs:q}"
+        "psfdae paper alignment figure stamps --config {params.config} {params.inputs:q}"
         " --out {output} > {log} 2>&1"
 
 
@@ -199,7 +199,7 @@ rule figure_alignment_twin:
     message:
         "Drawing the twin ambiguity"
     shell:
-        "psfdae alignment figure twin --config {params.config} --table={output.table}"
+        "psfdae paper alignment figure twin --config {params.config} --table={output.table}"
         " --out={output.out} > {log} 2>&1"
 
 

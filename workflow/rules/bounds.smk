@@ -20,7 +20,7 @@ rule bank:
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
-        "psfdae bank --config {params.config} --out {output} > {log} 2>&1"
+        "psfdae paper bank --config {params.config} --out {output} > {log} 2>&1"
 
 
 rule dataset_bounds:
@@ -47,7 +47,7 @@ rule dataset_bounds:
     message:
         "Bounding the errors of {wildcards.dataset}"
     shell:
-        "psfdae bounds --config {params.config} --dataset {wildcards.dataset}"
+        "psfdae paper bounds --config {params.config} --dataset {wildcards.dataset}"
         " --stars {input.stars} --templates {input.templates} {params.bank:q}"
         " --growth {output.growth} --per-star {output.per_star} --out {output.summary}"
         " > {log} 2>&1"
@@ -73,7 +73,7 @@ rule dataset_optics:
     message:
         "Restoring {wildcards.dataset} by the optics of the telescope"
     shell:
-        "psfdae optics --config {params.config} --dataset {wildcards.dataset}"
+        "psfdae paper optics --config {params.config} --dataset {wildcards.dataset}"
         " --stars {input.stars} --bank {input.bank}"
         " --per-star {output.per_star} --out {output.summary} > {log} 2>&1"
 
@@ -93,7 +93,7 @@ rule psf_bounds:
     message:
         "Collecting the bounds of all datasets"
     shell:
-        "psfdae collect-bounds --out {output} {input} > {log} 2>&1"
+        "psfdae paper collect-bounds --out {output} {input} > {log} 2>&1"
 
 
 use rule psf_bounds as psf_bounds_growth with:
@@ -157,7 +157,7 @@ rule psf_efficiency:
     message:
         "Comparing all methods with the bounds"
     shell:
-        "psfdae efficiency {params.bounds:q} {params.best:q} --out {output}"
+        "psfdae paper efficiency {params.bounds:q} {params.best:q} --out {output}"
         " {input.methods} > {log} 2>&1"
 
 
@@ -178,7 +178,7 @@ rule paper_rows:
     message:
         "Setting the paper's errors beside the bounds"
     shell:
-        "psfdae paper-rows {params.inputs:q} --out {output} > {log} 2>&1"
+        "psfdae paper paper-rows {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule figure_bounds:
@@ -202,7 +202,7 @@ rule figure_bounds:
     message:
         "Drawing {wildcards.dataset}: errors above the bounds"
     shell:
-        "psfdae figure bounds --dataset {wildcards.dataset} --bounds {input.bounds}"
+        "psfdae paper figure bounds --dataset {wildcards.dataset} --bounds {input.bounds}"
         " --efficiency {input.efficiency}"
         " --out {output} > {log} 2>&1"
 
@@ -227,7 +227,7 @@ rule figure_efficiency:
     message:
         "Drawing {wildcards.dataset}: efficiency"
     shell:
-        "psfdae figure efficiency --dataset {wildcards.dataset}"
+        "psfdae paper figure efficiency --dataset {wildcards.dataset}"
         " --efficiency {input.efficiency}"
         " --out {output} > {log} 2>&1"
 
@@ -252,7 +252,7 @@ rule figure_bank_growth:
     message:
         "Drawing {wildcards.dataset}: growth of the bank"
     shell:
-        "psfdae figure bank-growth --dataset {wildcards.dataset} --growth {input.growth}"
+        "psfdae paper figure bank-growth --dataset {wildcards.dataset} --growth {input.growth}"
         " --out {output} > {log} 2>&1"
 
 
@@ -281,7 +281,7 @@ rule figure_headline:
     message:
         "Drawing the figure of the README"
     shell:
-        "psfdae figure headline --restored {input.restored} --level {params.level}"
+        "psfdae paper figure headline --restored {input.restored} --level {params.level}"
         " --bounds {input.bounds} --efficiency {input.efficiency} --out {output}"
         " > {log} 2>&1"
 

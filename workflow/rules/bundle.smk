@@ -28,7 +28,7 @@ for _method in (m for m in registered() if m.storage and m.packing):
         message:
             f"Packing {_method.look.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
         shell:
-            "psfdae bundle --config {params.config} --stars {input.stars} {params.model}"
+            "psfdae paper bundle --config {params.config} --stars {input.stars} {params.model}"
             " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"
             " {params.size} --out {output} > {log} 2>&1"
 
@@ -61,5 +61,5 @@ rule shipped:
     message:
         "Renewing the model that comes with the package"
     shell:
-        "psfdae ship --config {params.config} --stars {input.stars} {params.bundles}"
+        "psfdae paper ship --config {params.config} --stars {input.stars} {params.bundles}"
         " --out {params.folder} > {log} 2>&1"

@@ -15,7 +15,7 @@ rule scan:
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
     shell:
-        "psfdae scan --config {params.config} --dataset {wildcards.dataset} --out {output}"
+        "psfdae paper scan --config {params.config} --dataset {wildcards.dataset} --out {output}"
         " > {log} 2>&1"
 
 
@@ -51,5 +51,5 @@ rule calibrate:
     message:
         "Fitting noise, dynamic range and pixel scales to the paper"
     shell:
-        "psfdae calibrate --config {params.config} --out {params.folder}"
+        "psfdae paper calibrate --config {params.config} --out {params.folder}"
         " {params.scans:q} {params.stars:q} > {log} 2>&1"

@@ -14,10 +14,10 @@ def night_parts():
         )
     # Only a night needs this module, and every job reads this file.
     from psfdae.telescope.settings import read_telescope
-    from psfdae_paper.stages.night import NightError, listed_images
+    from psfdae_paper.stages.night import NightError, list_images
 
     try:
-        rows = listed_images(config["images"])
+        rows = list_images(config["images"])
         if config["telescope"]:
             # A wrong key stops before any job.
             read_telescope(Path(config["telescope"]))

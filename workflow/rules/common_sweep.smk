@@ -2,7 +2,7 @@ from snakemake.exceptions import WorkflowError
 
 from psfdae_paper.configuration.aligners import swept_networks
 from psfdae_paper.configuration.sweep import sweep_names
-from psfdae_paper.stages.sweep import training_class
+from psfdae_paper.stages.sweep import training_module
 from psfdae_paper.sweeps.points import plan_sweep
 
 SWEEPS = f"{RESULTS}/sweeps"
@@ -54,9 +54,7 @@ def sweep_source(name):
     sweep = sweep_plan(name).sweep
     search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
     own = [] if sweep.model in swept_networks() else [method(sweep.model).__module__]
-    return source_hash(
-        "sweep point", training_class(sweep.model).partition(":")[0], *own, *search
-    )
+    return source_hash("sweep point", training_module(sweep.model), *own, *search)
 
 
 def sweep_results(w):

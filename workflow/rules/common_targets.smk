@@ -1,4 +1,4 @@
-from psfdae_paper.configuration.aligners import ALIGNERS, trained_networks
+from psfdae_paper.configuration.aligners import ESTIMATORS, trained_networks
 from psfdae.denoise.bundle import SUFFIX
 
 with one_line():
@@ -158,4 +158,4 @@ def methods_shown():
 
 def aligners_shown():
     """Labels of the methods of scene 3."""
-    return [aligner.look.label for aligner in ALIGNERS.values() if aligner.network]
+    return [estimator.look.label for estimator in ESTIMATORS.values() if estimator.network]

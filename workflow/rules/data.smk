@@ -12,7 +12,7 @@ rule templates:
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
     shell:
-        "psfdae templates --config {params.config} --out {output} > {log} 2>&1"
+        "psfdae paper templates --config {params.config} --out {output} > {log} 2>&1"
 
 
 rule stars:
@@ -34,5 +34,5 @@ rule stars:
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:
-        "psfdae stars --config {params.config} --templates {input.templates}"
+        "psfdae paper stars --config {params.config} --templates {input.templates}"
         " --out {output} > {log} 2>&1"

@@ -20,7 +20,7 @@ rule evaluate:
     message:
         "Evaluating {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
     shell:
-        "psfdae evaluate --config {params.config} --dataset {wildcards.dataset}"
+        "psfdae paper evaluate --config {params.config} --dataset {wildcards.dataset}"
         " --split {wildcards.split} --reference {wildcards.reference}"
         " --stars {input.stars} {params.models} --per-star {output.per_star}"
         " --restored {output.restored} --out {output.summary} > {log} 2>&1"
@@ -54,7 +54,7 @@ rule paper_tables:
     message:
         "Writing the paper's tables of {wildcards.dataset}"
     shell:
-        "psfdae paper-tables --dataset {wildcards.dataset} {params.out} {input}"
+        "psfdae paper paper-tables --dataset {wildcards.dataset} {params.out} {input}"
         " > {log} 2>&1"
 
 
@@ -75,7 +75,7 @@ rule held_out:
     message:
         "Comparing held-out with seen fields, star by star"
     shell:
-        "psfdae held-out --out {output} {input} > {log} 2>&1"
+        "psfdae paper held-out --out {output} {input} > {log} 2>&1"
 
 
 rule psf_metrics:
@@ -96,4 +96,4 @@ rule psf_metrics:
     message:
         "Collecting the metrics of all datasets"
     shell:
-        "psfdae collect --out {output} {input} > {log} 2>&1"
+        "psfdae paper collect --out {output} {input} > {log} 2>&1"

@@ -19,7 +19,7 @@ rule figure_templates:
     message:
         "Drawing the static PSFs of scene {wildcards.scene}"
     shell:
-        "psfdae figure {params.kind} --templates {input} --out {output} > {log} 2>&1"
+        "psfdae paper figure {params.kind} --templates {input} --out {output} > {log} 2>&1"
 
 
 use rule figure_templates as figure_energy with:
@@ -63,7 +63,7 @@ rule figure_strip:
     message:
         "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
     shell:
-        "psfdae figure strip --restored {input} {params.levels} --out {output}"
+        "psfdae paper figure strip --restored {input} {params.levels} --out {output}"
         " > {log} 2>&1"
 
 
@@ -88,7 +88,7 @@ rule figure_curves:
     message:
         "Drawing the training curves of {wildcards.dataset}"
     shell:
-        "psfdae figure curves {params.labels:q} --out {output} {input} > {log} 2>&1"
+        "psfdae paper figure curves {params.labels:q} --out {output} {input} > {log} 2>&1"
 
 
 rule figure_errors:
@@ -115,5 +115,5 @@ rule figure_errors:
     message:
         "Drawing errors of {wildcards.dataset} against the noise level"
     shell:
-        "psfdae figure errors --dataset {wildcards.dataset} {params.out} {input}"
+        "psfdae paper figure errors --dataset {wildcards.dataset} {params.out} {input}"
         " > {log} 2>&1"

@@ -43,6 +43,6 @@ for _method in (m for m in registered() if m.storage):
         message:
             f"Fitting {_method.look.label} to {fit_files.stem(_method, *_names)}"
         shell:
-            "psfdae fit {params.method} --config {params.config} --stars {input.stars}"
+            "psfdae paper fit {params.method} --config {params.config} --stars {input.stars}"
             " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"
             " --out {params.place} > {log} 2>&1"

@@ -21,7 +21,7 @@ rule night_images:
     message:
         "Measuring images of part {wildcards.part}"
     shell:
-        "psfdae night images --rows {params.rows} --folder {params.folder} --out {output}"
+        "psfdae paper night images --rows {params.rows} --folder {params.folder} --out {output}"
         " > {log} 2>&1"
 
 
@@ -40,7 +40,7 @@ rule night_table:
     message:
         "Judging the images of the night"
     shell:
-        "psfdae night table {input} --out {output.csv} > {log} 2>&1"
+        "psfdae paper night table {input} --out {output.csv} > {log} 2>&1"
 
 
 rule night_page:
@@ -59,7 +59,7 @@ rule night_page:
     message:
         "Drawing the night"
     shell:
-        "psfdae night page --table {input} --folder {params.folder} --out {output}"
+        "psfdae paper night page --table {input} --folder {params.folder} --out {output}"
         " > {log} 2>&1"
 
 
@@ -94,4 +94,4 @@ rule night:
     message:
         "Counting the images of the night"
     shell:
-        "psfdae night count {input.table} 2>&1 | tee {log}"
+        "psfdae paper night count {input.table} 2>&1 | tee {log}"

@@ -22,7 +22,7 @@ rule example_field:
     message:
         "Simulating an image of a star field"
     shell:
-        "psfdae example-field --out {output.image} --catalogue {output.catalogue}"
+        "psfdae example field --out {output.image} --catalogue {output.catalogue}"
         " > {log} 2>&1"
 
 
@@ -60,7 +60,7 @@ rule own_stars:
     message:
         "Training on the bright stars of the image"
     shell:
-        "psfdae from-stars {input.image} --config {params.config} --name example"
+        "psfdae train {input.image} --config {params.config} --name example"
         " --catalogue {input.catalogue} --licence MIT --overwrite --out {params.folder}"
         " > {log} 2>&1"
 

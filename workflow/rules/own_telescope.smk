@@ -60,5 +60,5 @@ rule figure_telescope:
     message:
         "Drawing the static PSFs of the telescope of {wildcards.stars}"
     shell:
-        "psfdae figure telescope --templates {input} --table {output.table}"
+        "psfdae paper figure telescope --templates {input} --table {output.table}"
         " --out {output.picture} > {log} 2>&1"

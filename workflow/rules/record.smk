@@ -19,4 +19,4 @@ rule runtime:
     message:
         "Collecting what the jobs cost"
     shell:
-        "psfdae runtime --results {params.results} --out {output} > {log} 2>&1"
+        "psfdae paper runtime --results {params.results} --out {output} > {log} 2>&1"

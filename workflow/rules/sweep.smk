@@ -50,7 +50,7 @@ rule sweep_point:
     message:
         "Training point {wildcards.point} of sweep {wildcards.sweep}"
     shell:
-        "psfdae sweep point {wildcards.sweep} {params.data:q}"
+        "psfdae paper sweep point {wildcards.sweep} {params.data:q}"
         " --checkpoint {params.checkpoint} --out {params.folder}"
         " {params.given:q} > {log} 2>&1"
 
@@ -82,7 +82,7 @@ rule sweep_summary:
     message:
         "Summarising sweep {wildcards.sweep}"
     shell:
-        "psfdae sweep summary {wildcards.sweep} --points {params.points}"
+        "psfdae paper sweep summary {wildcards.sweep} --points {params.points}"
         " --out {params.folder} {params.given:q} > {log} 2>&1"
 
 
@@ -111,7 +111,7 @@ rule figure_sweep:
     message:
         "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
     shell:
-        "psfdae sweep figure {wildcards.sweep_figure} --definition {input.definition}"
+        "psfdae paper sweep figure {wildcards.sweep_figure} --definition {input.definition}"
         " --table {input.summary} --out {output} > {log} 2>&1"
 
 
@@ -140,7 +140,7 @@ rule track_sweep:
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
     shell:
-        "psfdae track --results {params.results} --preset {params.preset}"
+        "psfdae paper track --results {params.results} --preset {params.preset}"
         " --database {params.database} --sweep {wildcards.sweep} --out {output}"
         " > {log} 2>&1"
 

@@ -21,7 +21,7 @@ rule track:
     message:
         "Importing the runs of {wildcards.dataset} into MLflow"
     shell:
-        "psfdae track --results {params.results} --preset {params.preset}"
+        "psfdae paper track --results {params.results} --preset {params.preset}"
         " --database {params.database} {params.what} --out {output} > {log} 2>&1"
 
 

@@ -484,6 +484,9 @@ def _option(name: str, hint: Any, default: Any, meaning: str | None = None) -> c
     required = default is Parameter.empty
     if attributes.pop("argument", False):
         nargs = -1 if attributes.pop("multiple", False) else 1
+        # Before version 8.5, arguments of click have no help.
+        if "help" not in signature(click.Argument).parameters:
+            attributes.pop("help", None)
         return click.Argument([name], required=required, nargs=nargs, **attributes)
     # The help shows a default, unless it is that nothing is given.
     attributes["required"] = required

@@ -1,17 +1,17 @@
 """Poisson likelihood of the stamps of a state: its Fisher information, its bound, its maximum.
 
 Photon counts are Poisson, n ~ Poisson(F p + B). Their Fisher information about
-the state t, per pixel F² ∂p ∂pᵀ / (F p + B), is that of a Gaussian with the
+the state t, per pixel F² ∂p ∂pᵀ / (F p + B), equals the one of a Gaussian with the
 variance (κλ)² + p/F, summed over pixels and fields (Kay 1993, chapter 3).
 
 Flux and centroid of a star are unknown. With an operator of movable stamps they
 are parameters, too: (n, 4) states become (n, 4 + 3F) parameters. After the
 state come three for each stamp in turn: the difference of its flux from 1, and the
-place (x, y) of its star in pixels.
+position (x, y) of its star in pixels.
 
 Fits follow the steps of `psfdae.sensing.climbing`. An emulator of the optics takes them most of
-the way, to a maximum that is a part of a standard error off; the last step uses the optics that
-made the data.
+the way, to within a fraction of a standard error of the maximum; the last step uses the optics
+that simulated the data.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ class StateOptics:
     Attributes
     ----------
     model : QuadraticModel
+        Zernike coefficients of a state at all fields.
     operator : AlignmentStamps
+        Propagation from Zernike coefficients to centred stamps.
     emulator : StampFunction, optional
         Source of the derivatives by the state, for stars in the centre of their stamps.
     """
@@ -56,9 +58,9 @@ class StateOptics:
     operator: AlignmentStamps
     emulator: StampFunction | None = None
 
-    def parameters_of(self, states: np.ndarray) -> np.ndarray:
+    def to_parameters(self, states: np.ndarray) -> np.ndarray:
         """Complete states (n, 4) to parameters, with flux 1 and the star in the stamp's centre."""
-        # Three zeros for each stamp: flux 1 + 0, place (0, 0).
+        # Three zeros for each stamp: flux 1 + 0, position (0, 0).
         count = 3 * len(self.model.coefficients) * self.operator.movable
         return np.pad(states, ((0, 0), (0, count)))
 
@@ -67,7 +69,9 @@ class StateOptics:
 
         Parameters
         ----------
-        parameters : ndarray, shape (n, 4) or, if stamps are movable, (n, 4 + 3F)
+        parameters : ndarray, shape (n, 4) or (n, 4 + 3F)
+            States in units of the range; if stamps are movable, followed by the difference of the
+            flux from 1 and the position (x, y) in pixels of each of the F stamps.
 
         Returns
         -------
@@ -83,7 +87,7 @@ class StateOptics:
         if self.emulator is not None:
             directions = directions[:, :, :0]
         if self.operator.movable:
-            # The place of the star is two more coefficients of the wavefront.
+            # The position of the star is two more coefficients of the wavefront.
             star_parameters = star_parameters.reshape(*zernikes.shape[:2], 3)
             zernikes = np.concatenate([zernikes, star_parameters[:, :, 1:]], axis=2)
             directions = np.pad(directions, ((0, 0), (0, 0), (0, 0), (0, 2)))
@@ -100,7 +104,7 @@ class StateOptics:
         return flux * shapes, slopes
 
 
-def deviance_and_information(
+def compute_deviance(
     noise: NoiseModel, level: float, images: np.ndarray, stamps: np.ndarray, slopes: np.ndarray
 ) -> Evaluation:
     """Compute the deviance of noisy stamps from expected ones, and its derivatives.
@@ -108,10 +112,15 @@ def deviance_and_information(
     Parameters
     ----------
     noise : NoiseModel
+        Photon noise of star and sky.
     level : float
         Noise level λ.
+    images : ndarray, shape (n, F, d, d)
+        Observed stamps, normalised by the true flux.
     images, stamps : ndarray, shape (n, F, d, d)
         Observed and expected stamps, normalised by the true flux.
+    stamps : ndarray, shape (n, F, d, d)
+        Expected stamps, normalised by the true flux.
     slopes : ndarray, shape (n, F, k, d, d)
         Derivatives by the parameters of each stamp: the first four are shared by all.
 
@@ -127,19 +136,19 @@ def deviance_and_information(
     count, fields, k = slopes.shape[:3]
     flux, sky = noise.flux(level), noise.background
     # Counts F p + B of every stamp by itself.
-    observed, expected = (
+    observed_counts, expected_counts = (
         flux * array.reshape(count * fields, -1).astype(np.float64) + sky
         for array in (images, stamps)
     )
     slopes = flux * slopes.reshape(count * fields, k, -1).astype(np.float64)
-    deviance, score, information = poisson_information(observed, expected, slopes)
+    deviance, score, information = poisson_information(observed_counts, expected_counts, slopes)
     # Photons of different fields are independent: their information about the state adds up.
     information = information.reshape(count, fields, k, k)
     score, information = combine_images(score.reshape(count, fields, k), information, 4)
     return deviance.reshape(count, fields).sum(axis=1), score, information
 
 
-def bound_covariances(
+def compute_bounds(
     optics: StateOptics,
     noise: NoiseModel,
     levels: list[float],
@@ -151,12 +160,15 @@ def bound_covariances(
     Parameters
     ----------
     optics : StateOptics
+        Optics, which give stamps and their derivatives.
     noise : NoiseModel
+        Photon noise of star and sky.
     levels : list of float
         Noise levels λ, L in all.
     states : ndarray, shape (n, 4)
+        True states, in units of the range.
     unknown_flux : sequence of bool
-        A bound each: True if flux and place of the stars are unknown, for which the stamps of
+        A bound each: True if flux and position of the stars are unknown, for which the stamps of
         `optics` must be movable.
 
     Returns
@@ -169,19 +181,17 @@ def bound_covariances(
     covariances = np.empty((len(unknown_flux), len(levels), len(states), 4, 4))
     for start in steps("bounds of states", range(0, len(states), 64)):
         part = slice(start, start + 64)
-        stamps, slopes = optics(optics.parameters_of(states[part]))
+        stamps, slopes = optics(optics.to_parameters(states[part]))
         for bound, level in np.ndindex(covariances.shape[:2]):
             # The inverse of the Fisher matrix by all parameters; its part for the state is the
             # bound with the others unknown.
             by_parameters = slopes if unknown_flux[bound] else slopes[:, :, :4]
-            information = deviance_and_information(
-                noise, levels[level], stamps, stamps, by_parameters
-            )[2]
+            information = compute_deviance(noise, levels[level], stamps, stamps, by_parameters)[2]
             covariances[bound, level, part] = np.linalg.inv(information)[:, :4, :4]
     return covariances
 
 
-def expected_abs_error(covariances: np.ndarray) -> np.ndarray:
+def compute_mean_abs_error(covariances: np.ndarray) -> np.ndarray:
     """Return the mean absolute error of normal errors, √(2/π) σ, (..., K, K) to (..., K)."""
     # ⟨|e|⟩ = ∫ |e| N(e; 0, σ²) de.
     sigma = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
@@ -195,8 +205,11 @@ class StateLikelihood:
     Attributes
     ----------
     stamps : StampFunction
+        Expected stamps and their derivatives as a function of the parameters.
     noise : NoiseModel
+        Photon noise of star and sky.
     level : float
+        Noise level λ.
     images : ndarray, shape (n, F, d, d)
         Noisy stamps of n states, normalised by the true flux.
     """
@@ -208,7 +221,7 @@ class StateLikelihood:
 
     def evaluate(self, rows: np.ndarray, parameters: np.ndarray) -> Evaluation:
         """Evaluate the log-likelihood of some states, as `psfdae.sensing.climbing.Evaluate`."""
-        deviance, score, information = deviance_and_information(
+        deviance, score, information = compute_deviance(
             self.noise, self.level, self.images[rows], *self.stamps(parameters)
         )
         return -0.5 * deviance, score, information
@@ -216,14 +229,15 @@ class StateLikelihood:
     def maximise(self, start: np.ndarray, settings: Fit) -> Peaks:
         """Fit the states to their stamps, each from one starting point.
 
-        A step of at most `settings.tolerance` standard errors of the state is the last.
+        The fit ends with a step of at most `settings.tolerance` standard errors of the state.
 
         Parameters
         ----------
         start : ndarray, shape (n, K)
             Parameters in units of the range, K = 4, or more with movable stamps; limited to
             ± `settings.limit`.
-        settings : config group `fit`
+        settings : Fit
+            Group `fit`: tolerance, limit, largest number of steps and initial damping.
 
         Returns
         -------
@@ -247,34 +261,37 @@ class StateLikelihood:
 def refit_twins(
     likelihood: StateLikelihood, fit: Peaks, model: QuadraticModel, settings: Fit
 ) -> tuple[Peaks, np.ndarray]:
-    """Fit again from the twins of fitted states, and take the more likely of both fits.
+    """Fit again from the twins of fitted states, and select the more likely of both fits.
 
     In focus, a state and its twin have nearly the same stamps.
 
     Parameters
     ----------
     likelihood : StateLikelihood
+        Likelihood of the stamps of all n states.
     fit : Peaks
         Result of the first fit; left unchanged.
     model : QuadraticModel
-    settings : config group `fit`
+        Model of the wavefront, from which the twins follow.
+    settings : Fit
+        Group `fit`, as for the first fit.
 
     Returns
     -------
-    improved : Peaks
+    best_fit : Peaks
         `evaluations` count both fits.
     in_range : ndarray of bool, shape (n,)
         True where the twin lies within the limit, and so was a starting point.
     """
-    # Twins beyond the limit are no states that the fit could reach.
+    # The fit cannot reach twins outside the limit.
     twins = twin_states(model, fit.parameters)
     in_range = (np.abs(twins) <= settings.limit).all(axis=1)
-    improved = deepcopy(fit)
+    best_fit = deepcopy(fit)
     if in_range.any():
-        of_twins = replace(likelihood, images=likelihood.images[in_range])
-        twin_fit = of_twins.maximise(twins[in_range], settings)
+        twin_likelihood = replace(likelihood, images=likelihood.images[in_range])
+        twin_fit = twin_likelihood.maximise(twins[in_range], settings)
         # Heights are negative: the twin must be higher by more than the rounding of the deviance.
         is_higher = twin_fit.height > fit.height[in_range] * (1.0 - 1e-6)
-        improved.overwrite(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
-        improved.evaluations[in_range] += twin_fit.evaluations
-    return improved, in_range
+        best_fit.overwrite(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
+        best_fit.evaluations[in_range] += twin_fit.evaluations
+    return best_fit, in_range

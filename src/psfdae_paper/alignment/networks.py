@@ -6,7 +6,8 @@ and strides are not in the paper's text; the configuration names them.
 
 The faster one is a perceptron behind the leading principal components of all stamps together:
 states have four numbers, so that a hundred components hold the information of the stamps about
-them, and stamps that are always centred need no convolution. It learns in a seventh of the time.
+them, and stamps that are always centred need no convolution. Its training takes a seventh of the
+time.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ class AlignmentPerceptron(nn.Module):
 Network = AlignmentCnn | AlignmentPerceptron
 
 
-def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Network:
+def make_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Network:
     """Make the network of a configuration, before it has its weights.
 
     Parameters
@@ -154,11 +155,17 @@ def build_network(
 
     Parameters
     ----------
-    config, fields, stamp_px : as for `empty_network`
+    config : Cnn or Perceptron
+        Settings of the layers; the class decides the kind of network.
+    fields : int
+        Stamps per state.
+    stamp_px : int
+        Side d of a stamp.
     generator : torch.Generator
+        Source of the initial weights.
     """
     # The gain of He's rule depends on the slope of the rectifier below 0.
-    model = channels_last(empty_network(config, fields, stamp_px))
+    model = channels_last(make_network(config, fields, stamp_px))
     leak = getattr(config, "leak", 0.0)
     with torch.no_grad():
         for layer in model.features:
@@ -192,7 +199,9 @@ def predict_states(
     Parameters
     ----------
     model : Module
+        Trained network.
     stamps : ndarray, shape (n, fields, d, d)
+        Stamps of sum 1.
     batch : int
         States that are estimated together.
     mirrors : sequence of Mirror
@@ -225,12 +234,13 @@ class TrainingStates:
     Attributes
     ----------
     states : ndarray, shape (n, 4)
+        States in units of the range.
     stamps : ndarray, shape (n, F, d, d) or (D, n, F, d, d)
-        Stamps, or D draws of their noise, of which every field shows one at random.
+        Stamps, or D draws of their noise; a random draw is used for every field.
     noise : NoiseModel, optional
-        Noise that is drawn anew for every batch.
+        Noise that is drawn again for every batch.
     levels : sequence of float
-        Noise levels λ, of which each state of a batch gets one at random.
+        Noise levels λ; each state of a batch has a random one.
     """
 
     states: np.ndarray
@@ -238,7 +248,7 @@ class TrainingStates:
     noise: NoiseModel | None = None
     levels: Sequence[float] = ()
 
-    def with_noise(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def add_noise(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Add noise of random levels to stamps, if there is noise.
 
         It is drawn from a normal distribution, which is faster than Poisson counts.
@@ -251,15 +261,20 @@ class TrainingStates:
 
 
 class NetworkTraining(Training):
-    """Training of a network; order, noise and mirror images are drawn anew in every epoch.
+    """Training of a network; order, noise and mirror images are drawn again in every epoch.
 
     The history has the mean squared error in units of the range.
 
     Parameters
     ----------
     data : TrainingStates
-    network, settings : config groups
+        States and their stamps, and the noise to draw.
+    network : Cnn or Perceptron
+        Settings of the layers.
+    settings : NetworkTrain
+        Batch size, epochs, learning rate, and whether states are mirrored.
     seed : int
+        Seed of the experiment; all random streams derive from it.
     name : str
         Name of the network; part of the address of its random streams.
     """
@@ -274,7 +289,7 @@ class NetworkTraining(Training):
         seed: int,
         name: str,
     ) -> None:
-        # Mirror images of the telescope, if the settings want them.
+        # Mirror images of the telescope, depending on the settings.
         self.data, self.seed, self.name = data, seed, name
         fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
         self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
@@ -292,9 +307,9 @@ class NetworkTraining(Training):
             rate=lambda epoch: settings.decay ** (epoch // settings.decay_epochs),
         )
 
-    def _shuffled(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        """Yield the numbers of the states of every batch of an epoch."""
-        # A random order of all states, cut into batches.
+    def _shuffle_states(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
+        """Yield the numbers of the states of every batch of an epoch, in random order."""
+        # A permutation of all states, cut into batches.
         order = rng.permutation(len(self.data.states))
         for start in range(0, order.size, self.settings.batch)[: self.steps]:
             yield order[start : start + self.settings.batch]
@@ -302,10 +317,10 @@ class NetworkTraining(Training):
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Yield stamps (B, fields, d, d) and states (B, 4) of every batch of an epoch."""
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
-        for numbers in self._shuffled(rng):
+        for numbers in self._shuffle_states(rng):
             # Noise, then a mirror image: all states of a batch are mirrored alike.
             images, truth = self._draw_stamps(numbers, rng), self.data.states[numbers]
-            images = self.data.with_noise(images, rng)
+            images = self.data.add_noise(images, rng)
             if self.mirrors:
                 mirror = self.mirrors[rng.integers(len(self.mirrors))]
                 images, truth = mirror.stamps(images), mirror.states(truth)
@@ -332,11 +347,11 @@ class NetworkTraining(Training):
 
 
 class PerceptronTraining(NetworkTraining):
-    """Training behind principal components, which are computed once, and so is their noise.
+    """Training on principal components, which are computed once, and so is their noise.
 
     The span of the components of all mirror images is mirrored onto itself, so that mirror images
     are matrix products of components. Noise is normal, with the covariance that it has in the mean
-    stamps of all states: a batch draws a number for each component in place of each pixel.
+    stamps of all states: a batch draws a number for each component instead of each pixel.
     """
 
     model: AlignmentPerceptron
@@ -349,10 +364,10 @@ class PerceptronTraining(NetworkTraining):
         if self.mirrors:
             clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
         self.model.fit_components(scale_stamps(clean))
-        # Variance 1 together with the noise: that of component k is (RᵀR)_kk, the mean over all λ.
+        # Variance 1 with noise, whose variance in component k is the mean of (RᵀR)_kk over all λ.
         noise_variance = [np.square(root).sum(axis=0) for root in self.roots] or [np.zeros(1)]
         self.model.axes /= torch.from_numpy(np.sqrt(1.0 + np.mean(noise_variance, axis=0))).float()
-        del self.roots  # they are those of the axes before
+        del self.roots  # computed with the axes before they were scaled
 
     @cached_property
     def parts(self) -> np.ndarray:
@@ -370,13 +385,13 @@ class PerceptronTraining(NetworkTraining):
         # (x_f − mean_f)·axes_f of every field f; the sum over fields are the components.
         parts = np.empty((draws, count, fields, axes.shape[-1]), np.float32)
         for draw, field in np.ndindex(draws, fields):
-            scaled = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
-            parts[draw, :, field] = (scaled - mean[field]) @ axes[field]
+            scaled_stamps = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
+            parts[draw, :, field] = (scaled_stamps - mean[field]) @ axes[field]
         return parts if draws > 1 else parts.sum(axis=2, keepdims=True)
 
     @cached_property
-    def mirrored(self) -> list[np.ndarray]:
-        """Matrix T of each mirror, shape (K, K), from components to those of mirrored stamps.
+    def mirror_matrices(self) -> list[np.ndarray]:
+        """Matrix T of each mirror, shape (K, K): from components to components of mirrored stamps.
 
         With a mirror P of stamps x and axes A, (P x)·A = x·(Pᵀ A). T solves Pᵀ A = A T, which is
         the same as A = P A T.
@@ -409,14 +424,14 @@ class PerceptronTraining(NetworkTraining):
         """Yield components (B, K) and states (B, 4) of every batch of an epoch."""
         draws, _, fields, _ = self.parts.shape
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
-        for numbers in self._shuffled(rng):
+        for numbers in self._shuffle_states(rng):
             # As in the base class: a draw for every field, then a mirror image of the batch.
             draw = rng.integers(draws, size=(numbers.size, fields))
             components = self.parts[draw, numbers[:, None], np.arange(fields)].sum(axis=1)
             truth = self.data.states[numbers]
             if self.mirrors:
                 mirror = rng.integers(len(self.mirrors))
-                components = components @ self.mirrored[mirror]
+                components = components @ self.mirror_matrices[mirror]
                 truth = self.mirrors[mirror].states(truth)
             # Every state has the noise of one λ: white numbers times the root of its covariance.
             if self.roots:
@@ -432,12 +447,12 @@ class PerceptronTraining(NetworkTraining):
         return nn.functional.mse_loss(self.model.states(components), states)
 
 
-def training_of(
+def make_training(
     network: Cnn | Perceptron, data: TrainingStates, settings: NetworkTrain, seed: int, name: str
 ) -> NetworkTraining:
-    """Make the training of a kind of network; arguments as those of `NetworkTraining`.
+    """Make the training of a kind of network; arguments as for `NetworkTraining`.
 
-    Perceptrons learn from principal components, CNNs from stamps.
+    Perceptrons are trained on principal components, CNNs on stamps.
     """
     if isinstance(network, Cnn):
         return NetworkTraining(data, network, settings, seed, name)

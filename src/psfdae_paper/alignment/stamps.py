@@ -2,8 +2,8 @@
 
 The centroid of an image lies at the mean slope of the wavefront over the lit
 pupil. Every Zernike polynomial therefore takes its own tilt along that cancels
-its mean slope, once; the centring stays linear in the coefficients and a
-derivative of a stamp is that of the centred stamp.
+its mean slope, once; the centring stays linear in the coefficients, and derivatives
+are derivatives of centred stamps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class EnergyError(Error, ValueError):
 def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
     """Return the mean gradient (x, y) of Noll polynomial j over an annulus, per pupil radius.
 
-    By the divergence theorem it is an integral along the two rims, which vanishes but for terms
+    By the divergence theorem it is an integral along the two rims, which vanishes except for terms
     with one cycle per turn, |m| = 1.
     """
     n, m = noll_to_nm(j)
@@ -51,7 +51,7 @@ def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
     return (slope, 0.0) if m > 0 else (0.0, slope)
 
 
-def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def centre_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the OPD of unit Zernike coefficients with their centring tilts, (highest − 3, ...).
 
     The OPD is in waves. Its sign turns the lead of a wavefront, which coefficients count, into an
@@ -83,7 +83,12 @@ class AlignmentStamps:
 
     Parameters
     ----------
-    telescope, optics, alignment : config groups
+    telescope : Telescope
+        Obscuration and pixel scale of the telescope.
+    optics : WholePeriodOptics
+        Sampling and precision of the propagation.
+    alignment : Alignment
+        Size of the stamps, highest Zernike term and minimum light in a stamp.
     movable : bool
         Two more coefficients, the last, move the stamp's star along x and y, in pixels.
     """
@@ -97,7 +102,7 @@ class AlignmentStamps:
     ) -> None:
         self.alignment, self.movable = alignment, movable
         # Pupil modes whose sum is the OPD of a centred stamp.
-        modes: PupilModes = partial(centred_modes, alignment.highest_zernike, telescope.obscuration)
+        modes: PupilModes = partial(centre_modes, alignment.highest_zernike, telescope.obscuration)
         if movable:
             modes = partial(movable_modes, modes, telescope.pixel)
         # Stamps are nearly as wide as the period of the image, which is transformed whole.
@@ -131,11 +136,11 @@ class AlignmentStamps:
         Raises
         ------
         SamplingError
-            If the largest grid size is below what a wavefront needs.
+            If a wavefront needs more samples than the largest grid has.
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
-        # One list of wavefronts, whatever the leading axes are; then light 1 in each stamp.
+        # Flatten the leading axes to one list of wavefronts; then normalise the stamps to flux 1.
         shape = zernikes.shape[:-1]
         raw = self.propagation.stamps(zernikes.reshape(-1, zernikes.shape[-1]))
         stamps, energy = normalise_flux(raw)
@@ -152,8 +157,8 @@ class AlignmentStamps:
         zernikes : ndarray, shape (..., J)
             Coefficients in waves.
         directions : ndarray, shape (..., K, J)
-            Changes of the coefficients per unit parameter, such as those of
-            `QuadraticModel.jacobian`.
+            Changes of the coefficients per unit parameter, such as
+            `QuadraticModel.jacobian` returns.
 
         Returns
         -------
@@ -161,12 +166,12 @@ class AlignmentStamps:
             Each sums to 1.
         derivatives : ndarray, shape (..., K, d, d)
             Derivatives per unit parameter; each sums to 0. If stamps are movable, two more follow,
-            by the place of the star along x and y in pixels.
+            by the position of the star along x and y in pixels.
 
         Raises
         ------
         SamplingError
-            If the largest grid size is below what a wavefront needs.
+            If a wavefront needs more samples than the largest grid has.
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
@@ -174,7 +179,7 @@ class AlignmentStamps:
         # An emulator may give all derivatives: only the stamps are left to compute.
         if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
-        # One list of wavefronts, whatever the leading axes are.
+        # Flatten the leading axes to one list of wavefronts.
         zernikes, directions = (
             array.reshape(prod(shape), *array.shape[len(shape) :])
             for array in (zernikes, directions)
@@ -187,7 +192,7 @@ class AlignmentStamps:
 
     def _check_energy(self, energy: np.ndarray) -> None:
         """Raise EnergyError if a stamp holds too small a fraction of the light."""
-        # Light beyond the stamp is missing from its flux. "not >=" refuses NaN, too.
+        # Light outside the stamp is missing from its flux. "not >=" rejects NaN, too.
         minimum = self.alignment.least_energy
         if not energy.min() >= minimum:
             darkest = int(energy.argmin())

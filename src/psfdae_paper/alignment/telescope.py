@@ -6,8 +6,8 @@ Wavefronts leave out piston and tilts: all fields move together with the seconda
 a stamp is centred on its own centroid.
 
 Rays are needed for 25 states only. Zernike coefficients are quadratic functions of a
-state, and the 15 terms of a fit give the wavefront of any state within the range at
-once, and its exact derivatives.
+state: 15 fitted terms give the wavefront of any state within the range, and its exact
+derivatives, at once.
 
 An aligned telescope and its ring of field points look the same in a mirror through
 the axis. Its image is the telescope with the mirrored misalignment: a decentre is a
@@ -72,7 +72,12 @@ class StateTracer(ZernikeTracer):
 
     Parameters
     ----------
-    telescope, prescription, alignment : config groups
+    telescope : Telescope
+        Diameter and wavelength.
+    prescription : Prescription
+        Surfaces of the telescope.
+    alignment : Alignment
+        Field points, range of the misalignment and defocus of the CCD.
 
     Attributes
     ----------
@@ -101,7 +106,7 @@ class StateTracer(ZernikeTracer):
         """
         # The range is that for which the model of the wavefront is tested.
         states = np.atleast_2d(np.asarray(states, float))
-        # Ends of a grid are rounded: 1e-9 of the range is no mistake.
+        # Ends of a grid are rounded: 1e-9 of the range is allowed.
         is_outside = ~(np.abs(states) <= 1.0 + 1e-9)
         if is_outside.any():
             state, axis = np.argwhere(is_outside)[0]
@@ -127,7 +132,7 @@ class Mirror:
     state_matrix : ndarray, shape (4, 4)
         Signed permutation of the four numbers of a state.
     fields : ndarray of int, shape (F,)
-        The mirrored telescope's stamp at field k is that of field `fields[k]`.
+        The mirrored telescope shows at field k the mirrored stamp of field `fields[k]`.
     """
 
     symmetry: Symmetry
@@ -152,7 +157,7 @@ def mirror_symmetries(points: int) -> list[Mirror]:
     fields, mirrors = field_points(45.0, points), []
     for symmetry in SYMMETRIES:
         matrix = symmetry.matrix
-        # The mirrored telescope shows at p what the telescope shows at matrix⁻¹ p.
+        # The mirrored telescope shows at p the stamp that the telescope shows at matrix⁻¹ p.
         distance = np.linalg.norm((fields @ matrix)[:, None] - fields, axis=2)
         if distance.min(axis=1).max() < 1e-9:  # no field point maps between two
             # A decentre moves as a vector, a tilt as an axial vector: with the determinant ±1.
@@ -246,6 +251,7 @@ def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     model : QuadraticModel
+        Model of the wavefront; only its linear terms are used.
     tilts : ndarray, shape (n, 2)
         Tilts in units of the range.
 
@@ -264,11 +270,10 @@ def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray) -> np.ndarray:
 def twin_states(model: QuadraticModel, states: np.ndarray) -> np.ndarray:
     """Return states with the opposite tilt and the same field-constant coma, shape (n, 4).
 
-    In focus their stamps hardly differ from those of `states`; parameters after the four are
-    unchanged.
+    In focus both have nearly the same stamps. Parameters after the four are unchanged.
     """
     # From t to −t on the line of tilt and coma-free decentre through the state: the decentre
-    # changes by that of −2 t.
+    # changes by the coma-free decentre of −2 t.
     tilts = states[:, 2:4]
     decentre = states[:, :2] + coma_free_decentre(model, -2.0 * tilts)
     return np.concatenate([decentre, -tilts, states[:, 4:]], axis=1)

@@ -12,7 +12,7 @@ from psfdae.methods.interface import Look
 
 
 @dataclass(frozen=True)
-class Aligner:
+class Estimator:
     """Method that estimates states of misalignment, or a bound of such estimates.
 
     To add a network, add one of these with `states`, and its settings `train_<name>` to
@@ -69,14 +69,14 @@ class Aligner:
         return bool(self.network) and not self.unknown_flux
 
 
-ALIGNERS = {
-    aligner.name: aligner
-    for aligner in (
+ESTIMATORS = {
+    estimator.name: estimator
+    for estimator in (
         # The aligned telescope, whatever the stamps: the error that a method must beat.
-        Aligner("constant", Look("always the middle", "black")),
+        Estimator("constant", Look("always the middle", "black")),
         # The paper's network: it learns noise-free stamps of the grid, and estimates from noisy
         # ones.
-        Aligner(
+        Estimator(
             "original",
             Look("CNN, noisy stamps", "#4d4d4d", paper=("original", "Original data")),
             "original",
@@ -85,7 +85,7 @@ ALIGNERS = {
             swept=("cnn", "train_original"),
         ),
         # The same network behind the DAE, which takes the noise from the stamps.
-        Aligner(
+        Estimator(
             "dae",
             Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
             "dae",
@@ -95,7 +95,7 @@ ALIGNERS = {
         ),
         # Not in the paper: a network that has seen noise needs no DAE, and one that is trained on
         # the DAE's output knows its errors.
-        Aligner(
+        Estimator(
             "noise_trained",
             Look("network trained on noisy stamps", "#d55e00"),
             "noise-trained",
@@ -104,7 +104,7 @@ ALIGNERS = {
             product="estimates",
             swept=("cnn", "perceptron", "train_noise_trained", "noise.levels"),
         ),
-        Aligner(
+        Estimator(
             "dae_retrained",
             Look("network trained on DAE output", "#cc79a7"),
             "DAE, retrained",
@@ -114,14 +114,14 @@ ALIGNERS = {
             denoised=True,
         ),
         # Fits of single states, which start at the estimate of a network.
-        Aligner(
+        Estimator(
             "max_likelihood",
             Look("maximum likelihood", "#009e73"),
             "max. likelihood",
             borrowed_network="noise_trained",
             product="fit",
         ),
-        Aligner(
+        Estimator(
             "max_likelihood_free",
             Look("maximum likelihood, flux and place free", "black"),
             borrowed_network="noise_trained",
@@ -130,9 +130,9 @@ ALIGNERS = {
         ),
         # Bounds of unbiased estimates: of each state, of the errors of all states together, and
         # with unknown flux and position.
-        Aligner("cramer_rao", Look("Cramér–Rao bound", "black"), product="bound"),
-        Aligner("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
-        Aligner(
+        Estimator("cramer_rao", Look("Cramér–Rao bound", "black"), product="bound"),
+        Estimator("cramer_rao_pooled", Look("Cramér–Rao, all states", "black"), "Fisher"),
+        Estimator(
             "cramer_rao_free",
             Look("Cramér–Rao bound, flux and place free", "black"),
             product="bound",
@@ -143,7 +143,7 @@ ALIGNERS = {
 """Methods and bounds by name."""
 
 
-def aligners_of(product: str, test_set: str = "uniform") -> list[Aligner]:
+def list_estimators(product: str, test_set: str = "uniform") -> list[Estimator]:
     """Return the methods of a product, or the bounds, in the order of its arrays.
 
     Those with unknown flux and position are applied to uniform states only.
@@ -151,22 +151,22 @@ def aligners_of(product: str, test_set: str = "uniform") -> list[Aligner]:
     Parameters
     ----------
     product : str
-        "estimates", "fit" or "bound"; see `Aligner.product`.
+        "estimates", "fit" or "bound"; see `Estimator.product`.
     test_set : str
         "uniform" or "grid".
     """
     return [
-        aligner
-        for aligner in ALIGNERS.values()
-        if aligner.product == product and (test_set == "uniform" or not aligner.unknown_flux)
+        estimator
+        for estimator in ESTIMATORS.values()
+        if estimator.product == product and (test_set == "uniform" or not estimator.unknown_flux)
     ]
 
 
 def trained_networks() -> list[str]:
     """Return the names of the methods that have a network of their own."""
-    return [name for name, aligner in ALIGNERS.items() if aligner.states]
+    return [name for name, estimator in ESTIMATORS.items() if estimator.states]
 
 
 def swept_networks() -> list[str]:
     """Return the names of the networks that sweeps may train."""
-    return [name for name, aligner in ALIGNERS.items() if aligner.swept]
+    return [name for name, estimator in ESTIMATORS.items() if estimator.swept]

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 from psfdae.base.errors import did_you_mean
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import groups_of, method
-from psfdae_paper.configuration.aligners import ALIGNERS, swept_networks
+from psfdae_paper.configuration.aligners import ESTIMATORS, swept_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load_file
@@ -217,7 +217,7 @@ class Sweep(Group):
     def varied(self) -> tuple[str, ...]:
         """Keys and groups that may differ between points; all points share their stars."""
         return (
-            ALIGNERS[self.model].swept
+            ESTIMATORS[self.model].swept
             if self.model in swept_networks()
             else (*method(self.model).groups, "noise.levels")
         )

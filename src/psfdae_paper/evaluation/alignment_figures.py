@@ -1,7 +1,7 @@
 """Figures of scene 3: stamps, estimates, errors, the twin ambiguity, correlations.
 
-In go arrays of stamps and of states in units of their range; out come matplotlib figures. A state
-is decentre x, y and tilt x, y of the secondary mirror.
+Functions take arrays of stamps and states and return matplotlib figures. A state is decentre x, y
+and tilt x, y of the secondary mirror, in units of their range.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
-from psfdae_paper.configuration.aligners import ALIGNERS
+from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.evaluation import drawing
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def parameter_label(parameter: str) -> str:
 
 
 @styled
-def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) -> Figure:
+def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) -> Figure:
     """Draw stamps at all fields, one row per treatment, in groups with a title.
 
     Parameters
@@ -62,14 +62,14 @@ def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) ->
 def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> None:
     """Draw a stamp in grey; the square root of the flux makes wings visible."""
     # Rows run along +y: the first one is at the bottom.
-    scaled = np.clip(stamp / peak, 0.0, 1.0) ** 0.5
-    axes.imshow(scaled, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+    grey = np.clip(stamp / peak, 0.0, 1.0) ** 0.5
+    axes.imshow(grey, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     axes.set_xticks([])
     axes.set_yticks([])
 
 
 @styled
-def predicted_against_true(
+def draw_predictions(
     truth: np.ndarray, estimates: Mapping[str, Mapping[float, np.ndarray]]
 ) -> Figure:
     """Draw estimate against truth, one row per method and one column per parameter.
@@ -97,7 +97,7 @@ def predicted_against_true(
             axes.set_ylim(-1.6, 1.6)
             axes.grid(True)
         # Long labels are broken where a comma or the training data begin.
-        label = ALIGNERS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
+        label = ESTIMATORS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
         row_panels[0].set_ylabel(label)
     for parameter, top, bottom in zip(DEGREES_OF_FREEDOM, panels[0], panels[-1], strict=True):
         top.set_title(parameter_label(parameter))
@@ -108,7 +108,7 @@ def predicted_against_true(
     return figure
 
 
-def size_of(states: np.ndarray) -> np.ndarray:
+def compute_size(states: np.ndarray) -> np.ndarray:
     """Return the size of misalignments: RMS of their four numbers, in units of the range, (n,)."""
     # √⟨t²⟩ over decentre x, y and tilt x, y.
     size: np.ndarray = np.sqrt((states**2).mean(axis=1))
@@ -116,7 +116,7 @@ def size_of(states: np.ndarray) -> np.ndarray:
 
 
 @styled
-def errors_against_size(
+def draw_errors_by_size(
     curves: Mapping[float, Mapping[str, tuple[np.ndarray, np.ndarray]]], title: str
 ) -> Figure:
     """Draw the mean absolute error against the size of the misalignment.
@@ -128,16 +128,17 @@ def errors_against_size(
     curves : by noise level and method, size (n,) and error (n,) of every state
         The error is averaged over the four parameters.
     title : str
+        Title of the figure.
     """
     figure = new_figure(3.9, layout="constrained")
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for axes, (level, methods) in zip(panels, curves.items(), strict=True):
         # Bounds are dashed lines, estimates have standard errors.
         for method, (size, error) in methods.items():
-            mean_size, mean_error, stderr = binned(size, error)
+            mean_size, mean_error, stderr = bin_errors(size, error)
             style = {
-                "color": ALIGNERS[method].look.color,
-                "label": ALIGNERS[method].look.label,
+                "color": ESTIMATORS[method].look.color,
+                "label": ESTIMATORS[method].look.label,
                 "lw": 1.4,
             }
             if method == "cramer_rao":
@@ -150,7 +151,7 @@ def errors_against_size(
         axes.set_yscale("log")
         axes.grid(True, which="both")
     # All panels have the same methods: one legend serves them.
-    drawing.readable_log_axis(panels[0])
+    drawing.label_log_axis(panels[0])
     panels[0].set_ylabel("mean absolute error / range")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
@@ -158,7 +159,7 @@ def errors_against_size(
     return figure
 
 
-def binned(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bin_errors(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean size, mean error and its standard error in six bins of equally many states."""
     # States by size, cut into groups of equally many; a group of n has the error σ/√n of its mean.
     order = np.argsort(size, kind="stable")
@@ -171,7 +172,7 @@ def binned(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 @styled
-def twin_ambiguity(
+def draw_twins(
     curves: pd.DataFrame, stamps: Sequence[tuple[str, np.ndarray]], state: np.ndarray
 ) -> Figure:
     """Draw the misfit of multiples of a state, and the stamps of the state and its twin.
@@ -220,7 +221,7 @@ def twin_ambiguity(
 
 
 @styled
-def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> Figure:
+def draw_correlations(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> Figure:
     """Draw matrices of correlations; cells that are NaN stay empty.
 
     Parameters

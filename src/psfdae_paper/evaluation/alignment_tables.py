@@ -1,7 +1,7 @@
 """Tables of scene 3: errors of states and their correlations, measured and published.
 
-In go errors of estimated states (n, 4), or the covariances (n, 4, 4) that bound them; out come rows
-of the tables of errors and correlations, and tables that set them beside the paper's.
+Inputs: errors of estimated states (n, 4), or the covariances (n, 4, 4) that bound them. Outputs:
+rows of the tables of errors and correlations, and tables that compare them with the paper's.
 """
 
 from __future__ import annotations
@@ -12,16 +12,19 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from psfdae_paper.alignment.likelihood import expected_abs_error
+from psfdae_paper.alignment.likelihood import compute_mean_abs_error
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
-from psfdae_paper.configuration.aligners import ALIGNERS
-from psfdae_paper.evaluation.paper import published
+from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.evaluation.paper import read_published
 
 Row = dict[str, object]
 """Row of a table: values by column."""
 
+Key = Mapping[str, object]
+"""First columns of a row: test_set, noise_level and method."""
 
-def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) -> list[Row]:
+
+def tabulate_errors(key: Key, errors: np.ndarray, unit: np.ndarray) -> list[Row]:
     """Return the rows of one method in the table of errors.
 
     Parameters
@@ -36,9 +39,9 @@ def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) 
     Returns
     -------
     list of dict
-        One row in units of the range and one in SI units for each parameter. `variance` is that
-        of the signed error about its mean; `variance_abs` is that of the absolute error, which
-        the paper tabulates.
+        One row in units of the range and one in SI units for each parameter. `variance` is the
+        variance of the signed error, `variance_abs` the variance of the absolute error, which the
+        paper tabulates.
     """
     # Statistics over all states, one number for each of the four parameters.
     absolute = np.abs(errors)
@@ -48,33 +51,36 @@ def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) 
         "variance": errors.var(axis=0),
         "variance_abs": absolute.var(axis=0),
     }
-    return _in_both_units(key, statistics, unit, len(errors))
+    return _tabulate_in_both_units(key, statistics, unit, len(errors))
 
 
-def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndarray) -> list[Row]:
+def tabulate_bounds(key: Key, covariances: np.ndarray, unit: np.ndarray) -> list[Row]:
     """Return the rows of the error table that unbiased normal errors at the bound would have.
 
     Parameters
     ----------
-    key, unit : as for `error_rows`
+    key : dict
+        test_set, noise_level and method.
     covariances : ndarray, shape (n, 4, 4)
         Cramér–Rao bounds of the states, in squared units of the range.
+    unit : ndarray, shape (4,)
+        The range in m, m, rad, rad.
     """
     # Marginal variance of each parameter, for every state.
     variance = np.diagonal(covariances, axis1=1, axis2=2)
     # ⟨|e|⟩ over all states; the variance of |e| is ⟨e²⟩ − ⟨|e|⟩².
-    absolute = expected_abs_error(covariances).mean(axis=0)
+    absolute = compute_mean_abs_error(covariances).mean(axis=0)
     statistics = {
         "mean_abs_error": absolute,
         "bias": np.zeros(4),
         "variance": variance.mean(axis=0),
         "variance_abs": variance.mean(axis=0) - absolute**2,
     }
-    return _in_both_units(key, statistics, unit, len(covariances))
+    return _tabulate_in_both_units(key, statistics, unit, len(covariances))
 
 
-def _in_both_units(
-    key: Mapping[str, object], statistics: Mapping[str, np.ndarray], unit: np.ndarray, count: int
+def _tabulate_in_both_units(
+    key: Key, statistics: Mapping[str, np.ndarray], unit: np.ndarray, count: int
 ) -> list[Row]:
     """Return a row in units of the range and one in SI units for each parameter."""
     rows: list[Row] = []
@@ -91,8 +97,8 @@ def _in_both_units(
     return rows
 
 
-def correlation_rows(
-    key: Mapping[str, object], matrix: np.ndarray, low: np.ndarray, high: np.ndarray
+def tabulate_correlations(
+    key: Key, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> list[Row]:
     """Return the rows of the correlation table for all pairs of parameters.
 
@@ -112,46 +118,44 @@ def correlation_rows(
     ]
 
 
-def measured_correlations(key: Mapping[str, object], errors: np.ndarray) -> list[Row]:
+def tabulate_error_correlations(key: Key, errors: np.ndarray) -> list[Row]:
     """Return correlations of signed errors (n, 4) with 95 % intervals."""
-    return correlation_rows(key, *error_correlation(errors))
+    return tabulate_correlations(key, *correlate_errors(errors))
 
 
-def predicted_correlations(key: Mapping[str, object], covariances: np.ndarray) -> list[Row]:
+def tabulate_bound_correlations(key: Key, covariances: np.ndarray) -> list[Row]:
     """Return correlations that the Fisher matrix predicts, for single and for all states.
 
     Method `cramer_rao` is the mean over states of each state's correlation; its interval contains
     95 % of the states. `cramer_rao_pooled` is the correlation of errors drawn with these
-    covariances, which states with large errors dominate; its interval is that of a sample of as
-    many states. Compare measured correlations with `cramer_rao_pooled`.
+    covariances, which states with large errors dominate; its interval is Fisher's for a sample of
+    as many states. Compare measured correlations with `cramer_rao_pooled`.
 
     Parameters
     ----------
     key : dict
         test_set and noise_level.
     covariances : ndarray, shape (n, 4, 4)
+        Cramér–Rao bounds of the states, in squared units of the range.
     """
     # Correlation C_ij / (σ_i σ_j) of each state.
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     state_correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
     low, high = np.quantile(state_correlation, [0.025, 0.975], axis=0)
     mean_correlation = state_correlation.mean(axis=0)
-    rows = correlation_rows({**key, "method": "cramer_rao"}, mean_correlation, low, high)
+    rows = tabulate_correlations({**key, "method": "cramer_rao"}, mean_correlation, low, high)
     # Correlation of the mean covariance, with Fisher's interval: artanh of a correlation of n
     # pairs is normal with the standard deviation 1/√(n − 3).
     mean_covariance = covariances.mean(axis=0)
     pooled_sigma = np.sqrt(np.diag(mean_covariance))
-    pooled = mean_covariance / np.outer(pooled_sigma, pooled_sigma)
-    half_width = 1.959964 / np.sqrt(max(len(covariances) - 3, 1))
-    with np.errstate(divide="ignore"):
-        z = np.arctanh(np.clip(pooled, -1.0, 1.0))
+    pooled_correlation = mean_covariance / np.outer(pooled_sigma, pooled_sigma)
+    within_one = np.clip(pooled_correlation, -1.0, 1.0)
+    low, high = compute_fisher_interval(within_one, len(covariances), 1.959964)
     key = {**key, "method": "cramer_rao_pooled"}
-    # Back from z = artanh r to correlations.
-    low, high = np.tanh(z - half_width), np.tanh(z + half_width)
-    return rows + correlation_rows(key, pooled, low, high)
+    return rows + tabulate_correlations(key, pooled_correlation, low, high)
 
 
-def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
+def compare_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
     """Return the paper's error table of one noise level, followed by the measured rows.
 
     Returns
@@ -161,22 +165,22 @@ def paper_errors(errors: pd.DataFrame, level: float) -> pd.DataFrame:
         variance of the absolute error) and one per parameter, in units of the range.
     """
     # The paper's rows and the measured ones get the same columns, in units of the range.
-    paper = published("alignment")
+    paper = read_published("alignment")
     paper = paper[np.isclose(paper.noise_level, level)].assign(source="paper", test_set="")
     paper = paper.rename(columns={"mean_error": "mean"})
-    measured = errors[np.isclose(errors.noise_level, level) & (errors.unit == "range")]
-    measured = measured.assign(
-        source="psfdae", mean=measured.mean_abs_error, variance=measured.variance_abs
+    measured_rows = errors[np.isclose(errors.noise_level, level) & (errors.unit == "range")]
+    measured_rows = measured_rows.assign(
+        source="psfdae", mean=measured_rows.mean_abs_error, variance=measured_rows.variance_abs
     )
     columns = ["source", "test_set", "method", "parameter", "mean", "variance"]
-    rows = pd.concat([paper[columns], measured[columns]], ignore_index=True)
+    rows = pd.concat([paper[columns], measured_rows[columns]], ignore_index=True)
     # One row for the mean and one for the variance of the absolute error.
     rows = rows.melt(columns[:4], var_name="quantity", value_name="value")
     index = ["source", "test_set", "method", "quantity"]
-    return _pivoted(rows, "parameter", list(DEGREES_OF_FREEDOM), index)
+    return _pivot(rows, "parameter", list(DEGREES_OF_FREEDOM), index)
 
 
-def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
+def compare_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
     """Return the paper's correlation table, followed by the measured rows.
 
     Returns
@@ -186,26 +190,26 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
     """
     # Pairs of parameters that the paper has, at levels with noise.
     pairs = [f"{parameter}-tilt_y" for parameter in ("decenter_x", "decenter_y", "tilt_x")]
-    paper = published("correlation").assign(source="paper", test_set="")
-    measured = correlations.assign(
+    paper = read_published("correlation").assign(source="paper", test_set="")
+    measured_rows = correlations.assign(
         source="psfdae", pair=correlations.parameter_a + "-" + correlations.parameter_b
     )
     columns = ["source", "test_set", "noise_level", "method", "pair", "correlation"]
-    rows = pd.concat([paper[columns], measured.loc[measured.pair.isin(pairs), columns]])
+    rows = pd.concat([paper[columns], measured_rows.loc[measured_rows.pair.isin(pairs), columns]])
     rows = rows[rows.noise_level > 0].rename(columns={"correlation": "value"})
     index = ["source", "test_set", "noise_level", "method"]
-    return _pivoted(rows, "pair", pairs, index)
+    return _pivot(rows, "pair", pairs, index)
 
 
-def _pivoted(
+def _pivot(
     rows: pd.DataFrame, column: str, column_order: list[str], index: list[str]
 ) -> pd.DataFrame:
     """Return a table with one row per index and a column for each value of `column`.
 
-    Rows are sorted by the index, methods in the order of `ALIGNERS`.
+    Rows are sorted by the index, methods in the order of `ESTIMATORS`.
     """
     # A column for each parameter or pair.
-    methods = list(ALIGNERS)
+    methods = list(ESTIMATORS)
     table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
     table.columns.name = None
     # Methods by their rank in the configuration, other keys by value.
@@ -217,33 +221,49 @@ def _pivoted(
 
 
 def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
-    """Return a table of `paper_errors` or `paper_correlations` as Markdown.
+    """Return a table of `compare_errors` or `compare_correlations` as Markdown.
 
     Parameters
     ----------
     table : DataFrame
+        Four columns of keys, among them source and method, then numbers.
     title : str
+        Line of text above the table.
     digits : dict
         Number format by the value of the column `quantity`; the key "" is for tables without it.
     """
     # Numbers as text; a value that was not measured or published is left empty.
-    formatted = table.copy()
+    text_table = table.copy()
     quantities = table.get("quantity", pd.Series("", index=table.index))
     for column in table.columns[4:]:  # four columns of keys come first
-        formatted[column] = [
+        text_table[column] = [
             "" if pd.isna(value) else format(value, digits[quantity])
             for value, quantity in zip(table[column], quantities, strict=True)
         ]
     # The paper's rows have its own names of the methods.
-    paper_labels = {a.name: a.look.paper[1] for a in ALIGNERS.values() if a.look.paper}
-    formatted["method"] = [
-        paper_labels[method] if source == "paper" else ALIGNERS[method].look.label
+    paper_labels = {a.name: a.look.paper[1] for a in ESTIMATORS.values() if a.look.paper}
+    text_table["method"] = [
+        paper_labels[method] if source == "paper" else ESTIMATORS[method].look.label
         for method, source in zip(table["method"], table["source"], strict=True)
     ]
-    return f"{title}\n\n{formatted.to_markdown(index=False, disable_numparse=True)}\n"
+    return f"{title}\n\n{text_table.to_markdown(index=False, disable_numparse=True)}\n"
 
 
-def error_correlation(
+def compute_fisher_interval(
+    correlation: np.ndarray, count: int, quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of Fisher's intervals of correlations of `count` samples.
+
+    z = artanh r is nearly normal with the standard deviation 1/√(n − 3); `quantile` is the half
+    width of the interval in standard deviations.
+    """
+    with np.errstate(divide="ignore"):
+        z = np.arctanh(correlation)
+    half_width = quantile / np.sqrt(max(count - 3, 1))
+    return np.tanh(z - half_width), np.tanh(z + half_width)
+
+
+def correlate_errors(
     errors: np.ndarray, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Pearson correlations of signed errors with intervals from Fisher's z.
@@ -269,7 +289,7 @@ def error_correlation(
     Raises
     ------
     ValueError
-        If there is no sample, or an error is not finite.
+        If there are no samples, or an error is not finite.
     """
     from scipy.stats import norm
 
@@ -285,11 +305,8 @@ def error_correlation(
     length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
     matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    with np.errstate(divide="ignore"):
-        z = np.arctanh(matrix)
-    # Interval z ± q/√(n − 3); with fewer than four samples there is none.
-    half = norm.isf(0.5 * (1.0 - confidence)) / np.sqrt(max(count - 3, 1))
-    low, high = np.tanh(z - half), np.tanh(z + half)
+    # The interval is undefined for fewer than four samples.
+    low, high = compute_fisher_interval(matrix, count, norm.isf(0.5 * (1.0 - confidence)))
     if count < 4:
         off_diagonal = ~np.eye(len(matrix), dtype=bool)
         low[off_diagonal] = high[off_diagonal] = np.nan

@@ -1,7 +1,7 @@
-"""Figures of the bounds: how far the errors of methods are above the least possible ones.
+"""Figures of the bounds: how far the errors of methods are above the minimum error.
 
-In go the tables of the stages `bounds` and `efficiency`; out come matplotlib figures. Rows of other
-datasets in these tables are not drawn.
+Functions take the tables of the stages `bounds` and `efficiency` and return matplotlib figures.
+Rows of other datasets in these tables are not drawn.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MEANS: dict[str, Style] = {
 
 
 @styled
-def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
+def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
     """Draw the MSE of every method against the noise level, with both bounds.
 
     Parameters
@@ -52,18 +52,19 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     efficiency, bounds : DataFrame
         Tables of the stages of these names.
     dataset : str
+        Dataset whose rows are drawn; it is also in the title.
     """
-    measured = efficiency[efficiency.dataset == dataset]
+    table = efficiency[efficiency.dataset == dataset]
     limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
-    figure, panels = drawing.reference_panels(limits)
+    figure, panels = drawing.make_panels(limits)
     for axes, reference, rows in panels:
         # The rows of each method are repeated for the floor, together with posterior means.
-        methods = measured[(measured.reference == reference) & (measured.bound != "floor")]
-        for method_class, errors in drawing.by_method(methods.sort_values("noise_level")):
+        methods = table[(table.reference == reference) & (table.bound != "floor")]
+        for method_class, errors in drawing.group_by_method(methods.sort_values("noise_level")):
             axes.plot(errors["noise_level"], errors["mse"], **drawing.method_line(method_class))
         for name, look in MEANS.items():
             _draw_posterior_mean(axes, rows[rows.method == name].sort_values("noise_level"), look)
-        _whole_noise_axis(axes, rows)
+        _set_whole_axis(axes, rows)
     # One logarithmic axis for all panels, down to the floor, with room for the zeros below it.
     first = panels[0][0]
     first.set_yscale("log")
@@ -72,14 +73,14 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     if (limits["value"] == 0).any():
         first.set_ylim(bottom=0.5 * first.get_ylim()[0])
     # Legend; an open marker is explained if a posterior mean is not tight at some level.
-    handles = drawing.method_entries(set(measured["method"]))
+    handles = drawing.make_method_entries(set(table["method"]))
     for name, look in MEANS.items():
         tightness = set(limits["tight"][limits.method == name])
         if tightness:
-            handles.append(drawing.legend_entry(**look, ls="--", lw=1.2, ms=6))
+            handles.append(drawing.make_entry(**look, ls="--", lw=1.2, ms=6))
         if "no" in tightness:
             open_marker = {**look, "mfc": "white", "label": "its draws too few: upper limit"}
-            handles.append(drawing.legend_entry(**open_marker, ls="--", lw=1.2, ms=6))
+            handles.append(drawing.make_entry(**open_marker, ls="--", lw=1.2, ms=6))
     # Stars without a posterior mean are missing from its n: the largest n counts all.
     title = f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars"
     drawing.finish_panels(figure, panels, title, [*handles, *floor_entries], 3)
@@ -87,54 +88,54 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
 
 
 @styled
-def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
+def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """Draw bound over MSE of every method against the noise level, one panel per reference.
 
     `efficiency` is the table of the stage of this name.
     """
-    measured = efficiency[efficiency.dataset == dataset]
-    # Posterior means are in the table, too, but are no methods.
+    table = efficiency[efficiency.dataset == dataset]
+    # The table also has posterior means, which are not methods.
     names = [method_class.name for method_class in registered()]
-    figure, panels = drawing.reference_panels(measured)
+    figure, panels = drawing.make_panels(table)
     for axes, _, rows in panels:
         # Solid lines relative to the posterior mean, dotted lines relative to the floor.
         method_rows = rows[rows.method.isin(names)].sort_values("noise_level")
-        for method_class, errors in drawing.by_method(method_rows):
+        for method_class, errors in drawing.group_by_method(method_rows):
             for bound, values in errors.groupby("bound"):
                 style = drawing.method_line(method_class)
                 style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
                 axes.plot(values["noise_level"], values["efficiency"], **style)
         axes.axhline(1.0, color="black", lw=1.0)
-        # Without a tight bound there is no efficiency to draw.
+        # An efficiency needs a tight bound.
         if method_rows["efficiency"].isna().all():
             axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
-        _whole_noise_axis(axes, rows)
+        _set_whole_axis(axes, rows)
     panels[0][0].set_yscale("log")
     # An efficiency above 1 is noise, or the floor is too rough an approximation.
     panels[0][0].set_ylim(top=2.0)
     # Line styles of both bounds, as far as they are drawn.
-    handles = drawing.method_entries(set(measured["method"]))
-    drawn_rows = measured[measured.method.isin(names)].dropna(subset=["efficiency"])
+    handles = drawing.make_method_entries(set(table["method"]))
+    drawn_rows = table[table.method.isin(names)].dropna(subset=["efficiency"])
     is_floor = drawn_rows["bound"] == "floor"
     if (~is_floor).any():
         handles.append(
-            drawing.legend_entry("against the posterior mean, where tight", ls="-", lw=1.6)
+            drawing.make_entry("against the posterior mean, where tight", ls="-", lw=1.6)
         )
     if is_floor.any():
-        handles.append(drawing.legend_entry("against the local floor", ls=":", lw=1.6))
+        handles.append(drawing.make_entry("against the local floor", ls=":", lw=1.6))
     title = f"{dataset}: efficiency against the noise level, 1 = no better is possible"
     drawing.finish_panels(figure, panels, title, handles, 3, "efficiency: bound / MSE")
     return figure
 
 
 @styled
-def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
+def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """Draw the error of the posterior mean against the size of the bank.
 
     `growth` is the growth table of the stage `bounds`; there is one panel per reference.
     """
     dataset_rows = growth[growth.dataset == dataset]
-    figure, panels = drawing.reference_panels(dataset_rows)
+    figure, panels = drawing.make_panels(dataset_rows)
     # One colour for each noise level, the same in both panels.
     levels = np.unique(dataset_rows["noise_level"])
     colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
@@ -147,27 +148,27 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
             axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
         # A tick at each size of the bank.
         draws = np.unique(rows["draws"])
-        drawing.log_axis(axes, draws, [f"{count:d}" for count in draws])
+        drawing.set_log_axis(axes, draws, [f"{count:d}" for count in draws])
         axes.set_xlabel("draws of the simulator in the bank")
     # Colours are noise levels; markers are the posterior mean with and without the field.
     handles = [
-        drawing.legend_entry(f"λ = {level:g}", color=color, marker="o", ms=4.5, lw=1.4)
+        drawing.make_entry(f"λ = {level:g}", color=color, marker="o", ms=4.5, lw=1.4)
         for level, color in colors.items()
     ]
     handles += [
-        drawing.legend_entry(**look | {"color": "black"}, ls="", ms=4.5) for look in MEANS.values()
+        drawing.make_entry(**look | {"color": "black"}, ls="", ms=4.5) for look in MEANS.values()
     ]
-    handles.append(drawing.legend_entry("limit of the fit", ls="--", lw=1.0))
+    handles.append(drawing.make_entry("limit of the fit", ls="--", lw=1.0))
     title = f"{dataset}: the posterior mean over banks of growing size"
     drawing.finish_panels(figure, panels, title, handles, 4)
     return figure
 
 
-def _whole_noise_axis(axes: Axes, rows: pd.DataFrame) -> None:
+def _set_whole_axis(axes: Axes, rows: pd.DataFrame) -> None:
     """Show all noise levels of a table, with 5 % of the axis' length beyond either end."""
     # Points at the ends stay clear of the frame.
     levels = np.unique(rows["noise_level"])
-    drawing.noise_axis(axes, levels)
+    drawing.set_noise_axis(axes, levels)
     margin_factor = max(levels.max() / levels.min(), 2.0) ** 0.05
     axes.set_xlim(levels.min() / margin_factor, levels.max() * margin_factor)
 
@@ -186,9 +187,9 @@ def _draw_posterior_mean(axes: Axes, rows: pd.DataFrame, look: Style) -> None:
     axes.errorbar(level, value, yerr=half_widths, color=color, ls="--", lw=1.2, capsize=3)
     # Filled markers where the bound is tight, open ones elsewhere.
     tight = (rows["tight"] == "yes").to_numpy()
-    for selected, fill in ((tight, color), (~tight, "white")):
+    for mask, fill in ((tight, color), (~tight, "white")):
         style: Style = {"color": color, "marker": look["marker"], "mfc": fill, "ms": 6, "ls": ""}
-        axes.plot(level[selected], value[selected], zorder=3, **style)
+        axes.plot(level[mask], value[mask], zorder=3, **style)
 
 
 def _draw_floor(panels: Sequence[Panel], floor: pd.DataFrame) -> Artist:
@@ -214,7 +215,7 @@ def _shade_below(axes: Axes, floor: pd.DataFrame, bottom: float) -> str:
 
 
 @styled
-def headline(
+def draw_headline(
     rows: Sequence[StripRow],
     methods: Sequence[type[Method]],
     efficiency: pd.DataFrame,
@@ -271,11 +272,11 @@ def _draw_errors(
         line = draw_line(method_class, 5)
         # The name of the lowest line is below its first point, because the next line is near.
         is_lowest = method_class is methods[-1]
-        named = line[:1] if is_lowest else line
-        # The label in brackets, what the method is given, is beside its stars.
+        points = line[:1] if is_lowest else line
+        # Inputs of the method, in brackets in its label, are shown with its stars.
         name = method_class.look.label.partition(" (")[0]
         color = method_class.look.color
-        _write_name(axes, named["noise_level"], named["mse"], name, color, below=is_lowest)
+        _write_name(axes, points["noise_level"], points["mse"], name, color, below=is_lowest)
     # Errors if the optics of the telescope are known. The line nearly coincides with the posterior
     # mean: its name is below that one's name.
     optics = method("wavefront")
@@ -299,8 +300,8 @@ def _draw_errors(
         axes.set_ylim(bottom=bottom)
         height = 0.7 * floor["value"]
         _write_name(axes, floor["noise_level"], height, "local floor", "#555555", below=True)
-    drawing.noise_axis(axes, np.unique(bayes["noise_level"]))
-    drawing.readable_log_axis(axes)
+    drawing.set_noise_axis(axes, np.unique(bayes["noise_level"]))
+    drawing.label_log_axis(axes)
     axes.grid(True, which="major")
     axes.set_ylabel(drawing.METRIC_LABELS["mse"], fontsize=8)
 
@@ -308,7 +309,7 @@ def _draw_errors(
 def _write_name(
     axes: Axes, level: pd.Series, value: pd.Series, name: str, color: str, *, below: bool = False
 ) -> None:
-    """Write the name of a line beside its second point, where lines are separate."""
+    """Write the name of a line next to its second point, where lines are separate."""
     # Names stand right of and below a point, or left of and above it.
     point = min(1, len(level) - 1)
     position = (float(level.iloc[point]), float(value.iloc[point]))

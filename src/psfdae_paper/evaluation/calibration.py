@@ -1,9 +1,9 @@
-"""Fit of parameters that the paper does not state to its original-noise rows.
+"""Fit of parameters that the paper does not give, to its original-noise rows.
 
 The rows depend on noise and images only, not on any estimator. Their MSE gives the noise per λ.
 Their SSIM gives the dynamic range, and the structure of a stamp, which is the pixel scale.
 
-In goes the scan of simulated stars (stage `scan`); out come the fitted parameters.
+Input: the scan of simulated stars (stage `scan`). Output: the fitted parameters.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from psfdae_paper.evaluation.paper import published
+from psfdae_paper.evaluation.paper import read_published
 
 
 class OriginalNoise(NamedTuple):
@@ -27,14 +27,14 @@ class OriginalNoise(NamedTuple):
     ssim: float
 
     @property
-    def fitted(self) -> bool:
+    def is_fitted(self) -> bool:
         """True if the column is used in fits: all but the one whose MSE does not follow λ²."""
         return (self.dataset, self.noise_level) != ("dataset8", 0.002)
 
 
-def original_noise_rows() -> list[OriginalNoise]:
+def read_original_noise() -> list[OriginalNoise]:
     """Return the paper's original-noise columns, by dataset and noise level."""
-    paper = published("psf")
+    paper = read_published("psf")
     rows = paper[paper.method == "original_noise"]
     # One row for each dataset and noise level, with both metrics.
     by_metric = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
@@ -44,7 +44,7 @@ def original_noise_rows() -> list[OriginalNoise]:
     return [OriginalNoise(*row) for row in zip(*columns, strict=True)]
 
 
-def kappa_of_mse(mse: float, level: float, pixels: int, background: float) -> float:
+def solve_kappa(mse: float, level: float, pixels: int, background: float) -> float:
     """Return κ of a noise level whose pixel variance is `mse`, the star's photons included.
 
     Solves (κλ)² + κλ/(P √B) = MSE for κ, where 1/P is the mean of a normalised image of P pixels
@@ -86,16 +86,16 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     from scipy.optimize import least_squares
 
     # Interpolated SSIM of each of the paper's columns, and the number of its experiment.
-    rows = _fitted_rows(scan)
+    rows = _select_rows(scan)
     experiments = sorted(scan.experiment.unique())
-    surfaces = [_ssim_surface(scan, row) for row in rows]
+    surfaces = [_interpolate_ssim(scan, row) for row in rows]
     experiment_index = [
         experiments.index(scan.experiment[scan.dataset == row.dataset].iloc[0]) for row in rows
     ]
     published_ssim = np.array([row.ssim for row in rows])
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        # SSIM of the interpolated scan minus that of the paper, for each of its columns.
+        # SSIM of the interpolated scan minus the paper's, for each of its columns.
         data_range, scales = np.exp(logarithms[0]), np.exp(logarithms[1:])
         ssim = [
             surface(scales[index], data_range)
@@ -118,8 +118,8 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     return ScaleFit(data_range, dict(zip(experiments, pixel_scales, strict=True)), rms)
 
 
-def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
-    """Compare the paper's SSIM with that of each scanned pixel scale at one dynamic range.
+def compute_scale_residuals(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
+    """Compare the paper's SSIM with the SSIM at each scanned pixel scale, at one dynamic range.
 
     Returns
     -------
@@ -129,8 +129,8 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     # RMS and largest difference of the SSIM over the paper's columns, at each scanned scale.
     table = []
     for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
-        rows = _fitted_rows(part)
-        surfaces = [_ssim_surface(part, row) for row in rows]
+        rows = _select_rows(part)
+        surfaces = [_interpolate_ssim(part, row) for row in rows]
         published_ssim = np.array([row.ssim for row in rows])
         for scale in sorted(part.pixel_scale_arcsec.unique()):
             ssim = np.array([surface(scale, data_range) for surface in surfaces])
@@ -143,14 +143,14 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     )
 
 
-def _fitted_rows(scan: pd.DataFrame) -> list[OriginalNoise]:
+def _select_rows(scan: pd.DataFrame) -> list[OriginalNoise]:
     """Return the paper's columns that are used in fits and are in a scan."""
     # A scan may have the datasets of one experiment alone.
     datasets = set(scan.dataset)
-    return [row for row in original_noise_rows() if row.fitted and row.dataset in datasets]
+    return [row for row in read_original_noise() if row.is_fitted and row.dataset in datasets]
 
 
-def _ssim_surface(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
+def _interpolate_ssim(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
     """Interpolate the SSIM of one column as a function of pixel scale and dynamic range."""
     from scipy.interpolate import RectBivariateSpline
 

@@ -1,8 +1,8 @@
 """Comparison of errors: of two trained networks, of two tables, of known and held-out fields.
 
-In go errors by star, or tables of mean errors; out come tables of differences with their standard
-errors. Two fits of one setting differ by their seeds, too: that scatter was measured once, and
-counts beside the standard error of the stars.
+Inputs: errors by star, or tables of mean errors. Outputs: tables of differences with their standard
+errors. Two fits of one setting also differ by their seeds: this scatter was measured once, and is
+added to the standard error of the stars.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ SIGNIFICANT = 3.0
 Scatter = Mapping[tuple[str, str, str], float]
 """Relative scatter of a method's MSE between seeds by dataset, reference and method."""
 
-FITTED = ["dataset", "reference", "method"]
+FIT_KEYS = ["dataset", "reference", "method"]
 """Columns that identify a fit."""
 
 
 @cache
-def seed_scatter() -> Scatter:
+def read_seed_scatter() -> Scatter:
     """Read the scatter between seeds that the target `seeds` has measured, `seed_scatter.csv`.
 
     Fits without a row were not measured.
     """
     # A row for each fit: dataset, reference, method and relative scatter of its MSE.
     with resources.files(__package__).joinpath("seed_scatter.csv").open() as file:
-        return dict(pd.read_csv(file, index_col=FITTED)["scatter"])
+        return dict(pd.read_csv(file, index_col=FIT_KEYS)["scatter"])
 
 
-def config_differences(
+def compare_settings(
     first: Mapping[str, str], second: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
     """Return the settings that differ, each with both values; keys sorted.
@@ -56,7 +56,7 @@ def config_differences(
     return [row for row in rows if row[1] != row[2]]
 
 
-def training_summary(history: pd.DataFrame) -> dict[str, float]:
+def summarise_training(history: pd.DataFrame) -> dict[str, float]:
     """Summarise length, time and validation errors of a training, by name.
 
     Parameters
@@ -65,8 +65,8 @@ def training_summary(history: pd.DataFrame) -> dict[str, float]:
         A row per epoch: epoch, train_mse, validation_mse (NaN where not measured), seconds.
     """
     # Only some epochs are validated.
-    validated = history.dropna(subset=["validation_mse"])
-    best_epoch = validated.iloc[validated["validation_mse"].argmin()]
+    validation_rows = history.dropna(subset=["validation_mse"])
+    best_epoch = validation_rows.iloc[validation_rows["validation_mse"].argmin()]
     epochs = float(history["epoch"].max())
     # The network of the smallest validation error is the result.
     summary = {
@@ -77,13 +77,13 @@ def training_summary(history: pd.DataFrame) -> dict[str, float]:
     }
     # The last validation error within the first quarter, half, … of the training.
     for share in (0.25, 0.5, 0.75, 1.0):
-        earlier = validated[validated["epoch"] <= share * epochs]
+        earlier = validation_rows[validation_rows["epoch"] <= share * epochs]
         value = earlier["validation_mse"].iloc[-1] if len(earlier) else np.nan
         summary[f"validation MSE after {share:.0%}"] = float(value)
     return summary
 
 
-def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
+def share_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     """Return True if two evaluations used the same noisy images.
 
     The error of the image that no method has changed is a fingerprint of star and noise: if it
@@ -115,21 +115,24 @@ def compare_evaluations(
 
     Parameters
     ----------
-    first, second : as for `same_noisy_stars`, with dataset and reference
+    first : DataFrame
+        Errors per star, as for `share_noisy_stars`, with the columns dataset and reference.
+    second : DataFrame
+        Errors of the other evaluation, in the same form.
     scatter : mapping
-        See `seed_scatter`.
+        See `read_seed_scatter`.
 
     Returns
     -------
     DataFrame
         metric, method, noise_level, first, second, difference (second − first), stderr (of
-        the stars), seed_stderr (of both trainings; NaN if not measured), sigmas (of both
-        errors, or of that of the stars alone), verdict: "better", "worse" (the second) or
-        "same", for methods and levels that both have.
+        the stars), seed_stderr (of both trainings; NaN if not measured), sigmas (the difference
+        over both errors, or over stderr where seed_stderr is NaN), verdict: "better", "worse" (the
+        second) or "same", for methods and levels that both have.
     """
     # Methods and levels that both evaluations have, in the order of the first one.
     # On the same noisy stars their scatter is common to both, and cancels.
-    paired = same_noisy_stars(first, second)
+    is_paired = share_noisy_stars(first, second)
     rows = []
     keys = ["method", "noise_level"]
     second_groups = {key: table for key, table in second.groupby(keys, sort=False)}
@@ -138,7 +141,7 @@ def compare_evaluations(
         if second_stars is None:
             continue
         for metric in ("mse", "ssim"):
-            values = _difference(first_stars, second_stars, metric, paired, scatter)
+            values = _compare_means(first_stars, second_stars, metric, is_paired, scatter)
             rows.append({"metric": metric, "method": method, "noise_level": level, **values})
     columns = [
         *("metric", "method", "noise_level", "first", "second"),
@@ -148,11 +151,11 @@ def compare_evaluations(
     return table.sort_values(["metric", "method", "noise_level"], ignore_index=True)
 
 
-def _difference(
-    first: pd.DataFrame, second: pd.DataFrame, metric: str, paired: bool, scatter: Scatter
+def _compare_means(
+    first: pd.DataFrame, second: pd.DataFrame, metric: str, is_paired: bool, scatter: Scatter
 ) -> dict[str, float | str]:
     """Return a row of `compare_evaluations` for one method and noise level, without its keys."""
-    if paired:
+    if is_paired:
         # Mean of the differences of the same stars.
         first, second = (table.sort_values("star") for table in (first, second))
         change = second[metric].to_numpy() - first[metric].to_numpy()
@@ -167,7 +170,7 @@ def _difference(
         stderr = float(np.hypot(means[0][1], means[1][1]))
     # Scatter of both trainings between seeds; 0 in the significance if it was not measured.
     first_mean, second_mean = (float(table[metric].mean()) for table in (first, second))
-    fits = (tuple(table[FITTED].iloc[0]) for table in (first, second))
+    fits = (tuple(table[FIT_KEYS].iloc[0]) for table in (first, second))
     seed_errors = [
         seed_stderr(scatter.get(fit, np.nan), metric, mean)
         for fit, mean in zip(fits, (first_mean, second_mean), strict=True)
@@ -191,9 +194,9 @@ def _difference(
     }
 
 
-def with_seed_stderr(table: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
+def add_seed_stderr(table: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
     """Add the column `seed_stderr` to rows of `psf_metrics.csv`; NaN where not measured."""
-    rows = zip(*(table[name] for name in (*FITTED, "metric", "value")), strict=True)
+    rows = zip(*(table[name] for name in (*FIT_KEYS, "metric", "value")), strict=True)
     seed_errors = [
         seed_stderr(scatter.get(tuple(fit), np.nan), metric, value) for *fit, metric, value in rows
     ]
@@ -214,7 +217,7 @@ def compare_tables(
     first, second : DataFrame
         Rows of `psf_metrics.csv`.
     scatter : mapping
-        See `seed_scatter`.
+        See `read_seed_scatter`.
     negligible : float
         Part of the test stars' standard error up to which a difference is called rounding.
     ascending : sequence of str
@@ -233,7 +236,7 @@ def compare_tables(
         scatter in both.
     """
     # Rows that both tables have, with the standard errors of both.
-    tables = [with_seed_stderr(table, scatter) for table in (first, second)]
+    tables = [add_seed_stderr(table, scatter) for table in (first, second)]
     keys = [*CELL, "method", "metric"]
     columns = [table[[*keys, "value", "stderr", "seed_stderr", "n"]] for table in tables]
     rows = columns[0].merge(columns[1], on=keys, suffixes=("_first", "_second"))
@@ -251,14 +254,14 @@ def compare_tables(
     )
     rows = rows[[*keys, "value_first", "value_second", "n_first", "n_second", "verdict"]]
     # Signs of the differences between the paper's methods, where both tables have them.
-    signs = [_mse_signs(table, ascending) for table in tables]
+    signs = [_compute_mse_signs(table, ascending) for table in tables]
     signs = [s.reindex(signs[0].index.intersection(signs[1].index)) for s in signs]
     order = {name: (s < 0).all(axis=1) for name, s in zip(("first", "second"), signs, strict=True)}
     order["exchanged"] = (signs[0] * signs[1] < 0).any(axis=1)
     return rows, pd.DataFrame(order)
 
 
-def _mse_signs(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
+def _compute_mse_signs(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
     """Return the sign of the MSE difference for each pair of methods.
 
     −1 if the MSE of the pair's first method is smaller, 1 if larger, 0 if the difference is below
@@ -279,10 +282,10 @@ def _mse_signs(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(signs, index=mse.index)
 
 
-def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
-    """Measure the increase of errors if a star's field is not among the training fields.
+def measure_held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
+    """Measure how much errors grow if a star's field is not among the training fields.
 
-    Compared are the stars that both splits test: they are in held-out fields, and the split
+    The stars that both splits test are compared: they are in held-out fields, and the split
     `random` does not use them for training or validation.
 
     Parameters
@@ -298,19 +301,19 @@ def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
         its standard error clustered by field, numbers of stars and of fields.
     """
     rows = []
-    keys = [*FITTED, "noise_level"]
+    keys = [*FIT_KEYS, "noise_level"]
     for key, errors in stars.groupby(keys, sort=False):
         # Errors of one method at one noise level, in both splits.
-        by_split = [errors[errors.split == split] for split in ("random", "held_out")]
-        # Stars that both splits test: their two errors differ by what the fit has seen.
-        shared = by_split[0].merge(
+        by_split = [errors[errors.split == name] for name in ("random", "held_out")]
+        # Stars that both splits test: their errors differ because the training stars differ.
+        pairs = by_split[0].merge(
             by_split[1], on=["star", "field"], suffixes=("_random", "_held_out")
         )
-        if len(shared):
-            held_out_mse, random_mse = shared.mse_held_out.to_numpy(), shared.mse_random.to_numpy()
-            ratio, stderr = clustered_ratio(held_out_mse, random_mse, shared.field.to_numpy())
+        if len(pairs):
+            held_out_mse, random_mse = pairs.mse_held_out.to_numpy(), pairs.mse_random.to_numpy()
+            ratio, stderr = clustered_ratio(held_out_mse, random_mse, pairs.field.to_numpy())
             means = (random_mse.mean(), held_out_mse.mean())
-            rows.append((*key, *means, ratio, stderr, len(shared), shared.field.nunique()))
+            rows.append((*key, *means, ratio, stderr, len(pairs), pairs.field.nunique()))
     columns = [*keys, "mse_random", "mse_held_out", "ratio", "stderr", "n", "fields"]
     return pd.DataFrame(rows, columns=columns)
 

@@ -1,7 +1,7 @@
 """Axes, line styles and legends that figures of tables share.
 
-In go the rows of a table; out come panels with the axis of noise levels, a readable logarithmic
-axis of errors, one line style for each method and a legend below all panels.
+Panels have an axis of noise levels, a readable logarithmic axis of errors, one line style for each
+method, and a legend below all of them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def reference_title(reference: str) -> str:
     }[reference]
 
 
-def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
+def make_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
     """Make a figure with one titled panel for each reference of a table.
 
     The panels stand side by side, realisations first, and share the axis of errors.
@@ -64,7 +64,7 @@ def reference_panels(table: pd.DataFrame) -> tuple[Figure, list[Panel]]:
     references = sorted(set(table["reference"]))
     all_axes = figure.subplots(1, len(references), squeeze=False, sharey=True)[0]
     for axes, name in zip(all_axes, references, strict=True):
-        # What is in brackets goes to a second line: two panels share the width of the figure.
+        # Words in brackets are on a second line: two panels share the width of the figure.
         axes.set_title(reference_title(name).replace(" (", "\n("))
         axes.grid(True, which="major")
     rows = [table[table.reference == name] for name in references]
@@ -80,19 +80,19 @@ def finish_panels(
     label: str = METRIC_LABELS["mse"],
     logarithmic: bool = True,
 ) -> None:
-    """Label the common axis of errors, and add the title and the legend below the panels."""
+    """Label the common axis of errors; add the title, and the legend below the panels."""
     # The panels share one axis of errors: the first one's scale and label hold for all.
     first = panels[0][0]
     if logarithmic:
         first.set_yscale("log")
-        readable_log_axis(first)
+        label_log_axis(first)
     first.set_ylabel(label)
     figure.suptitle(title)
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
 
 
-def by_method(table: pd.DataFrame) -> list[tuple[type[Method], pd.DataFrame]]:
-    """Return the methods of a table by name, and the rows of each."""
+def group_by_method(table: pd.DataFrame) -> list[tuple[type[Method], pd.DataFrame]]:
+    """Return the methods in a table in the order of their names, with the rows of each."""
     return [(method(str(name)), rows) for name, rows in table.groupby("method")]
 
 
@@ -105,43 +105,43 @@ def method_line(method_class: type[Method]) -> Style:
 
 def paper_marker(method_class: type[Method]) -> Style:
     """Return the style of the paper's published values: an open marker without a line."""
-    # The paper has no standard errors: its markers are larger and open.
+    # The paper gives no standard errors: its markers are larger and open.
     return {**method_line(method_class), "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
 
 
-def legend_entry(label: str, **style: Any) -> Artist:
+def make_entry(label: str, **style: Any) -> Artist:
     """Return an entry of a legend with the style of a line, black unless it has a colour."""
     from matplotlib.lines import Line2D
 
     return Line2D([], [], **{"color": "black", **style}, label=label)
 
 
-def method_entries(methods: set[str], published: Set[str] = frozenset()) -> list[Artist]:
+def make_method_entries(methods: set[str], paper_methods: Set[str] = frozenset()) -> list[Artist]:
     """Return legend entries of measured methods, each followed by the paper's open marker."""
     # Methods that are given the noise level stand last.
     entries: list[Artist] = []
-    for method_class in oracles_last(methods | published):
+    for method_class in oracles_last(methods | paper_methods):
         label = method_class.look.label
         if method_class.name in methods:
-            entries.append(legend_entry(label, **method_line(method_class)))
-        if method_class.name in published:
-            entries.append(legend_entry(f"{label}, paper", **paper_marker(method_class)))
+            entries.append(make_entry(label, **method_line(method_class)))
+        if method_class.name in paper_methods:
+            entries.append(make_entry(f"{label}, paper", **paper_marker(method_class)))
     return entries
 
 
-def noise_axis(axes: Axes, levels: np.ndarray) -> None:
+def set_noise_axis(axes: Axes, levels: np.ndarray) -> None:
     """Make the x axis logarithmic, with a tick at each noise level λ.
 
     The common power of ten is in the label of the axis.
     """
     # Rounding must not make log10(1e-3) less than −3.
     power = int(np.floor(np.log10(levels.min()) + 1e-9))
-    log_axis(axes, levels, [f"{level / 10.0**power:g}" for level in levels])
+    set_log_axis(axes, levels, [f"{level / 10.0**power:g}" for level in levels])
     exponent = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     axes.set_xlabel(f"noise level λ (× 10{exponent})")
 
 
-def log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
+def set_log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
     """Make the x axis logarithmic with these ticks and no others."""
     from matplotlib.ticker import NullLocator
 
@@ -151,7 +151,7 @@ def log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
     axes.set_xticks(ticks, labels=labels)
 
 
-def readable_log_axis(axes: Axes) -> None:
+def label_log_axis(axes: Axes) -> None:
     """Write numbers on the y axis between decades, too: it often spans only one or two."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 

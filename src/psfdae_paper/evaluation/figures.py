@@ -23,11 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FieldOfPsfs:
-    """Static PSFs of F field points, and what was measured of them.
+    """Static PSFs of F field points, and their measured shapes.
 
     Attributes
     ----------
     psf : ndarray, shape (F, d, d)
+        Fraction of the light on each pixel.
     grid : ndarray of int, shape (F, 2)
         Grid index (ix, iy).
     field : ndarray, shape (F, 2)
@@ -44,15 +45,16 @@ class FieldOfPsfs:
     table: pd.DataFrame
 
 
-def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
+def make_mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
     """Put stamps side by side at their grid positions.
 
-    Stamp (ix, iy) starts at row gap + iy (d + gap) and column gap + ix (d + gap)
+    Stamp (ix, iy) starts at row gap + iy (d + gap) and column gap + ix (d + gap),
     and is not flipped.
 
     Parameters
     ----------
     stamps : ndarray, shape (F, d, d)
+        Stamps, one per field point.
     grid : ndarray of int, shape (F, 2)
         Grid index (ix, iy) of every stamp.
     gap : int
@@ -61,9 +63,9 @@ def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
     Returns
     -------
     ndarray, shape (P_y (d + gap) + gap, P_x (d + gap) + gap)
-        NaN where there is no stamp.
+        NaN outside the stamps.
     """
-    # Pixels between stamps, and where there is none, are NaN, which is drawn in grey.
+    # Pixels outside the stamps are NaN, which is drawn in grey.
     side = stamps.shape[-1]
     pitch = side + gap  # pixels from one stamp to the next
     # Columns run along x, rows along y.
@@ -76,7 +78,7 @@ def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
 
 
 @styled
-def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
+def draw_templates(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
     """Draw all templates (F, d, d) at their field positions, as one mosaic.
 
     `grid` holds grid indices (ix, iy), `field` angles (x, y) in radians, both of shape (F, 2).
@@ -95,18 +97,16 @@ def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: st
 
 
 @styled
-def stamp_energy_map(
-    energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int
-) -> Figure:
+def draw_energy(energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int) -> Figure:
     """Draw the fraction of a star's light inside its stamp, shape (F,), over the field.
 
-    `grid` and `field` as for `template_map`; the stamps have `stamp_px` pixels a side.
+    `grid` and `field` as for `draw_templates`; the stamps have `stamp_px` pixels a side.
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
     # A coloured cell for each field point, with its number where there is room.
     image = _draw_values(axes, energy, grid, field, "viridis")
-    _field_axes(axes, field)
+    _label_axes(axes, field)
     # On grids with more than 15 points a side the numbers would touch.
     if grid.max() < 15:
         _write_values(axes, image, energy, field, fontsize=8)
@@ -120,8 +120,8 @@ def stamp_energy_map(
 
 
 @styled
-def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> Figure:
-    """Draw a mosaic of all stamps; beside it maps of the light in the stamp and of the FWHM.
+def draw_field(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> Figure:
+    """Draw a mosaic of all stamps, and maps of the light in the stamp and of the FWHM.
 
     Whiskers in the map of the FWHM have the direction of the longer axis and a length in
     proportion to the ellipticity. `name` is the telescope's.
@@ -142,11 +142,11 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     image = _draw_map(light_axes, fields, energy, "viridis", "light inside the stamp")
     if fields.grid.max() < 7:
         _write_values(light_axes, image, energy, fields.field, fontsize=6.5)
-    # FWHM, with whiskers: that of a line (ellipticity 1) is 1.6 distances of field points long.
+    # FWHM, with whiskers: at ellipticity 1 they are 1.6 distances of field points long.
     fwhm_axes = figure.add_subplot(grid[1, 1])
     _draw_map(fwhm_axes, fields, fields.table.fwhm_arcsec.to_numpy(), "cividis", "FWHM (arcsec)")
     # Spacing of the field points in the unit of the axes, for the length of the whiskers.
-    position, _ = in_field_unit(fields.field)
+    position, _ = to_field_unit(fields.field)
     points = int(fields.grid[:, 0].max()) + 1
     spacing = float(np.ptp(position[:, 0])) / (points - 1) if points > 1 else 1.0
     angle = np.deg2rad(fields.table.position_angle_deg.to_numpy())
@@ -172,7 +172,7 @@ def _draw_map(
     half_range = 0.5 * max(float(np.ptp(values)), 0.05 * middle)
     limits = (middle - half_range, middle + half_range)
     image = _draw_values(axes, values, fields.grid, fields.field, cmap, *limits)
-    axes.set_ylabel(f"y ({in_field_unit(fields.field)[1]})")
+    axes.set_ylabel(f"y ({to_field_unit(fields.field)[1]})")
     axes.set_title(f"{title}: {values.min():.2f} … {values.max():.2f}")
     axes.figure.colorbar(image, ax=axes, shrink=0.9)
     return image
@@ -186,7 +186,7 @@ def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray)
     share = psf / psf.max(axis=(1, 2), keepdims=True)
     gap = 1  # pixels between stamps
     image = axes.imshow(
-        mosaic(np.sqrt(np.clip(share, 0.0, None)), grid, gap),
+        make_mosaic(np.sqrt(np.clip(share, 0.0, None)), grid, gap),
         origin="lower",
         extent=_extent(grid, field, psf.shape[-1], gap),
         cmap=colormaps[STAMP_MAP].with_extremes(bad="#b0b0b0"),
@@ -194,7 +194,7 @@ def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray)
         vmax=1.0,
         interpolation="nearest",
     )
-    _field_axes(axes, field)
+    _label_axes(axes, field)
     return image
 
 
@@ -209,8 +209,8 @@ def _draw_values(
 ) -> AxesImage:
     """Draw a value of each field point (F,) as a coloured cell."""
     return axes.imshow(
-        # A value is a stamp of one pixel; there are no gaps.
-        mosaic(values[:, None, None], grid, gap=0),
+        # A value is a stamp of one pixel, drawn without gaps.
+        make_mosaic(values[:, None, None], grid, gap=0),
         origin="lower",
         extent=_extent(grid, field, 1, 0),
         cmap=cmap,
@@ -224,9 +224,9 @@ def _write_values(
     axes: Axes, image: AxesImage, values: np.ndarray, field: np.ndarray, fontsize: float
 ) -> None:
     """Write numbers into the cells of an image, dark on light or light on dark."""
-    position, _ = in_field_unit(field)
+    position, _ = to_field_unit(field)
     for (x, y), value in zip(position, values, strict=True):
-        # Colour of the cell, from which that of the number follows.
+        # The number is white on dark cells, and black on light ones.
         red, green, blue, _ = image.cmap(image.norm(value))
         # Luma of ITU-R BT.601, the brightness that the eye perceives.
         color = "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.5 else "black"
@@ -240,7 +240,7 @@ def _extent(
 
     With these edges the centre of each stamp is at its field point.
     """
-    position, _ = in_field_unit(field)
+    position, _ = to_field_unit(field)
     pitch = side + gap  # pixels from one stamp to the next
 
     # The centre of a stamp is gap + side/2 pixels from the edge of the mosaic.
@@ -249,7 +249,7 @@ def _extent(
         # Width of a pixel of the mosaic in the unit of the axes, from the spacing of the field
         # points.
         first, last = position[:, axis].min(), position[:, axis].max()
-        # A single field point has no spacing; its width is arbitrary.
+        # A single field point has an arbitrary width.
         pixel = ((last - first) / (points - 1) if points > 1 else 1.0) / pitch
         margin = (gap + 0.5 * side) * pixel
         return first - margin, last + margin
@@ -257,14 +257,14 @@ def _extent(
     return *edges(0), *edges(1)
 
 
-def _field_axes(axes: Axes, field: np.ndarray) -> None:
+def _label_axes(axes: Axes, field: np.ndarray) -> None:
     """Label both axes with the field angle and its unit."""
-    _, unit = in_field_unit(field)
+    _, unit = to_field_unit(field)
     axes.set_xlabel(f"field angle x ({unit})")
     axes.set_ylabel(f"field angle y ({unit})")
 
 
-def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
+def to_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     """Return field angles in degrees, or in arc minutes if the whole field is within ±1°.
 
     Parameters

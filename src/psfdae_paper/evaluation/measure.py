@@ -1,7 +1,7 @@
-"""Errors of estimates on the stars of a part: what every table of errors is made of.
+"""Errors of estimated PSFs on a set of stars, from which all tables of errors are made.
 
-In go restored images of some stars; out come rows of the summary (mean and standard error of each
-metric) and a table with the errors of every single star.
+Input: denoised images of some stars. Outputs: rows of the summary (mean and standard error of each
+metric), and a table with the errors of every star.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from psfdae.base.files import Product, ProductError
+from psfdae.base.files import Product
 from psfdae.base.reading import read_table
 from psfdae.methods.interface import Estimate
 from psfdae.methods.metrics import quality, summarised
@@ -30,20 +30,19 @@ def read_tables(paths: Sequence[Path], columns: Sequence[str] | None = None) -> 
     Parameters
     ----------
     paths : sequence of Path
+        CSV files, at least one.
     columns : sequence of str, optional
-        Columns to take from each file; by default those of the first.
+        Columns to read from each file; by default all columns of the first.
 
     Raises
     ------
     ProductError
-        If a file is missing or damaged, or has not all columns.
+        If a file is missing or damaged, or lacks a column.
     """
-    # All files must have the columns that are taken; others are left out.
-    tables = [read_table(path) for path in paths]
-    columns = list(tables[0].columns if columns is None else columns)
-    for path, table in zip(paths, tables, strict=True):
-        if missing := [name for name in columns if name not in table]:
-            raise ProductError(f"{path}: column {missing[0]!r} is missing")
+    # All files must have these columns; others are left out.
+    first = read_table(paths[0], *(columns or ()))
+    columns = list(columns or first.columns)
+    tables = [first, *(read_table(path, *columns) for path in paths[1:])]
     # Tables without rows would change the types of columns.
     tables = [table for table in tables if len(table)] or tables[:1]
     return pd.concat([table[columns] for table in tables], ignore_index=True)
@@ -75,8 +74,8 @@ class MeasuredStars:
     truth: np.ndarray
 
     @classmethod
-    def of(cls, product: Product, star: np.ndarray, reference: str) -> MeasuredStars:
-        """Take some stars of a product "stars", with one of its references as the truth."""
+    def from_product(cls, product: Product, star: np.ndarray, reference: str) -> MeasuredStars:
+        """Select stars of a product "stars", with one of its references as the truth."""
         # A method may be given the position; errors are clustered by field.
         field, position = product["field_index"][star], field_positions(product)[star]
         return cls(star, field, position, product[reference][star])
@@ -91,7 +90,7 @@ class MeasuredStars:
         row : mapping
             The first columns of both tables: those that name dataset, method and noise level.
         estimate : Estimate
-            Restored images of the stars, shape (n, d, d), and their errors if the method has them.
+            Denoised images of the stars, shape (n, d, d), and their errors if the method has them.
         data_range : float
             Dynamic range of the SSIM.
 

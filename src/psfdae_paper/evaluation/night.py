@@ -1,7 +1,7 @@
 """Verdicts on the images of a night, and the page that shows them.
 
-In goes a table with a row for each image, in the order of time; out come a verdict and its reason
-for each, figures of size and shape of the PSF against time, and an HTML page.
+Input: a table with a row for each image, in the order of time. Outputs: a verdict and its reason
+for each image, figures of size and shape of the PSF against time, and an HTML page.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VERDICTS = ("good", "poor", "failed")
 """Good images, those with a model that are unlike their neighbours in time, those without one."""
 
 TEXT_COLUMNS = {"image", "name", "reason", "verdict", "start", "time"}
-"""Columns of the table of a night that are texts, whatever they look like."""
+"""Columns of the table of a night that are texts, also if they look like numbers."""
 
 TABLE_COLUMNS = {
     *(TEXT_COLUMNS - {"image"}),
@@ -51,30 +51,30 @@ LIMITS = {
     "ellipticity_centre": (0.1, "elongated stars, ellipticity {value:.2f}: trailed?"),
     "mag_20th": (0.5, "stars fainter by {excess:.1f} mag than in its neighbours in time: clouds?"),
 }
-"""Least excess over the neighbours in time for which an image is poor, and what is said of it."""
+"""Minimum excess over the neighbours in time for which an image is poor, and the reason given."""
 
 
-def with_verdicts(night: DataFrame) -> DataFrame:
+def add_verdicts(night: DataFrame) -> DataFrame:
     """Return a table of a night with a verdict on each image, and the reason for it.
 
     A quantity of an image is compared with its median over the eleven images about it in time. It
     is unusual if it is larger by 5 σ, with the robust σ of all such differences of the night, and
-    by the least excess of `LIMITS`.
+    by the minimum excess in `LIMITS`.
 
     Parameters
     ----------
     night : DataFrame
-        Rows in the order of time, with the column `reason` of images that have no model.
+        Rows in the order of time; the column `reason` says why an image has no model.
     """
-    # A night without any model has no measurements.
+    # A night without any model lacks the columns of measurements.
     night = night.reindex(columns=[*night, *(name for name in LIMITS if name not in night)])
     night = night.assign(verdict=np.where(night.reason == "", "good", "failed"))
-    for column, (least_excess, sentence) in LIMITS.items():
+    for column, (min_excess, sentence) in LIMITS.items():
         value = night[column].dropna()
         median = value.rolling(11, center=True, min_periods=1).median()
         excess = value - median
         sigma = SIGMA_OF_MAD * (excess - excess.median()).abs().median()
-        for row in excess.index[excess > max(5.0 * sigma, least_excess)]:
+        for row in excess.index[excess > max(5.0 * sigma, min_excess)]:
             words = {"value": value[row], "median": median[row], "excess": excess[row]}
             reasons = [night.loc[row, "reason"], sentence.format(**words)]
             night.loc[row, ["verdict", "reason"]] = "poor", "; ".join(filter(None, reasons))
@@ -113,7 +113,7 @@ def read_night(path: Path, *columns: str) -> DataFrame:
     return table
 
 
-def times_of(night: DataFrame) -> tuple[Any, str]:
+def read_times(night: DataFrame) -> tuple[Any, str]:
     """Return the time of each image, or its number where times are missing, and their label."""
     import pandas as pd
 
@@ -124,14 +124,14 @@ def times_of(night: DataFrame) -> tuple[Any, str]:
 
 
 @styled
-def telescope_figure(night: DataFrame, names: Sequence[str]) -> Figure:
+def draw_telescope_numbers(night: DataFrame, names: Sequence[str]) -> Figure:
     """Draw numbers of the telescope, columns of the night's table, with their errors against time.
 
     The columns with the errors have `_error` at the end of their names.
     """
     figure = new_figure(0.4 + 0.8 * len(names), layout="constrained")
     panels: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    x, label_of_x = times_of(night)
+    x, label_of_x = read_times(night)
     is_measured = night[names[0]].notna()
     for axes, name in zip(panels, names, strict=True):
         columns = night[name][is_measured], night[f"{name}_error"][is_measured]
@@ -145,11 +145,11 @@ def telescope_figure(night: DataFrame, names: Sequence[str]) -> Figure:
 
 
 @styled
-def night_figure(night: DataFrame) -> Figure:
-    """Draw FWHM and ellipticity at five places, and the brightness of stars, against time."""
+def draw_night(night: DataFrame) -> Figure:
+    """Draw FWHM and ellipticity at five positions, and the brightness of stars, against time."""
     figure = new_figure(6.5, layout="constrained")
     panels: Any = figure.subplots(3, 1, sharex=True)
-    x, label_of_x = times_of(night)
+    x, label_of_x = read_times(night)
     for axes, column, label in (
         (panels[0], "fwhm_px", "FWHM (px)"),
         (panels[1], "ellipticity", "ellipticity"),
@@ -158,7 +158,7 @@ def night_figure(night: DataFrame) -> Figure:
             values = night[f"{column}_{place}"]
             axes.plot(x, values, ".-", ms=4, lw=0.7, color=color, label=place.replace("_", " "))
         axes.set_ylabel(label)
-        # The range is that of good images: an outlier must not flatten all others.
+        # Good images decide the range: an outlier must not flatten all others.
         good_values = night[night.verdict == "good"][[f"{column}_{place}" for place in PLACES]]
         if len(good_values) > 1:
             low, high = good_values.min().min(), good_values.max().max()
@@ -208,14 +208,14 @@ def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) ->
     if psfs:
         places = [place.replace("_", " ") for place in PLACES]
         strip = [StripRow(label, stamps, own_scale=True) for label, stamps in psfs.items()]
-        figures = image_tag(night_figure(night))
+        figures = image_tag(draw_night(night))
         figures += image_tag(restoration_strip(strip, places, "Best, median and worst PSF"))
     # Where the optics are known: the state of the telescope, or why it is not.
     state = night.filter(regex="^telescope_")
     numbers = {str(column) for column in state.select_dtypes("number")}
     names = [str(column) for column in state if {column, f"{column}_error"} <= numbers]
     if names:
-        figures += image_tag(telescope_figure(night, names))
+        figures += image_tag(draw_telescope_numbers(night, names))
     for reason in (
         state.get("telescope_reason", night.reason[:0]).replace("", None).dropna().unique()
     ):

@@ -1,7 +1,7 @@
 """Figures of a sweep: all points at once, and the metric against each axis.
 
-In go the summary of a sweep and its definition; out come matplotlib figures. An axis of the sweep
-may have numbers, drawn at their distances, or options, which follow each other.
+Functions take the summary of a sweep and its definition and return matplotlib figures. Numbers of
+an axis are drawn at their distances, options one after the other.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, new_figure, styled
-from psfdae_paper.evaluation.drawing import Style, legend_entry
+from psfdae_paper.evaluation.drawing import Style, make_entry
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,7 +69,7 @@ class Scale:
             )
 
 
-def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
+def to_scale(texts: Sequence[str], logarithmic: bool = False) -> Scale:
     """Make the scale of an axis from the texts in its column.
 
     Parameters
@@ -80,7 +80,7 @@ def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
         The scale of numbers is logarithmic; otherwise their range decides.
     """
     try:
-        # Texts that are no numbers are options: they follow each other at equal distances.
+        # Texts other than numbers are options: they follow each other at equal distances.
         numbers = np.array([float(text) for text in texts])
     except ValueError:
         options = list(dict.fromkeys(texts))
@@ -107,7 +107,7 @@ def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
 
 @dataclass(frozen=True)
 class SweepPoints:
-    """Points of a sweep with what they are compared by.
+    """Points of a sweep, and the metric by which they are compared.
 
     Attributes
     ----------
@@ -157,14 +157,14 @@ class SweepPoints:
 
     def scale(self, name: str) -> Scale:
         """Return the scale of an axis; it is logarithmic if its range is."""
-        return scale_of(self.table[name].tolist(), bool(self.definition["space"][name].get("log")))
+        return to_scale(self.table[name].tolist(), bool(self.definition["space"][name].get("log")))
 
     def draw(self, panel: Axes, scale: Scale, name: str, line: Style) -> str:
         """Draw all points, and lines through the best; return the axis that the lines stand for."""
         table, definition = self.table, self.definition
-        # Points that failed have no metric.
+        # Points that failed lack the metric.
         validation, test = self.errors(self.metric)
-        succeeded = np.isfinite(validation)
+        has_metric = np.isfinite(validation)
         # In a grid of two axes each value of the second axis has a line, if there are at most six.
         second_axes = [axis for axis in definition["space"] if axis != name]
         line_axis = second_axes[0] if definition["kind"] == "grid" and len(second_axes) == 1 else ""
@@ -172,7 +172,7 @@ class SweepPoints:
             line_axis = ""
         for number, value in enumerate(dict.fromkeys(table[line_axis]) if line_axis else [""]):
             color = SERIES_COLORS[number % len(SERIES_COLORS)]
-            members = succeeded & ((table[line_axis] == value).to_numpy() if line_axis else True)
+            members = has_metric & ((table[line_axis] == value).to_numpy() if line_axis else True)
             coordinate = scale.coordinate[members]
             # The line joins the best validation value at each coordinate.
             positions = np.unique(coordinate)
@@ -186,9 +186,9 @@ class SweepPoints:
         panel.plot(scale.coordinate[self.is_best], validation[self.is_best], **star)
         # Failed points are crosses at the upper edge of the panel.
         cross: Style = {"ls": "", "marker": "x", "ms": 6, "color": "0.4"}
-        top = np.full((~succeeded).sum(), 0.97)
+        top = np.full((~has_metric).sum(), 0.97)
         transform = panel.get_xaxis_transform()
-        panel.plot(scale.coordinate[~succeeded], top, transform=transform, **cross)
+        panel.plot(scale.coordinate[~has_metric], top, transform=transform, **cross)
         return line_axis
 
     def draw_noise_levels(self, panel: Axes, scale: Scale, name: str, line: Style) -> str:
@@ -208,16 +208,16 @@ class SweepPoints:
 
 
 @styled
-def parallel_coordinates(points: SweepPoints) -> Figure:
+def draw_parallel_coordinates(points: SweepPoints) -> Figure:
     """Draw every point as a line over the axes of the sweep, coloured by its validation metric."""
     from matplotlib import colormaps
 
     # Heights of every line on every axis, from 0 to 1; the last axis is the metric.
     names, table = list(points.definition["space"]), points.table
     metric_values, _ = points.errors(points.metric)
-    # Points that failed have no metric, and no rank.
-    succeeded = np.isfinite(metric_values)
-    values = metric_values[succeeded]
+    # Points that failed lack a metric, and so a rank.
+    has_metric = np.isfinite(metric_values)
+    values = metric_values[has_metric]
     scales = [points.scale(name) for name in names]
     # Rank of every point, from 0, the best, to 1: it decides the colour of its line.
     direction = points.definition["direction"]
@@ -228,13 +228,13 @@ def parallel_coordinates(points: SweepPoints) -> Figure:
     heights = np.full((len(table), len(names) + 1), failed_height)
     # Lines of a grid would lie on each other: they leave an axis at slightly different heights.
     offset = np.zeros(len(table))
-    offset[succeeded] = 0.025 * (2.0 * rank - 1.0)
+    offset[has_metric] = 0.025 * (2.0 * rank - 1.0)
     for i, scale in enumerate(scales):
         heights[:, i] = scale.to_unit(scale.coordinate) + offset
     # The scale of the metric has five evenly spaced ticks instead of one per point.
-    metric_scale = scale_of([f"{value:.3g}" for value in values], points.is_logarithmic)
+    metric_scale = to_scale([f"{value:.3g}" for value in values], points.is_logarithmic)
     coordinate = np.log10(values) if points.is_logarithmic else values
-    heights[succeeded, -1] = metric_scale.to_unit(coordinate)
+    heights[has_metric, -1] = metric_scale.to_unit(coordinate)
     low, high = np.nanmin(metric_scale.coordinate), np.nanmax(metric_scale.coordinate)
     ticks = np.linspace(low, high, 5) if high > low else np.array([low])
     digits = ".2e" if points.metric.endswith("mse") else ".3g"
@@ -246,37 +246,37 @@ def parallel_coordinates(points: SweepPoints) -> Figure:
     panel = figure.add_subplot()
     # Lines from the largest to the smallest value of the metric; failed ones are grey and dotted.
     colors = np.full((len(table), 4), (0.6, 0.6, 0.6, 1.0))
-    colors[succeeded] = colormaps["viridis"](0.92 * rank)
-    for i in np.argsort(np.where(succeeded, -metric_values, -np.inf), kind="stable"):
-        style = "-" if succeeded[i] else ":"
+    colors[has_metric] = colormaps["viridis"](0.92 * rank)
+    for i in np.argsort(np.where(has_metric, -metric_values, -np.inf), kind="stable"):
+        style = "-" if has_metric[i] else ":"
         panel.plot(heights[i], color=colors[i], ls=style, lw=3.2 if points.is_best[i] else 1.1)
     for i, scale in enumerate(scales):
         scale.draw_upright(panel, i)
     # Names of the axes below them; the frame of the panel would look like another axis.
     panel.set_xticks(range(len(names) + 1), [*names, f"validation\n{points.label}"])
-    bottom = -0.06 if succeeded.all() else failed_height - 0.06
+    bottom = -0.06 if has_metric.all() else failed_height - 0.06
     panel.set(ylim=(bottom, 1.06), xlim=(-0.25, len(names) + 0.35), yticks=[])
     panel.set_title(f"Sweep {points.definition['sweep']}: {len(table)} points")
     panel.spines[:].set_visible(False)
     panel.tick_params(axis="x", length=0)
     # Colours run from the best point to the worst, by rank.
-    handles = [legend_entry("best point", color=colormaps["viridis"](0.0), lw=3.2)]
-    handles += [legend_entry("worst point", color=colormaps["viridis"](0.92), lw=1.1)]
-    if not succeeded.all():
-        handles += [legend_entry(f"failed: {(~succeeded).sum()}", color="0.6", ls=":")]
+    handles = [make_entry("best point", color=colormaps["viridis"](0.0), lw=3.2)]
+    handles += [make_entry("worst point", color=colormaps["viridis"](0.92), lw=1.1)]
+    if not has_metric.all():
+        handles += [make_entry(f"failed: {(~has_metric).sum()}", color="0.6", ls=":")]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
 
 @styled
-def response_curves(points: SweepPoints) -> Figure:
+def draw_response_curves(points: SweepPoints) -> Figure:
     """Draw validation and test metric against each axis of the sweep.
 
     The line of a panel joins the best validation values of listed numbers; in a grid of
     two axes there is one line for every value of the other axis. A sweep of one axis has a
     second panel with the metric at every noise level.
     """
-    # Name of the axis of each panel, and what is drawn against it.
+    # Name of the axis of each panel, and the function that draws it.
     names = list(points.definition["space"])
     contents = [(name, points.draw) for name in names]
     if len(names) == 1:
@@ -289,9 +289,9 @@ def response_curves(points: SweepPoints) -> Figure:
     for panel, (name, draw) in zip(panels, contents, strict=False):
         scale = points.scale(name)
         # Only listed numbers are joined; draws from a range are scattered.
-        joined = scale.numeric and points.definition["space"][name].get("low") is None
+        is_joined = scale.numeric and points.definition["space"][name].get("low") is None
         # The legend's title is the quantity that the lines stand for.
-        title = draw(panel, scale, name, {"ls": "-" if joined else "", "lw": 1.3})
+        title = draw(panel, scale, name, {"ls": "-" if is_joined else "", "lw": 1.3})
         if points.is_logarithmic:
             panel.set_yscale("log")
         panel.set_xticks(scale.ticks, scale.labels)
@@ -304,9 +304,9 @@ def response_curves(points: SweepPoints) -> Figure:
     for row in range(rows):
         panels[row * columns].set_ylabel(points.label)
     # Crosses are explained if a point has failed.
-    failed = ", × failed" if (points.table["status"] == "failed").any() else ""
+    cross_text = ", × failed" if (points.table["status"] == "failed").any() else ""
     name = points.definition["sweep"]
-    figure.suptitle(f"Sweep {name}: filled validation, open test, star the best{failed}")
+    figure.suptitle(f"Sweep {name}: filled validation, open test, star the best{cross_text}")
     return figure
 
 

@@ -1,1 +1,1 @@
-"""Methods of the paper and of its studies, beside those of the library."""
+"""Methods of the paper and of its studies, in addition to the methods of the library."""

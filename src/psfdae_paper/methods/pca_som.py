@@ -5,7 +5,7 @@ Star images are mean-subtracted and projected on their first K eigenvectors
 6–8), and the mean star image of a cluster is the PSF of all its stars. The
 map is MiniSom's.
 
-The paper does not say which noise its training stars have: `baseline.per_level`.
+The paper does not give the noise of its training stars: see `baseline.per_level`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Baseline(Group):
 
 @dataclass(frozen=True)
 class PcaFit:
-    """One fit: arrays that can be stored and applied without a library.
+    """One fit, as arrays.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class PcaFit:
     components : ndarray, shape (K, P)
         Eigenvectors, rows.
     nodes : ndarray, shape (M, K)
-        Map nodes in feature space; only nodes that won a training star.
+        Map nodes in feature space; only nodes with training stars.
     psf : ndarray, shape (M, P)
         Mean star image of each node's cluster.
     """
@@ -76,8 +76,9 @@ class PcaFit:
         Raises
         ------
         ValueError
-            If an image has a pixel that is not finite: it is nearest to no node.
+            If an image has a pixel that is not finite: the nearest node is undefined.
         """
+        # y = Aᵀ (x − mean), with the eigenvectors as columns of A (eqs. 2–5).
         features: np.ndarray = (images.reshape(len(images), -1) - self.mean) @ self.components.T
         if not (finite := np.isfinite(features).all(axis=1)).all():
             raise ValueError(
@@ -114,6 +115,7 @@ class PcaSom(Method):
     level : ndarray, shape (L,)
         Noise level λ of each fit, ascending; 0 of a single one for all levels.
     fits : tuple of PcaFit
+        Fit of each level.
     """
 
     look = Look("PCA+SOM", "#d55e00", "s", paper=("pca", "PCA"))
@@ -171,25 +173,22 @@ class PcaSom(Method):
             level,
             tuple(
                 fit_pca_som(noisy, **settings, seed=seed)
-                for noisy in _noisy(data, level, f"baseline{validation}")
+                for noisy in _draw_noisy_images(data, level, f"baseline{validation}")
             ),
         )
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the arrays of all fits with their resolved configuration."""
-        # Arrays of equal shapes are stacked. Fits may differ in the number of nodes: theirs are
-        # joined, and `owner` tells the fit of each node.
+        # Arrays of equal shapes are stacked. Fits may differ in the number of nodes: these arrays
+        # are joined, and `owner` is the number of each node's fit.
         values = {
-            name: join([getattr(fit, name) for fit in self.fits])
-            for names, join in (
-                (("mean", "components"), np.stack),
-                (("nodes", "psf"), np.concatenate),
-            )
-            for name in names
+            "level": self.level,
+            "mean": np.stack([fit.mean for fit in self.fits]),
+            "components": np.stack([fit.components for fit in self.fits]),
+            "nodes": np.concatenate([fit.nodes for fit in self.fits]),
+            "psf": np.concatenate([fit.psf for fit in self.fits]),
+            "owner": np.repeat(np.arange(len(self.fits)), [len(fit.nodes) for fit in self.fits]),
         }
-        values["level"] = self.level
-        node_count = [len(fit.nodes) for fit in self.fits]
-        values["owner"] = np.repeat(np.arange(len(self.fits)), node_count)
         columns = {
             name: Column(values[name], *unit_and_meaning)
             for name, unit_and_meaning in self.stored().items()
@@ -201,7 +200,7 @@ class PcaSom(Method):
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Make the fits from the arrays that `save` has written."""
-        # `owner` tells which nodes belong to which fit.
+        # `owner` is the number of each node's fit.
         node_masks = [arrays["owner"] == i for i in range(len(arrays["level"]))]
         stored_fits = zip(arrays["mean"], arrays["components"], node_masks, strict=True)
         return cls(
@@ -218,6 +217,7 @@ class PcaSom(Method):
         Parameters
         ----------
         images : ndarray, shape (n, d, d)
+            Noisy stars of sum 1.
         level : float or ndarray, shape (n,)
             Noise level λ.
 
@@ -239,7 +239,7 @@ class PcaSom(Method):
         return psf
 
 
-def _noisy(data: TrainingSet, levels: np.ndarray, name: str) -> Iterator[np.ndarray]:
+def _draw_noisy_images(data: TrainingSet, levels: np.ndarray, name: str) -> Iterator[np.ndarray]:
     """Draw noisy images of the training stars for each fit; level 0 mixes all levels."""
     for level in levels:
         if level:
@@ -261,12 +261,13 @@ def fit_pca_som(
 ) -> PcaFit:
     """Fit the baseline on noisy star images of one level, or of mixed ones.
 
-    Nodes that win no training star have no mean image; they are left out of the
-    fitted map, so a test star falls to the nearest node that has one.
+    Nodes without training stars, which have no mean image, are left out of the fitted
+    map: a test star is assigned to the nearest of the other nodes.
 
     Parameters
     ----------
     images : ndarray, shape (n, d, d)
+        Noisy training stars of sum 1.
     components : int
         K, at most min(n, d²).
     rows, columns : int
@@ -289,10 +290,10 @@ def fit_pca_som(
             f"baseline.components = {components}: must be at most {min(flat.shape)} "
             f"(stars and pixels: {flat.shape})"
         )
-    # Coefficients of the stars along the principal axes, of which the map is made.
+    # Coefficients of the stars along the principal axes, on which the map is trained.
     mean, axes = principal_axes(flat, components)
     features = flat @ axes.T - mean @ axes.T
-    nodes = self_organised(features, (rows, columns), epochs, sigma, learning_rate, seed)
+    nodes = train_map(features, (rows, columns), epochs, sigma, learning_rate, seed)
     # Cluster of each star, and the mean image of each cluster that has stars.
     whole_map = PcaFit(mean, axes, nodes, np.empty((len(nodes), flat.shape[1])))
     winner = whole_map.assign(images)
@@ -309,6 +310,7 @@ def principal_axes(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     Parameters
     ----------
     x : ndarray, shape (n, P)
+        Samples, one per row.
     count : int
         Number of eigenvectors.
 
@@ -320,13 +322,14 @@ def principal_axes(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         largest element is positive.
     """
     mean = x.mean(axis=0)
-    # n times the covariance; `eigh` sorts eigenvalues in ascending order.
+    # n times the covariance is Xᵀ X − n mean meanᵀ.
+    # `eigh` sorts eigenvalues in ascending order.
     axes = np.linalg.eigh(x.T @ x - len(x) * np.outer(mean, mean))[1][:, : -count - 1 : -1].T
     largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
     return mean, axes * np.sign(largest)
 
 
-def self_organised(
+def train_map(
     features: np.ndarray,
     shape: tuple[int, int],
     epochs: int,
@@ -367,7 +370,7 @@ def self_organised(
 
     som = Map(*shape, features.shape[1], sigma=sigma, learning_rate=learning_rate, random_seed=seed)
     som.random_weights_init(features)
-    # A view of the map's weights, so that MiniSom's training changes what is returned.
+    # A view of the map's weights: MiniSom's training changes the array that is returned.
     nodes: np.ndarray = som.get_weights().reshape(-1, features.shape[1])
     difference = np.empty_like(nodes)
     som.train(features, epochs, random_order=True, use_epochs=True)

@@ -1,9 +1,9 @@
 """The telescope's optics as an estimator: wavefronts that explain a star, and their mean PSF.
 
-Given are the telescope, the distribution of its random aberrations, and flux, sky and noise level
-of the star. The unknowns are the star's Seidel coefficients, its field and the position of its
-stamp. Where enough stars of a simulated bank are similar to the star, they give the posterior
-mean. Elsewhere the modes of the posterior are searched as for the error bounds
+The telescope, the distribution of its random aberrations, and flux, sky and noise level of the star
+are known. The unknowns are the star's Seidel coefficients, its field and the position of its stamp.
+Where enough stars of a simulated bank are similar to the star, they give the posterior mean.
+Elsewhere the modes of the posterior are searched as for the error bounds
 (`psfdae_paper.bounds.mode_search`), and importance samples around them give the mean. A star that
 no mode explains gets the PSF of the Gaussian mixture.
 """
@@ -77,22 +77,23 @@ class Wavefront(Method):
 
         # The bank has the configuration of the training stars under another name, which gives
         # other random streams.
-        simulated = data.simulation
-        if simulated.get("scene", {}).get("name") != "seidel":
+        star_config = data.simulation
+        if star_config.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
-        config = part(SIMULATION, simulated)
+        config = part(SIMULATION, star_config)
         columns = fresh_stars(config, "optics", cls.bank_stars)
         bank = {name: column.values for name, column in columns.items()}
-        return cls.with_bank(bank, config, data)
+        return cls.from_bank(bank, config, data)
 
     @classmethod
-    def with_bank(
+    def from_bank(
         cls, bank_columns: Mapping[str, np.ndarray], config: Config, data: TrainingSet
     ) -> Self:
         """Make the method from the columns of a bank of stars, as `fresh_stars` draws them."""
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
 
+        # The model and the static PSFs belong to the same telescope as the bank.
         bank = Bank.of(bank_columns, config.grid.points, config.framing.jitter_px)
         return cls(bank, stamp_model(config), static_psfs(config), data)
 
@@ -120,7 +121,7 @@ class Wavefront(Method):
     def estimate_from_posterior(
         self,
         sums: PosteriorSums,
-        explained: np.ndarray,
+        is_explained: np.ndarray,
         noisy: np.ndarray,
         level: float,
         position: np.ndarray | None = None,
@@ -131,26 +132,30 @@ class Wavefront(Method):
 
         Parameters
         ----------
-        sums, explained : as `posterior` returns them
+        sums : PosteriorSums
+            Weighted sums over samples of the posterior, as `posterior` returns them.
+        is_explained : ndarray of bool, shape (n,)
+            True where a mode explains the star.
         noisy : ndarray, shape (n, d, d)
+            Noisy stars.
         level : float
             Noise level λ.
         position : ndarray, shape (n, 2), optional
             Grid indices of the stars' fields.
         """
         # Posterior mean Σ w x / Σ w over the samples, and the variance about it; of templates, the
-        # weights of fields and positions are those of static PSFs.
+        # weights belong to static PSFs, by field and position.
         mean, variance = sums.mean_image, sums.variance
         if self.data.reference == "template":
             mean, variance = sums.template(self.static)
         psf, sigma = mean.reshape(noisy.shape), np.sqrt(variance).reshape(noisy.shape)
         # Stars without a mode get the estimate of the Gaussian mixture.
-        unexplained = ~explained
-        if unexplained.any():
-            fields = None if position is None else position[unexplained]
-            fallback = self.mixture.estimate(noisy[unexplained], level, fields)
-            psf[unexplained], sigma[unexplained] = fallback.psf, fallback.sigma
-        return Estimate(psf, sigma, explained=explained)
+        has_no_mode = ~is_explained
+        if has_no_mode.any():
+            fields = None if position is None else position[has_no_mode]
+            fallback = self.mixture.estimate(noisy[has_no_mode], level, fields)
+            psf[has_no_mode], sigma[has_no_mode] = fallback.psf, fallback.sigma
+        return Estimate(psf, sigma, explained=is_explained)
 
     def modes(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -168,6 +173,7 @@ class Wavefront(Method):
         from psfdae_paper.bounds.mode_search import search
         from psfdae_paper.bounds.stamp_model import StarPosteriors
 
+        # All fields are searched unless the field of each star is given.
         star_field = self._fields(position)
         posteriors = StarPosteriors(noisy, self.likelihood(level), self.model)
         return search(self.bank, posteriors, star_field, in_all_fields=star_field is None)
@@ -195,8 +201,9 @@ class Wavefront(Method):
         Returns
         -------
         sums : PosteriorSums
-        explained : ndarray of bool, shape (n,)
-            True where a sample of positive weight and, if it was searched, a mode exists.
+            Weighted sums over the samples of each star.
+        is_explained : ndarray of bool, shape (n,)
+            True where a sample has a positive weight and, if modes were searched, one was found.
         """
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
         from psfdae_paper.bounds.sampling import sample_posterior
@@ -204,14 +211,14 @@ class Wavefront(Method):
 
         # First by the stars of the bank, whose weights are their likelihoods.
         sums = self._sums_over_bank(noisy, level, self._fields(position))
-        explained = np.ones(len(noisy), bool)
+        is_explained = np.ones(len(noisy), bool)
         # Stars whose effective number of similar bank stars is too small.
-        unresolved = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
+        undersampled_stars = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
         likelihood = self.likelihood(level)
-        for start in range(0, len(unresolved), 256):  # stars whose matches fit in memory
-            block = unresolved[start : start + 256]
+        for start in range(0, len(undersampled_stars), 256):  # stars whose matches fit in memory
+            block = undersampled_stars[start : start + 256]
             fields = None if position is None else position[block]
-            modes, unexplained = self.modes(noisy[block], level, fields)
+            modes, stars_without_mode = self.modes(noisy[block], level, fields)
             # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
@@ -219,24 +226,26 @@ class Wavefront(Method):
             no_field = np.full(len(block), -1)
             samples, _ = sample_posterior(modes, posteriors, no_field, self.draws_per_star, rngs)
             sums.put(block, samples.with_truth)
-            explained[block[unexplained]] = False
-        return sums, explained & (sums.weight_sum > 0)
+            is_explained[block[stars_without_mode]] = False
+        return sums, is_explained & (sums.weight_sum > 0)
 
     def _fields(self, position: np.ndarray | None) -> np.ndarray | None:
         """Return the numbers of the stars' fields, (n,), if the method is given them."""
         if not self.needs.position or position is None:
             return None
+        # Fields are numbered ix + P iy on a grid of P points a side.
         fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
         return fields
 
     def _sums_over_bank(
         self, noisy: np.ndarray, level: float, star_field: np.ndarray | None
     ) -> PosteriorSums:
-        """Sum over an eighth of the bank, and over all of it where that promises to be enough.
+        """Sum over an eighth of the bank, and over all of it where this is likely to be enough.
 
         Parameters
         ----------
         noisy : ndarray, shape (n, d, d)
+            Noisy stars.
         level : float
             Noise level λ.
         star_field : ndarray of int, shape (n,), optional
@@ -264,8 +273,8 @@ class Wavefront(Method):
             eighth = len(bank_stars) // 8
             first_sums = weigh(stars, bank_stars[:eighth])
             sums.put(stars, first_sums)
-            # The effective sample size grows in proportion to the bank: all of it is worth its
-            # time for stars that have too few samples now, and would have enough of 8 times.
+            # The effective sample size grows in proportion to the bank: the whole bank is used for
+            # stars with too few samples of an eighth of it, and enough of all of it.
             size = first_sums.effective_size
             promising = (size < ENOUGH_ESS) & (8 * size >= ENOUGH_ESS)
             if promising.any():

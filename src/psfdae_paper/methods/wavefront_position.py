@@ -1,4 +1,4 @@
-"""The telescope's optics as an estimator that is given where in the field a star stands."""
+"""The telescope's optics as an estimator that is given the field position of each star."""
 
 from __future__ import annotations
 

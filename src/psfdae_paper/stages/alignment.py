@@ -1,11 +1,12 @@
 """Stages of scene 3: quadratic model of the wavefront, states with their stamps, key figures.
 
-In: the configuration of telescope, prescription and states. Out: the products "alignment_model"
-and "alignment_states", which all other stages of the scene read, and a table of key figures.
+Input: the configuration of telescope, prescription and states. Outputs: the products
+"alignment_model" and "alignment_states", which all other stages of the scene read, and a table of
+key figures.
 
 Products have noise-free stamps; noise is drawn by the stages that need it. The stamps of the grid
-are the training set of the networks; with other noise they are one of the two test sets. The other
-one is the set of uniform states.
+are the training set of the networks and, with other noise, one of two test sets. The other test set
+has uniform states.
 """
 
 from __future__ import annotations
@@ -50,18 +51,20 @@ def model(config: Config, out: File) -> None:
 
     Rays through the misaligned telescope give the Zernike coefficients at all fields. They are
     fitted as quadratic functions of the four numbers of a state: 25 states determine the model,
-    and all states of the grid test it. A model that is off by more than
-    alignment.model_tolerance_waves anywhere is refused.
+    and all states of the grid test it. It is an error if the model is off by more than
+    alignment.model_tolerance_waves anywhere.
 
     The product has the coefficients in waves for each field, and the RMS residual from ray tracing
     for each state of the grid and field.
 
     Parameters
     ----------
+    config : Config
+        Telescope, prescription and alignment.
     out : Path
         HDF5 product with the quadratic model of the wavefront.
     """
-    # Few small arrays: threads would not pay.
+    # Few small arrays: threads would not help.
     limit_threads(1)
     # 25 states of a central composite design determine all terms of the model.
     tracer = StateTracer(config.telescope, config.prescription, config.alignment)
@@ -70,7 +73,7 @@ def model(config: Config, out: File) -> None:
     # The grid, with other states, tests it: no wavefront may differ by more than the tolerance.
     grid = grid_states(config.alignment.grid_levels)
     residual = verify(quadratic, grid, tracer(grid), config.alignment.model_tolerance_waves)
-    # The residual goes into the product, too: it is the model's error.
+    # The product has the residual, too: it is the model's error.
     columns = {
         "coefficients": Column(
             quadratic.coefficients,
@@ -91,21 +94,22 @@ def read_model(
     Parameters
     ----------
     path : Path
+        HDF5 product of `alignment model`.
     expected_config : mapping or Group
         Configuration with which the telescope and states of the product must agree.
     owner : object
         Name of that configuration's file, for error messages.
-
-    Raises
-    ------
-    ProductError
-        If the product is missing or damaged, or does not agree.
 
     Returns
     -------
     QuadraticModel
         Function of states (n, 4), in units of their range, to Zernike coefficients (n, F, Z) in
         waves at the F fields.
+
+    Raises
+    ------
+    ProductError
+        If the product is missing or damaged, or does not agree.
     """
     # The wavefront of a state depends on the telescope's optics and on the range of the states.
     product = read_product(path, "alignment_model", ("coefficients",))
@@ -123,22 +127,22 @@ def read_states(
     Parameters
     ----------
     path : Path
+        HDF5 product of `alignment states`.
     expected_config : mapping or Group, optional
         Configuration with which telescope, range and stamps of the product must agree.
     owner : object
         Name of that configuration's file, for error messages.
 
-    Raises
-    ------
-    ProductError
-        If the product is missing or damaged, or does not agree.
-
     Returns
     -------
     Product
         `states` (n, 4) in units of the range; `stamps` (n, F, d, d), noise-free, each of sum 1.
+
+    Raises
+    ------
+    ProductError
+        If the product is missing or damaged, or does not agree.
     """
-    # Stamps are (n, F, d, d), states (n, 4) in units of their range.
     product = read_product(path, "alignment_states", ("states", "stamps"))
     if expected_config is not None:
         require(path, product.config, Alignment.stamp_keys, expected_config, owner)
@@ -163,6 +167,8 @@ def states(
 
     Parameters
     ----------
+    config : Config
+        Telescope, prescription, alignment and optics.
     kind : str
         Set of states: the paper's grid, uniform states for the test, or many for the training.
     out : Path
@@ -224,13 +230,17 @@ def _geometry(config: Config) -> dict[str, Column]:
 def telescope(config: Config, model: ModelFile, grid: File, uniform: File, out: File) -> None:
     """Tabulate key figures of telescope, model and stamps.
 
-    They say how well the model reproduces rays, how far the telescope is out of focus, how well
-    images separate the four numbers of a state, and how much light the stamps hold.
+    The figures are the error of the model, the defocus of the telescope, the condition number of
+    the four numbers of a state in the images, and the light inside the stamps.
 
-    A row has a quantity, its value and its unit. Products of another telescope are refused.
+    A row has a quantity, its value and its unit. Products of another telescope are rejected.
 
     Parameters
     ----------
+    config : Config
+        Telescope and alignment, with which all products must agree.
+    model : Path
+        Product of `alignment model`.
     grid : Path
         Product of `alignment states --set grid`.
     uniform : Path
@@ -238,20 +248,20 @@ def telescope(config: Config, model: ModelFile, grid: File, uniform: File, out: 
     out : Path
         CSV with key figures.
     """
-    # The model, and the two sets that serve as tests.
+    # The model, and the two test sets.
     quadratic = read_product(model, "alignment_model")
     sets = {
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
-    # All products must be those of the configured telescope.
+    # All products must belong to the configured telescope.
     require(model, quadratic.config, Alignment.wavefront_keys, config)
     for product in sets.values():
         require(product.path, product.config, Alignment.stamp_keys, config)
     # Arrays [field, term, Zernike], [state, field], [Zernike].
     coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
     # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:
-    # its condition number says how well states can be separated.
+    # its condition number measures how well states can be separated.
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
     # Defocus (Noll 4) of the aligned telescope in each field; the first field is the centre.
     defocus = coefficients[:, 0, noll == 4][:, 0]

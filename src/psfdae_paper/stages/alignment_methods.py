@@ -1,7 +1,7 @@
 """Stages of scene 3 that train networks, estimate the states of test sets and bound their errors.
 
-In: products "alignment_states" and "alignment_model". Out: a folder for each network, and the
-products "alignment_estimates" (learned methods), "alignment_fit" (maximum likelihood) and
+Inputs: products "alignment_states" and "alignment_model". Outputs: a folder for each network, and
+the products "alignment_estimates" (networks), "alignment_fit" (maximum likelihood) and
 "alignment_bound" (Cramér–Rao), which `psfdae_paper.stages.alignment_results` tabulates and draws.
 
 The networks differ in their training set. The paper's CNN is trained on noise-free stamps of the
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import make_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,12 @@ from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
 from psfdae.stars.noise import mixed_levels
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of, trained_networks
+from psfdae_paper.configuration.aligners import (
+    ESTIMATORS,
+    Estimator,
+    list_estimators,
+    trained_networks,
+)
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
@@ -47,45 +52,46 @@ from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_m
 if TYPE_CHECKING:
     from psfdae_paper.alignment.networks import TrainingStates
 
-    class NetworkFolders:
-        """A folder of each network, by its name."""
-else:
-    NetworkFolders = make_dataclass(
-        "NetworkFolders",
-        [
-            (name, Annotated[Folder, "Folder of the network of that name."])
-            for name in trained_networks()
-        ],
-    )
+NetworkFolders = make_dataclass(
+    "NetworkFolders",
+    [(name, Annotated[Folder, "Folder of this network."]) for name in trained_networks()],
+)
+"""Options of a command: the folder of each network, by its name."""
 
 Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
-Trained = Annotated[Folder, "Folder for weights, config and history."]
+TrainingFolder = Annotated[Folder, "Folder for weights, config and history."]
 DaeFolder = Annotated[Folder, "Folder of `alignment train-dae`."]
 
 
 @command("paper alignment train-dae", reads=("seed", "noise", "dae", "dae_train"))
 def train_dae(
-    config: Config, grid: File, train: File, checkpoint: Checkpoint, out: Trained
+    config: Config, grid: File, train: File, checkpoint: Checkpoint, out: TrainingFolder
 ) -> None:
     """Train the DAE on the stamps of the grid.
 
-    It learns to restore single stamps with noise of all levels to those without, and is applied
-    to the stamps of a state before a network estimates the state.
+    It is trained to remove the noise of single stamps, at all noise levels, and is applied to the
+    stamps of a state before a network estimates the state.
 
-    The folder gets weights, settings and the error of every epoch. An interrupted training goes on
-    from the checkpoint, and ends with the same bytes.
+    The folder receives weights, settings and the error of every epoch. An interrupted training
+    resumes from the checkpoint, and ends with the same bytes.
 
     Parameters
     ----------
+    config : Config
+        Seed, noise, and settings of the DAE and its training.
     grid : Path
         Product of `alignment states --set grid`.
     train : Path
-        Product of `alignment states --set train`: its first states validate.
+        Product of `alignment states --set train`; its first states are for validation.
+    checkpoint : Path
+        File that lets an interrupted training resume.
+    out : Path
+        Folder for weights, config and history.
     """
     # Both sets must have stamps of the same telescope.
     grid_product = read_states(grid)
     large_product = read_states(train, grid_product.config, grid)
-    # The DAE restores stamps one by one, whatever their state and field.
+    # The DAE denoises stamps one by one, independently of their state and field.
     # 100 states of the large set choose the best epoch; the DAE is not trained on them.
     training = _single_stamps(grid_product["stamps"])
     validation = _single_stamps(large_product["stamps"][:100])
@@ -106,7 +112,7 @@ def train_dae(
 
 
 def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
-    """Return the configuration groups of the training of one network, or of all.
+    """Return the configuration groups of the training of one network, or of all networks.
 
     Parameters
     ----------
@@ -120,8 +126,8 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     """
     # Noise, and the settings of a DAE that is applied, only where some network needs them.
     kinds = [kind] if kind else trained_networks()
-    noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
-    dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
+    noise = ["noise"] if any(ESTIMATORS[name].noisy for name in kinds) else []
+    dae = ["evaluation"] if any(ESTIMATORS[name].denoised for name in kinds) else []
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
@@ -131,74 +137,75 @@ def train_network(
     kind: Annotated[str, click.Choice(trained_networks())],
     states: File,
     checkpoint: Checkpoint,
-    out: Trained,
+    out: TrainingFolder,
     dae: DaeFolder | None = None,
 ) -> None:
     """Train a network that estimates states of misalignment.
 
-    Its input are the stamps of all fields of a state, its output the four numbers of the state in
-    units of the range. The folder receives weights, the settings that made them, and the history
-    of the loss.
+    Its input is the stamps of all fields of a state, its output the four numbers of the state in
+    units of the range. The folder receives weights, settings, and the history of the loss.
 
-    With --dae the stamps are what the DAE makes of noisy ones. An interrupted training goes on from
-    its checkpoint if stamps and settings are the same, and ends with the same bytes.
+    With --dae the stamps are the DAE's output for noisy stamps. An interrupted training resumes
+    from its checkpoint if stamps and settings are the same, and ends with the same bytes.
 
     Parameters
     ----------
+    config : Config
+        Seed, and settings of the network and its training.
     kind : str
         Clean stamps, noisy stamps, or the DAE's output for noisy stamps.
     states : Path
         Product of `alignment states`: the grid or the large set.
+    checkpoint : Path
+        File that lets an interrupted training resume.
+    out : Path
+        Folder for weights, config and history.
     dae : Path, optional
         Folder of `alignment train-dae`. For networks behind the DAE only.
     """
     from psfdae.methods.networks.training import fingerprint, progress, train
     from psfdae.methods.networks.weights import save_weights
-    from psfdae_paper.alignment.networks import NetworkTraining, TrainingStates, training_of
+    from psfdae_paper.alignment.networks import TrainingStates, make_training
 
     # Settings and training data of this kind of network.
-    if ALIGNERS[kind].denoised != (dae is not None):
-        denoised = [name for name in trained_networks() if ALIGNERS[name].denoised]
-        raise click.UsageError(f"--dae goes with --kind {', '.join(denoised)}, and only with it")
+    if ESTIMATORS[kind].denoised != (dae is not None):
+        behind_dae = [name for name in trained_networks() if ESTIMATORS[name].denoised]
+        raise click.UsageError(f"--dae goes with --kind {', '.join(behind_dae)}, and only with it")
     # Every network has a group train_NAME.
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_states(states)
     if dae:
         require_origin(dae, Alignment.stamp_keys, product)
-    # Stamps without noise, with noise that is drawn anew in every epoch, or the DAE's output.
+    # Stamps without noise, with noise that is drawn again in every epoch, or the DAE's output.
     data = TrainingStates(product["states"], product["stamps"])
-    if ALIGNERS[kind].noisy:
+    if ESTIMATORS[kind].noisy:
         data = replace(data, noise=noise_model(config), levels=config.noise.levels)
     if dae and data.noise:
-        data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
+        data = denoise_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
         product.arrays.clear()  # only the product's configuration is still needed
     limit_threads(settings.threads)
-    # Settings that describe the network to those who load it; `network_predictor` reads them.
+    # Settings that describe the network to those who load it; `load_predictor` reads them.
     fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
-    described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
+    network_config = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
     # Kind of the network, and whether estimates are averaged over mirror images.
-    described |= {"network": settings.network, "mirrors": settings.mirrors}
-
-    def begin(attempt: int) -> NetworkTraining:
-        """Start the training; every attempt starts alike."""
-        # Group of the network's layers: cnn or perceptron.
-        network = getattr(config, settings.network)
-        return training_of(network, data, settings, config.seed, kind)
-
+    network_config |= {"network": settings.network, "mirrors": settings.mirrors}
+    # Group of the network's layers: cnn or perceptron. All attempts start in the same way.
+    network = getattr(config, settings.network)
+    begin = partial(make_training, network, data, settings, config.seed, kind)
     # A checkpoint is resumed only if settings and stamps are the same.
     with progress(settings.epochs) as report:
-        # The fingerprint holds settings and stamps, but not what cannot change the result.
-        identity = fingerprint(described | deciding(config), data.stamps)
-        training = train(begin, checkpoint, identity, report)
+        # The fingerprint covers stamps, and all settings that can change the result.
+        identity = fingerprint(network_config | deciding(config), data.stamps)
+        training = train(lambda _: begin(), checkpoint, identity, report)
     # Weights first: a folder with a configuration is complete.
-    save_weights(out / Aligner.weights_file, training.result, described)
+    save_weights(out / Estimator.weights_file, training.result, network_config)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(training.history))
-    write_text(out / CONFIG, as_yaml(described))
+    write_text(out / CONFIG, as_yaml(network_config))
     checkpoint.unlink(missing_ok=True)
 
 
-def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> TrainingStates:
+def denoise_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> TrainingStates:
     """Return states with the DAE's output for a few draws of their noise.
 
     Parameters
@@ -206,7 +213,9 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
     data : TrainingStates
         n states with noise-free stamps, and the noise to draw.
     dae : Dae
+        Trained DAE.
     config : Config
+        Its seed, and the number of draws among the settings of the network's training.
     kind : str
         Name of the network, for its settings and its random stream.
 
@@ -223,25 +232,20 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) ->
     count = getattr(config, f"train_{kind}").noise_draws
     # Each state has one noise level, which is the same in all draws.
     level = mixed_levels(np.asarray(data.levels), len(data.states), rng)
-    denoised = np.empty((count, *data.stamps.shape), np.float32)
-    for draw in denoised:
+    dae_stamps = np.empty((count, *data.stamps.shape), np.float32)
+    for draw in dae_stamps:
         # 1000 states at a time limit the memory.
         for start in range(0, len(level), 1000):
             part = slice(start, start + 1000)
             noisy = data.noise.draw(data.stamps[part], level[part], rng)
-            # States that a network estimates from them err as before (studies/training).
+            # Errors of the states are the same as in single precision (studies/training).
             with half_precision():
                 draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
-    return replace(data, stamps=denoised, noise=None)
+    return replace(data, stamps=dae_stamps, noise=None)
 
 
 def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
     """Apply a trained DAE to stamps (n, F, d, d); it neither clips nor renormalises them.
-
-    Raises
-    ------
-    ProductError
-        If the folder `dae` has no network, or a damaged one.
 
     Parameters
     ----------
@@ -255,6 +259,11 @@ def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (n, F, d, d), float32
+
+    Raises
+    ------
+    ProductError
+        If the network in the folder `dae` is missing or damaged.
     """
     network = Dae.load(dae, evaluation=config.evaluation)
     return network.predict(_single_stamps(stamps)).reshape(stamps.shape)
@@ -265,19 +274,19 @@ def _single_stamps(stamps: np.ndarray) -> np.ndarray:
     return stamps.reshape(-1, *stamps.shape[-2:])
 
 
-def noisy_test_states(
-    config: Config, stamps: np.ndarray, test_set: str, level: float
-) -> np.ndarray:
+def draw_test_stamps(config: Config, stamps: np.ndarray, test_set: str, level: float) -> np.ndarray:
     """Draw the stamps of a test set at one λ, (n, F, d, d), float32; unchanged for λ = 0.
 
-    The noise depends on the seed, the name of the set and λ alone: all methods get the same stamps.
+    The noise depends on seed, name of the set and λ alone: all methods get the same stamps.
 
     Parameters
     ----------
     config : Config
+        Its seed and the group `noise`.
     stamps : ndarray, shape (n, F, d, d)
         Noise-free stamps.
     test_set : str
+        Name of the set, "grid" or "uniform", part of the address of the random stream.
     level : float
         Noise level λ.
 
@@ -293,7 +302,7 @@ def noisy_test_states(
     return noise_model(config).draw(stamps, level, rng)
 
 
-def network_predictor(
+def load_predictor(
     folder: Path, states: Product, config: Config, name: str | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Load the trained network of a folder, a function from stamps (n, F, d, d) to states (n, 4).
@@ -303,50 +312,52 @@ def network_predictor(
     Parameters
     ----------
     folder : Path
+        Folder of `alignment train-network`.
     states : Product
         States whose stamps the network is to be applied to.
     config : Config
+        Its group `evaluation` has the number of threads.
     name : str, optional
         Name that the network must have.
-
-    Raises
-    ------
-    ProductError
-        If it was trained for other stamps, has another name, or is damaged.
 
     Returns
     -------
     callable
         Function of stamps (n, F, d, d) that returns states (n, 4), in units of the range.
+
+    Raises
+    ------
+    ProductError
+        If the network was trained on other stamps, has another name, or is damaged.
     """
     import torch
 
     from psfdae.methods.networks.weights import with_weights
-    from psfdae_paper.alignment.networks import empty_network, predict_states
+    from psfdae_paper.alignment.networks import make_network, predict_states
     from psfdae_paper.alignment.telescope import mirror_symmetries
 
-    # The configuration beside the weights must agree with the stamps.
+    # The configuration in the folder must agree with the stamps.
     path = folder / CONFIG
-    described = read_yaml(path)
+    tree = read_yaml(path)
     _, fields, _, side = states["stamps"].shape
     shape = {"fields": fields, "stamp_px": side}
-    require(path, described, tuple(shape), shape, states.path)
+    require(path, tree, tuple(shape), shape, states.path)
     require_origin(folder, Alignment.stamp_keys, states)
     if name:
-        require(path, described, ("name",), {"name": name}, "the command")
-    # It describes training and network, and is checked as settings are.
-    training = f"train_{from_tree(path, described, 'name')}"
-    trained = from_tree(path, described, training, make=partial(parse_settings, NetworkTrain))
+        require(path, tree, ("name",), {"name": name}, "the command")
+    # Its settings of training and network are checked like those of a user.
+    group = f"train_{from_tree(path, tree, 'name')}"
+    training = from_tree(path, tree, group, make=partial(parse_settings, NetworkTrain))
     # Class of the settings of its layers.
-    kind = NETWORKS[trained.network]
-    settings = from_tree(path, described, trained.network, make=partial(parse_settings, kind))
-    # Threads as configured: their number can change the last digits.
+    kind = NETWORKS[training.network]
+    settings = from_tree(path, tree, training.network, make=partial(parse_settings, kind))
+    # The number of threads can change the last digits.
     torch.set_num_threads(config.evaluation.threads)
     model = with_weights(
-        lambda: empty_network(settings, fields, side), folder / Aligner.weights_file
+        lambda: make_network(settings, fields, side), folder / Estimator.weights_file
     )
     # The field points are a centre and a circle of points; a mirror image permutes these.
-    mirrors = mirror_symmetries(fields - 1) if trained.mirrors else []
+    mirrors = mirror_symmetries(fields - 1) if training.mirrors else []
     return partial(predict_states, model, mirrors=mirrors)
 
 
@@ -356,11 +367,11 @@ def estimate(
     test_set: TestSet,
     states: StatesFile,
     dae: DaeFolder,
-    networks: NetworkFolders,
+    networks: NetworkFolders,  # type: ignore[valid-type]  # made at run time
     out: File,
     times: File,
 ) -> None:
-    """Estimate the states of a test set with every learned method.
+    """Estimate the states of a test set with every network.
 
     Each method gets the same noisy stamps at every noise level, and without noise.
 
@@ -369,10 +380,18 @@ def estimate(
 
     Parameters
     ----------
+    config : Config
+        Seed, noise and evaluation.
     test_set : str
         Set of the states: the grid that networks are trained on, or uniform states.
+    states : Path
+        Product of `alignment states`.
+    dae : Path
+        Folder of `alignment train-dae`.
+    networks : NetworkFolders
+        Folder of each network, an option of its name.
     out : Path
-        HDF5 product with the estimates of all learned methods.
+        HDF5 product with the estimates of all networks.
     times : Path
         CSV that receives the run times.
     """
@@ -380,42 +399,71 @@ def estimate(
     product = read_states(states)
     require_origin(dae, Alignment.stamp_keys, product)
     predict = {
-        name: network_predictor(folder, product, config, name)
+        name: load_predictor(folder, product, config, name)
         for name, folder in vars(networks).items()
     }
-    # The same noisy stamps for all methods, with the time that each takes; λ = 0 is no noise.
-    levels, learned = [0.0, *config.noise.levels], aligners_of("estimates")
+    # The same noisy stamps for all methods, with the time that each takes; λ = 0: without noise.
+    levels, methods = [0.0, *config.noise.levels], list_estimators("estimates")
     # Array [λ, method, state, number].
-    estimates = np.empty((len(levels), len(learned), *product["states"].shape))
+    estimates = np.empty((len(levels), len(methods), *product["states"].shape))
     rows = []
     for row, level in enumerate(steps("noise levels", levels)):
-        noisy = noisy_test_states(config, product["stamps"], test_set, level)
-        # The DAE's output, which several networks get, and the time that it takes.
-        started = time.perf_counter()
-        denoised = denoise(dae, config, noisy)
-        denoising_seconds = time.perf_counter() - started
+        noisy = draw_test_stamps(config, product["stamps"], test_set, level)
+        # The DAE's output, the input of several networks, and its run time.
+        start_s = time.perf_counter()
+        dae_psf = denoise(dae, config, noisy)
+        denoising_seconds = time.perf_counter() - start_s
         # Each network, with the stamps that it was trained for.
-        for column, method in enumerate(learned):
-            started = time.perf_counter()
-            estimates[row, column] = predict[method.network](denoised if method.denoised else noisy)
+        for column, method in enumerate(methods):
+            start_s = time.perf_counter()
+            estimates[row, column] = predict[method.network](dae_psf if method.denoised else noisy)
             # Seconds for all states of the set; the DAE is part of a method that uses it.
-            seconds = time.perf_counter() - started + denoising_seconds * method.denoised
+            seconds = time.perf_counter() - start_s + denoising_seconds * method.denoised
             rows.append((test_set, level, method.name, seconds, len(noisy)))
-    # True states go along: products of one test are compared by them.
-    columns = {
-        "states": Column(product["states"], "range", "true states"),
-        "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "estimates": Column(estimates, "range", f"[λ, method, state, number]; {_names(learned)}"),
-    }
-    # The test set is not part of the configuration, but tells products apart.
-    described = {**config.model_dump(), "test_set": test_set}
-    write_product(out, "alignment_estimates", columns, described)
+    about = f"[λ, method, state, number]; {_names(methods)}"
+    columns = {"estimates": Column(estimates, "range", about)}
+    key = {"test_set": test_set}
+    _write_results(out, "alignment_estimates", config, key, product["states"], columns, levels)
     _write_times(times, rows)
 
 
-def _names(methods: list[Aligner]) -> str:
+def _names(methods: list[Estimator]) -> str:
     """Return the names of methods in the order of an array's axis, for its description."""
     return ", ".join(method.name for method in methods)
+
+
+def _write_results(
+    path: Path,
+    kind: str,
+    config: Config,
+    key: Mapping[str, object],
+    states: np.ndarray,
+    columns: Mapping[str, Column],
+    levels: Sequence[float] = (),
+) -> None:
+    """Write the product of a test, with the true states by which products are compared.
+
+    Parameters
+    ----------
+    path : Path
+        HDF5 file.
+    kind : str
+        Kind of the product, such as "alignment_fit".
+    config : Config
+        Stage configuration.
+    key : mapping
+        Test set, which is not part of the configuration, and noise level if there is only one.
+    states : ndarray, shape (n, 4)
+        True states in units of the range.
+    columns : mapping of str to Column
+        Results of the methods.
+    levels : sequence of float
+        Noise levels λ along an axis of the results; empty if there is only one.
+    """
+    all_columns = {"states": Column(states, "range", "true states")}
+    if len(levels):
+        all_columns["levels"] = Column(np.array(levels), "1", "noise levels λ")
+    write_product(path, kind, {**all_columns, **columns}, {**config.model_dump(), **key})
 
 
 def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]]) -> None:
@@ -424,6 +472,7 @@ def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]])
     Parameters
     ----------
     path : Path
+        CSV file.
     rows : sequence of (str, float, str, float, int)
         Test set, noise level, name of the method, seconds and number of states.
     """
@@ -449,23 +498,29 @@ def fit_alignment_method(
 ) -> None:
     """Fit the states of a test set by maximum likelihood.
 
-    A fit begins at a network's estimate, and again at the twin of the state that it has reached,
-    which has nearly the same stamps in focus. Flux and place of the stars are known; uniform
-    states are fitted once more with both unknown.
+    A fit begins at a network's estimate, and again at the twin of the fitted state, which has
+    nearly the same stamps in focus. Flux and position of the stars are known; uniform states are
+    fitted once more with both unknown.
 
     The product has, for each fit, the estimates in units of the range, the deviance, how many
     stamps were computed, whether it has converged, and whether the twin was better.
 
     Parameters
     ----------
+    config : Config
+        Seed, telescope, alignment, optics, noise, fit and evaluation.
     test_set : str
         Set of the states: the grid that networks are trained on, or uniform states.
     level : float
         Noise level λ.
+    states : Path
+        Product of `alignment states`.
     train : Path
-        Product of `alignment states --set train`: most steps go by it.
+        Product of `alignment states --set train`: states between which stamps are interpolated.
+    model : Path
+        Product of `alignment model`.
     network : Path
-        Folder of the network that starts the fit.
+        Folder of the network whose estimate starts the fit.
     out : Path
         HDF5 product with the fits.
     times : Path
@@ -479,16 +534,16 @@ def fit_alignment_method(
     product, large_product = read_states(states, config), read_states(train, config)
     # Zernike coefficients of a state, quadratic in its four numbers.
     wavefronts = read_model(model, product.config, states)
-    predict = network_predictor(network, product, config)
-    stamps = noisy_test_states(config, product["stamps"], test_set, level)
+    predict = load_predictor(network, product, config)
+    stamps = draw_test_stamps(config, product["stamps"], test_set, level)
     # Columns of the fits, with an entry for each method.
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows, methods = [], aligners_of("fit", test_set)
+    rows, methods = [], list_estimators("fit", test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
-    columns = {"states": Column(product["states"], "range", "true states")}
-    # The emulator interpolates stamps between those of the large set, and the network's estimate
-    # starts the first fit.
-    started = time.perf_counter()
+    columns: dict[str, Column] = {}
+    # The emulator interpolates between the stamps of the large set. The network's estimate starts
+    # the first fit.
+    start_s = time.perf_counter()
     emulator = StampEmulator(
         StateOptics(wavefronts, operator()),
         large_product["states"],
@@ -499,21 +554,21 @@ def fit_alignment_method(
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in steps("fits", methods):
-        # Flux and place of the stars are known, or parameters of the fit, too.
+        # Flux and position of the stars are known, or parameters of the fit, too.
         optics = StateOptics(wavefronts, operator(movable=method.unknown_flux), emulator)
         exact = StateLikelihood(optics, noise_model(config), level, stamps)
         # The emulator can compute stars at their given position only.
         fast = exact if method.unknown_flux else replace(exact, stamps=emulator)
-        first_fit = fast.maximise(optics.parameters_of(start), config.fit)
-        # In focus, a state and its twin have nearly the same stamps: the better one of both fits.
+        first_fit = fast.maximise(optics.to_parameters(start), config.fit)
+        # In focus, a state and its twin have nearly the same stamps: take the better fit.
         best_fit, twin_tried = refit_twins(fast, first_fit, wavefronts, config.fit)
         # The last steps use the exact optics.
         final_fit = best_fit
         if fast is not exact:
             final_fit = exact.maximise(best_fit.parameters, config.fit)
-        # None if all steps were exact.
+        # Zero if all steps were exact.
         last_evaluations = final_fit.evaluations * (fast is not exact)
-        rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
+        rows.append((test_set, level, method.name, time.perf_counter() - start_s, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
         start = final_fit.parameters[:, :4]
         fits["estimates"].append(final_fit.parameters[:, :4])
@@ -536,8 +591,8 @@ def fit_alignment_method(
         unit = "range" if name == "estimates" else "1"
         # Arrays [method, state, …].
         columns[name] = Column(np.array(fits[name]), unit, text)
-    described = {**config.model_dump(), "test_set": test_set, "level": level}
-    write_product(out, "alignment_fit", columns, described)
+    key = {"test_set": test_set, "level": level}
+    _write_results(out, "alignment_fit", config, key, product["states"], columns)
     _write_times(times, rows)
 
 
@@ -548,35 +603,36 @@ def bound(
     """Bound the errors of any unbiased estimate.
 
     The Cramér-Rao bound is the inverse of the Fisher information that the photons of all stamps
-    of a state hold about its four numbers, with flux and place of the stars known and unknown.
+    of a state hold about its four numbers, with flux and position of the stars known and unknown.
 
     The product has a covariance (4, 4) in units of the range for each bound, noise level and state.
 
     Parameters
     ----------
+    config : Config
+        Telescope, alignment, optics and noise.
     test_set : str
         Set of the states: the grid that networks are trained on, or uniform states.
+    states : Path
+        Product of `alignment states`.
+    model : Path
+        Product of `alignment model`.
     out : Path
         HDF5 product with Cramér-Rao bounds.
     """
-    from psfdae_paper.alignment.likelihood import StateOptics, bound_covariances
+    from psfdae_paper.alignment.likelihood import StateOptics, compute_bounds
 
     limit_threads(1)
     # States, the model of their wavefronts, and the noise.
     product = read_states(states, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    # Bounds with flux and place of the stars known, or unknown: the stamps are then movable.
-    methods = aligners_of("bound", test_set)
+    # Bounds with flux and position of the stars known, or unknown: the stamps are then movable.
+    methods = list_estimators("bound", test_set)
     unknown_flux = [method.unknown_flux for method in methods]
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(unknown_flux))
     optics = StateOptics(wavefronts, operator)
-    covariances = bound_covariances(optics, noise, levels, truth, unknown_flux)
+    covariances = compute_bounds(optics, noise, levels, truth, unknown_flux)
     about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
-    columns = {
-        "states": Column(truth, "range", "true states"),
-        "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "covariances": Column(covariances, "range^2", about),
-    }
-    described = {**config.model_dump(), "test_set": test_set}
-    write_product(out, "alignment_bound", columns, described)
+    columns = {"covariances": Column(covariances, "range^2", about)}
+    _write_results(out, "alignment_bound", config, {"test_set": test_set}, truth, columns, levels)

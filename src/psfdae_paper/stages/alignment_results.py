@@ -1,8 +1,8 @@
 """Stages of scene 3 that turn estimates, fits and bounds into tables and figures.
 
-In: the products of `psfdae_paper.stages.alignment_methods`. They are read in one place,
-`read_results`, which refuses products of different telescopes, noise or states. Out: tables of
-errors and of their correlations, the paper's beside them, run times, and figures.
+Inputs: the products of `psfdae_paper.stages.alignment_methods`. They are read in one place,
+`read_results`, which rejects products of different telescopes, noise or states. Outputs: tables of
+errors and of their correlations, compared with the paper's, run times, and figures.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
 from psfdae.training.star_sets import noise_model
-from psfdae_paper.alignment.likelihood import expected_abs_error
+from psfdae_paper.alignment.likelihood import compute_mean_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
     DEGREES_OF_FREEDOM,
@@ -31,14 +31,14 @@ from psfdae_paper.alignment.telescope import (
     design_states,
     fit_quadratic,
 )
-from psfdae_paper.configuration.aligners import ALIGNERS, Aligner, aligners_of
+from psfdae_paper.configuration.aligners import ESTIMATORS, Estimator, list_estimators
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import alignment_figures, alignment_tables
-from psfdae_paper.evaluation.paper import published
+from psfdae_paper.evaluation.paper import read_published
 from psfdae_paper.stages.alignment import StatesFile, read_states
-from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
+from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, draw_test_stamps
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]
@@ -61,11 +61,13 @@ class MethodResult(NamedTuple):
     Attributes
     ----------
     key : Key
+        Test set, noise level and method.
     truth : ndarray, shape (n, 4)
         True states, in units of the range.
     values : ndarray, shape (n, 4) or (n, 4, 4)
         Estimated states or, of a bound, covariances of unbiased estimates.
     is_bound : bool
+        Whether `values` are covariances of a bound.
     """
 
     key: Key
@@ -79,11 +81,6 @@ def read_results(
 ) -> Iterator[MethodResult]:
     """Read the results of all methods and noise levels, from products of one test.
 
-    Raises
-    ------
-    ProductError
-        If products differ in telescope, noise or states.
-
     Parameters
     ----------
     estimates, fits, bounds : sequence of Path
@@ -93,39 +90,39 @@ def read_results(
     ------
     MethodResult
         One for each method and noise level, in the order of the products.
+
+    Raises
+    ------
+    ProductError
+        If products differ in telescope, noise or states.
     """
-    for product in products_of_one_test(estimates, fits, bounds):
+    for product in read_products(estimates, fits, bounds):
         truth, test_set = product["states"], product.config["test_set"]
         # A bound has covariances instead of estimates.
         is_bound = product.kind == "alignment_bound"
         # Names of the methods, and their values as an array [λ, method, state, ...].
         if is_bound:
-            aligners = aligners_of("bound", test_set)
+            estimators = list_estimators("bound", test_set)
             levels, values = product["levels"], product["covariances"].swapaxes(0, 1)
         elif product.kind == "alignment_fit":
             # A product of maximum-likelihood fits has one noise level.
-            aligners = aligners_of("fit", test_set)
+            estimators = list_estimators("fit", test_set)
             levels, values = np.array([product.config["level"]]), product["estimates"][None]
         else:
             # The networks, and the constant estimate of the aligned telescope, which is 0.
-            aligners = [ALIGNERS["constant"], *aligners_of("estimates", test_set)]
+            estimators = [ESTIMATORS["constant"], *list_estimators("estimates", test_set)]
             levels = product["levels"]
             values = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
         for level, by_method in zip(levels, values, strict=True):
-            for aligner, of_method in zip(aligners, by_method, strict=True):
-                key = Key(test_set=test_set, noise_level=float(level), method=aligner.name)
+            for estimator, of_method in zip(estimators, by_method, strict=True):
+                key = Key(test_set=test_set, noise_level=float(level), method=estimator.name)
                 yield MethodResult(key, truth, of_method, is_bound)
 
 
-def products_of_one_test(
+def read_products(
     estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
 ) -> list[Product]:
-    """Read products; refuse those that differ in telescope, noise or states.
-
-    Raises
-    ------
-    ProductError
-        With the first value that differs.
+    """Read products, which must agree in telescope, noise and states.
 
     Parameters
     ----------
@@ -136,13 +133,18 @@ def products_of_one_test(
     -------
     list of Product
         In this order, each with the column `states`.
+
+    Raises
+    ------
+    ProductError
+        With the first value that differs between two products.
     """
     same_keys = ("noise.kappa", "noise.background_photons", *Alignment.stamp_keys)
     products: list[Product] = []
     for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
         for path in paths:
             product = read_product(path, f"alignment_{kind}", ("states",))
-            # Bounds have no noise that is drawn, and so no seed.
+            # Bounds do not depend on drawn noise, and so not on the seed.
             keys = same_keys if kind == "bound" else ("seed", *same_keys)
             # Compare with all products before; sets of the same name must have the same states.
             for reference in products:
@@ -154,27 +156,26 @@ def products_of_one_test(
 
 
 def _require_states(product: Product, reference: Product) -> None:
-    """Refuse two products of one test set that have different true states.
+    """Require that two products of one test set have the same true states.
+
+    Parameters
+    ----------
+    product, reference : Product
+        Products with the column `states`, (n, 4); messages name the first as wrong.
 
     Raises
     ------
     ProductError
         With the number of states, or the first state that differs.
-
-    Parameters
-    ----------
-    product, reference : Product
-        With the column `states`, (n, 4).
     """
-    states, expected = product["states"], reference["states"]
-    if np.array_equal(states, expected):
+    states, truth = product["states"], reference["states"]
+    if np.array_equal(states, truth):
         return
-    difference = f"number of states = {len(states)}, but {reference.path} has {len(expected)}"
-    if len(states) == len(expected):
-        row = int((states != expected).any(axis=1).argmax())
+    difference = f"number of states = {len(states)}, but {reference.path} has {len(truth)}"
+    if len(states) == len(truth):
+        row = int((states != truth).any(axis=1).argmax())
         difference = (
-            f"state {row} = {states[row].tolist()}, "
-            f"but {reference.path} has {expected[row].tolist()}"
+            f"state {row} = {states[row].tolist()}, but {reference.path} has {truth[row].tolist()}"
         )
     raise ProductError(f"{product.path}: {difference}")
 
@@ -195,10 +196,18 @@ def tables(
     values.
 
     Errors are in units of the range, and in metres and radians. Rows of correlations have the
-    measured coefficient of each pair of numbers, or that which the bound predicts.
+    measured coefficient of each pair of numbers, or the coefficient that the bound predicts.
 
     Parameters
     ----------
+    states : Path
+        Product of `alignment states`, for the range of the four numbers.
+    estimates : sequence of Path
+        Product of `alignment estimate`.
+    fits : sequence of Path
+        Product of `alignment fit`.
+    bounds : sequence of Path
+        Product of `alignment bound`.
     errors : Path
         CSV that receives the errors.
     correlation : Path
@@ -206,29 +215,29 @@ def tables(
     """
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
-        # A bound must be that of the telescope whose states are tabulated.
+        # A bound must belong to the telescope whose states are tabulated.
         bound_config = read_product(path, "alignment_bound", ()).config
         require(path, bound_config, Alignment.stamp_keys, product.config, states)
     unit = product["unit"]
-    # Measured errors, and those that unbiased estimates at the bound would have.
-    rows_by_table: dict[Path, list[alignment_tables.Row]] = {errors: [], correlation: []}
+    # Measured errors, and errors of unbiased estimates at the bound.
+    error_rows: list[alignment_tables.Row] = []
+    correlation_rows: list[alignment_tables.Row] = []
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         if is_bound:
-            rows_by_table[errors] += alignment_tables.bound_rows(key, values, unit)
-            # Predicted correlations are those of the bound with flux and position known.
+            error_rows += alignment_tables.tabulate_bounds(key, values, unit)
+            # Correlations are predicted by the bound with flux and position known.
             if key["method"] == "cramer_rao":
-                rows_by_table[correlation] += alignment_tables.predicted_correlations(key, values)
+                correlation_rows += alignment_tables.tabulate_bound_correlations(key, values)
         else:
-            rows_by_table[errors] += alignment_tables.error_rows(key, values - truth, unit)
+            error = values - truth
+            error_rows += alignment_tables.tabulate_errors(key, error, unit)
             if key["method"] != "constant":
-                rows_by_table[correlation] += alignment_tables.measured_correlations(
-                    key, values - truth
-                )
+                correlation_rows += alignment_tables.tabulate_error_correlations(key, error)
     # Rows by test set, noise level, and the order in which methods are listed.
-    method_order = list(ALIGNERS)
-    for path, table_rows in rows_by_table.items():
+    method_order = list(ESTIMATORS)
+    for path, rows in ((errors, error_rows), (correlation, correlation_rows)):
         # A stable sort keeps the order of the parameters.
-        frame = pd.DataFrame(table_rows).sort_values(
+        frame = pd.DataFrame(rows).sort_values(
             ["test_set", "noise_level", "method"],
             key=lambda c: c.map(method_order.index) if c.name == "method" else c,
             kind="stable",
@@ -238,15 +247,19 @@ def tables(
 
 @command("paper alignment paper-tables")
 def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Folder) -> None:
-    """Set measured errors beside the paper's tables.
+    """Compare measured errors with the paper's tables.
 
     One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
 
     Files are named alignment_paper_LEVEL and alignment_paper_correlation, with errors in units of
-    the range. It is refused if a noise level of the paper was not measured.
+    the range. It is an error if a noise level of the paper was not measured.
 
     Parameters
     ----------
+    errors : Path
+        CSV of `alignment tables` with the errors.
+    correlation : Path
+        CSV of `alignment tables` with their correlations.
     out : Path
         Folder for CSV and Markdown files.
     """
@@ -262,16 +275,16 @@ def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Fol
         write_text(path.with_suffix(".md"), text)
 
     # One table of errors for each of the paper's noise levels.
-    measured = read_table(errors)
-    for level in sorted(published("alignment").noise_level.unique()):
-        if not np.isclose(measured.noise_level, level).any():
+    error_table = read_table(errors)
+    for level in sorted(read_published("alignment").noise_level.unique()):
+        if not np.isclose(error_table.noise_level, level).any():
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
         # Mean and variance of the absolute errors, as in the paper.
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
-        write(f"{level:g}", alignment_tables.paper_errors(measured, level), title, digits)
+        write(f"{level:g}", alignment_tables.compare_errors(error_table, level), title, digits)
     # Correlations of signed errors between pairs of parameters.
-    table = alignment_tables.paper_correlations(read_table(correlation))
+    table = alignment_tables.compare_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
 
 
@@ -283,30 +296,30 @@ def time_table(
 ) -> None:
     """Tabulate the run times of the methods.
 
-    A row has the seconds of an estimate, and those of all trainings that the method needs.
+    A row has the seconds of an estimate, and the seconds of all trainings that the method needs.
 
-    Seconds per estimate are means over all states of all test sets; NAME of --history is that of a
-    network, or dae.
+    Seconds per estimate are means over all states of all test sets; NAME of --history is the name
+    of a network, or dae.
 
     Parameters
     ----------
     times : sequence of Path
         CSV of `alignment estimate` or `alignment fit`.
     histories : sequence of str
-        A training.
+        History of a training, by name of the network.
     out : Path
         CSV with the cost of an estimate and of the trainings.
     """
     # Seconds of each training, from the last row of its history.
-    named = (text.partition("=") for text in histories)
-    training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in named}
+    pairs = (text.partition("=") for text in histories)
+    training = {name: float(read_table(Path(path))["seconds"].iloc[-1]) for name, _, path in pairs}
     # Seconds and states of each method, over all test sets and noise levels.
     table = pd.concat([read_table(path) for path in times], ignore_index=True)
-    # Seconds per state from sums, in which large sets have their weight.
+    # Seconds per state from sums, so that large sets have more weight.
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
-    # An estimate's time, and that of the trainings on which it rests.
-    for method in (a for a in ALIGNERS.values() if a.network):
+    # Time of an estimate, and of the trainings that it needs.
+    for method in (a for a in ESTIMATORS.values() if a.network):
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
         networks = [method.network, *(["dae"] if method.denoised else [])]
@@ -317,32 +330,32 @@ def time_table(
 
 
 @command("paper alignment figure stamps", reads=("seed", "noise", "evaluation"))
-def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
+def figure_stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE.
 
     The first two states of the set are shown, without noise and at every noise level.
 
-    They have the very noise of the tables. The DAE must be one that was trained on stamps of the
-    same telescope.
+    They have the same noise as in the tables. The DAE must be trained on stamps of the same
+    telescope.
     """
-    # The DAE must be that of these stamps.
+    # The DAE must be trained on stamps of this telescope.
     product = read_states(states)
     require_origin(dae, Alignment.stamp_keys, product)
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
-        # Noise is drawn for the whole set, so that these two have that of the tables.
-        noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:2]
+        # Noise is drawn for the whole set, so that these two have the noise of the tables.
+        noisy = draw_test_stamps(config, product["stamps"], "uniform", level)[:2]
         rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(dae, config, noisy))]
     titles = [
         "decentre ({:+.2f}, {:+.2f}), tilt ({:+.2f}, {:+.2f}) of the range".format(*state)
         for state in product["states"][:2]
     ]
-    write_png(alignment_figures.stamp_rows(rows, titles), out)
+    write_png(alignment_figures.draw_stamp_rows(rows, titles), out)
 
 
 @command("paper alignment figure predicted")
-def predicted(
+def figure_predicted(
     estimates: File, fits: Annotated[tuple[File, ...], {"flag": "--fit"}], out: Png
 ) -> None:
     """Draw estimates against the truth, for each method, number of a state and noise level.
@@ -356,77 +369,79 @@ def predicted(
         Product of `alignment estimate`.
     fits : sequence of Path
         Product of `alignment fit` of the same states.
+    out : Path
+        PNG.
     """
     # Estimated states of each method and noise level.
     by_method: dict[str, dict[float, np.ndarray]] = {
-        name: {} for name, aligner in ALIGNERS.items() if aligner.is_drawn
+        name: {} for name, estimator in ESTIMATORS.items() if estimator.is_drawn
     }
     for key, truth, states, _ in read_results([estimates], fits, []):  # noqa: B007
         if key["method"] in by_method and key["noise_level"] > 0:
             by_method[key["method"]][key["noise_level"]] = states
-    # All products have the same states, so that the last truth is that of all.
-    write_png(alignment_figures.predicted_against_true(truth, by_method), out)
+    # All products have the same states, so that the last truth belongs to all.
+    write_png(alignment_figures.draw_predictions(truth, by_method), out)
 
 
 @command("paper alignment figure errors")
-def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
+def figure_errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     """Draw errors against the size of the misalignment, with the Cramér-Rao bound.
 
     The error of a state is the mean of the absolute errors of its four numbers.
 
     A panel is a noise level, and a curve a mean over states of about the same size, all in units of
-    the range. The bound is that of a normal error: the mean modulus is σ √(2/π).
+    the range. The bound assumes normal errors, whose mean modulus is σ √(2/π).
     """
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
     curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
-        is_shown = ALIGNERS[key["method"]].is_drawn or key["method"] == "cramer_rao"
+        is_shown = ESTIMATORS[key["method"]].is_drawn or key["method"] == "cramer_rao"
         if key["noise_level"] > 0 and is_shown:
             # A bound gives the variance: E|x| = σ √(2/π) for a normal error.
-            error = expected_abs_error(values) if is_bound else np.abs(values - truth)
+            error = compute_mean_abs_error(values) if is_bound else np.abs(values - truth)
             curves[key["noise_level"]][key["method"]] = (
-                alignment_figures.size_of(truth),
+                alignment_figures.compute_size(truth),
                 error.mean(axis=1),
             )
     title = f"Errors against misalignment, {len(truth)} uniform states"
-    write_png(alignment_figures.errors_against_size(curves, title), out)
+    write_png(alignment_figures.draw_errors_by_size(curves, title), out)
 
 
 @command(
     "paper alignment figure twin",
     reads=("telescope", "prescription", "alignment", "optics", "noise"),
 )
-def twin(config: Config, table: File, out: Png) -> None:
+def figure_twin(config: Config, table: File, out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus.
 
-    The curve is the difference χ² of the stamps of multiples of a state from those of the state:
-    at −1, its twin, it is small in focus.
+    The curve is the χ² difference between the stamps of a state and of its multiples: at −1, its
+    twin, it is small in focus.
 
     The table has a row for each noise level, defocus and multiple. The stamps of both states are
     shown above the curves.
 
     Parameters
     ----------
+    config : Config
+        Telescope, prescription, alignment, optics and noise.
     table : Path
         CSV that receives the curves.
+    out : Path
+        PNG.
     """
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
-
     limit_threads(1)
-    # In focus, the stamps of a state and of its twin hardly differ; a defocus tells them apart.
+    # In focus, the stamps of a state and of its twin hardly differ; with a defocus they do.
     multiples = np.linspace(-1.5, 1.5, 61)
     rows, stamp_groups, state = [], [], np.empty(0)
     for defocus in sorted({0.0, config.alignment.defocus_m}):
-        state, line_stamps = _stamps_of_multiples(config, defocus, multiples)
+        state, line_stamps = _trace_multiples(config, defocus, multiples)
         # The multiple 1 is the state, −1 its twin.
         state_stamps = line_stamps[np.argmin(np.abs(multiples - 1.0))].astype(np.float64)
         twin_stamps = line_stamps[np.argmin(np.abs(multiples + 1.0))]
         focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
-        stamp_groups += [
-            (f"state\n{focus}", state_stamps),
-            (f"twin\n{focus}", twin_stamps),
-        ]
+        stamp_groups += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
         # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
         for level in config.noise.levels:
             variance = noise_model(config).variance(state_stamps, level)
@@ -437,13 +452,22 @@ def twin(config: Config, table: File, out: Png) -> None:
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(alignment_figures.twin_ambiguity(curves, stamp_groups, state), out)
+    write_png(alignment_figures.draw_twins(curves, stamp_groups, state), out)
 
 
-def _stamps_of_multiples(
+def _trace_multiples(
     config: Config, defocus_m: float, multiples: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ray-trace the stamps of multiples of a state whose decentre cancels the coma of its tilt.
+
+    Parameters
+    ----------
+    config : Config
+        Stage configuration of `alignment figure twin`.
+    defocus_m : float
+        Distance of the CCD behind best focus, in metres.
+    multiples : ndarray, shape (n,)
+        Factors of the state.
 
     Returns
     -------
@@ -451,15 +475,6 @@ def _stamps_of_multiples(
         The state in units of the range.
     stamps : ndarray, shape (len(multiples), F, d, d)
         Stamps of multiples of the state, with the CCD at a defocus of `defocus_m` metres.
-
-    Parameters
-    ----------
-    config : Config
-        Stage configuration of `alignment figure twin`.
-    defocus_m : float
-        Distance of the CCD beyond best focus, in metres.
-    multiples : ndarray, shape (n,)
-        Factors of the state.
     """
     # The telescope with another defocus, its wavefront, and its stamps.
     settings = config.alignment.model_copy(update={"defocus_m": defocus_m})
@@ -473,8 +488,8 @@ def _stamps_of_multiples(
 
 
 @command("paper alignment figure correlation")
-def correlation(correlation: ErrorTable, out: Png) -> None:
-    """Draw measured and predicted correlations of errors beside the paper's.
+def figure_correlation(correlation: ErrorTable, out: Png) -> None:
+    """Draw measured and predicted correlations of errors, and the paper's.
 
     A panel is the matrix of the correlations between the four numbers of a state.
 
@@ -482,7 +497,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     methods with a short title.
     """
 
-    def panel(method: Aligner, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
+    def panel(method: Estimator, rows: pd.DataFrame, source: str = "") -> tuple[str, np.ndarray]:
         """Return title and symmetric matrix of a method, from rows of pairs of parameters."""
         # Pairs that the paper does not print stay empty.
         matrix = np.full((4, 4), np.nan)
@@ -494,19 +509,19 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
         return f"{source}{method.short}, λ = {level:g}", matrix
 
     # Correlations of uniform states with noise, and the paper's; both as rows of pairs.
-    measured, paper = read_table(correlation), published("correlation")
-    measured = measured[(measured.test_set == "uniform") & (measured.noise_level > 0)]
-    measured = measured.assign(pair=measured.parameter_a + "-" + measured.parameter_b)
-    methods = [method for method in ALIGNERS.values() if method.short]
-    # Methods with a short name have a panel; those of the paper have its values beside them.
+    table, paper = read_table(correlation), read_published("correlation")
+    table = table[(table.test_set == "uniform") & (table.noise_level > 0)]
+    table = table.assign(pair=table.parameter_a + "-" + table.parameter_b)
+    methods = [method for method in ESTIMATORS.values() if method.short]
+    # Methods with a short name have a panel; methods of the paper also one with its values.
     in_paper = [method for method in methods if method.look.paper]
     not_in_paper = [method for method in methods if not method.look.paper]
     panels = []
-    for level in np.unique(measured.noise_level):
-        rows = measured[measured.noise_level == level]
+    for level in np.unique(table.noise_level):
+        rows = table[table.noise_level == level]
         paper_rows = paper[np.isclose(paper.noise_level, level)]
         # Methods of the paper, as published and measured, above the other ones.
         upper = [panel(method, paper_rows, "paper, ") for method in in_paper]
         upper += [panel(method, rows) for method in in_paper]
         panels += [upper, [panel(method, rows) for method in not_in_paper]]
-    write_png(alignment_figures.correlation_matrices(panels), out)
+    write_png(alignment_figures.draw_correlations(panels), out)

@@ -1,8 +1,5 @@
 """Stages `bank`, `bounds`, `optics`, `efficiency`, `paper-rows`: bounds of the error of estimates.
 
-In go simulated stars and the errors of methods; out come the least errors that any method can have
-on them, and tables that set the errors of all methods beside these.
-
 They simulate stars, bound the error of any estimate of the test stars, and compare the errors of
 methods with these bounds.
 """
@@ -32,25 +29,30 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import CELL, MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import paper_rows, published
+from psfdae_paper.evaluation.paper import read_paper_names, read_published
 
 if TYPE_CHECKING:
     from psfdae_paper.methods.wavefront import Wavefront
+
+BANK_COLUMNS = ("framed", "field_index", "peak", "seidel")
+"""Columns of the product "bank" that the bounds use."""
 
 
 @command("paper bank", reads=(*SIMULATION, "bounds"))
 def bank(config: Config, out: File) -> None:
     """Simulate the bank of fresh stars behind the posterior mean.
 
-    They are other draws of the simulator that made the test stars, with a margin, so that one
-    propagated star stands for all eight of its mirror images and rotations.
+    They are new draws of the simulator of the test stars, with a margin, so that one propagated
+    star represents all eight of its mirror images and rotations.
 
-    The product has the framed stars, the number of each one's field, its brightest pixel and the
-    Seidel coefficients. Its first bounds.bank_stars serve all bounds; the others only those that
-    are given the field.
+    The product has the framed stars, the number of each star's field, its brightest pixel and the
+    Seidel coefficients. All bounds use its first bounds.bank_stars; bounds of methods that are
+    given the field use the others, too.
 
     Parameters
     ----------
+    config : Config
+        Settings of the simulation and of the bounds.
     out : Path
         HDF5 product with fresh stars, framed so that they can be mirrored.
     """
@@ -84,15 +86,18 @@ def bounds(
 ) -> None:
     """Bound the error that any estimator can reach on the test stars.
 
-    The posterior mean over the simulator's stars has the least mean squared error; its tables say
-    where the bank suffices for it. The local floor is the error if field and centring are known.
+    The posterior mean over the simulator's stars has the minimum mean squared error; a column says
+    where the bank is large enough for it. The local floor is the error if field and centring are
+    known.
 
-    Three tables come out: the bounds with their standard errors, by noise level and reference; the
+    There are three tables: the bounds with their standard errors, by noise level and reference; the
     error for banks of growing size, which shows whether the bank is large enough; and the squared
     error of every star.
 
     Parameters
     ----------
+    config : Config
+        Settings of the simulation, noise, parts and bounds.
     dataset : str
         Name in the tables.
     stars : Path
@@ -111,12 +116,12 @@ def bounds(
     # Test stars, and templates with every centring error.
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
-    framed = read_product(templates, "templates", ("psf",))
     require(stars, product.config, STARS, config)
-    require(templates, framed.config, STATIC, config)
+    template_product = read_product(templates, "templates", ("psf",))
+    require(templates, template_product.config, STATIC, config)
     # The static PSFs with all centring errors that a star may have.
-    static = jittered_templates(framed["psf"], config.framing.jitter_px)
-    # Rows are collected in one place, whichever bounds a dataset has.
+    static = jittered_templates(template_product["psf"], config.framing.jitter_px)
+    # All bounds of a dataset add their rows to these tables.
     bound = tables.Tables(dataset, bounded_stars(config, product))
     # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
@@ -126,12 +131,12 @@ def bounds(
     else:
         # The floor: field and centring error are known, the random aberrations are not.
         tables.add_floor(config, product, bound)
-        bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
+        bank_product = read_product(bank, "bank", BANK_COLUMNS)
         require(bank, bank_product.config, STARS, product.config, stars)
         settings = bank_product.config
         # Points along a side of the field, and the largest centring error.
         sizes = (settings["grid"]["points"], settings["framing"]["jitter_px"])
-        # Only the bound that is given the field uses the stars after the first `bank_stars`.
+        # Only bounds for a given field use the stars after the first `bank_stars`.
         large_bank = Bank.of(bank_product.arrays, *sizes)
         count, fields = settings["bounds"]["bank_stars"], large_bank.points**2
         if count < fields:
@@ -150,15 +155,17 @@ def bounds(
 def optics(
     config: Config, dataset: str, stars: File, bank: File, per_star: File, out: File
 ) -> None:
-    """Measure the methods that are given the telescope, on the test stars that are bounded.
+    """Measure the methods that are given the telescope, on the test stars of the bounds.
 
-    They estimate the wavefront of each star; one of them is given its position, too.
+    They estimate the wavefront of each star; one of them is also given its position.
 
-    The table has the columns of `evaluate`. Such a method knows more than any other, and shows how
+    The table has the columns of `evaluate`. These methods know more than any other, and show how
     near an estimate of a single star comes to the bound.
 
     Parameters
     ----------
+    config : Config
+        Settings of the simulation, noise, parts, bounds and evaluation.
     dataset : str
         Name in the tables.
     stars : Path
@@ -173,28 +180,28 @@ def optics(
     limit_threads(1)
     product = read_product(stars, "stars")
     require(stars, product.config, STARS, config)
-    bank_product = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
+    bank_product = read_product(bank, "bank", BANK_COLUMNS)
     require(bank, bank_product.config, STARS, product.config, stars)
-    bounded = bounded_stars(config, product)
+    test_stars = bounded_stars(config, product)
     # Field position of each bounded star, which one of the methods is given.
-    position = field_positions(product)[bounded.star]
+    position = field_positions(product)[test_stars.star]
     # Without, then with the position of the star in the field.
     summary, stars_table = [], []
     for name in ("wavefront", "wavefront_position"):
         method_class = cast("type[Wavefront]", method(name))
-        data = {r: training_set(config, method_class, product, SPLIT, r) for r in bounded.truth}
+        data = {r: training_set(config, method_class, product, SPLIT, r) for r in test_stars.truth}
         # The posterior does not depend on the reference: it is computed once for all references.
-        first = method_class.with_bank(bank_product.arrays, config, next(iter(data.values())))
+        first = method_class.from_bank(bank_product.arrays, config, next(iter(data.values())))
         estimators = {reference: replace(first, data=data[reference]) for reference in data}
-        for level, noisy in steps("noise levels", bounded.noisy.items()):
-            # Time for the log: the posterior is what takes long.
+        for level, noisy in steps("noise levels", test_stars.noisy.items()):
+            # Time for the log: the posterior takes most of it.
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)
             for reference, estimator in estimators.items():
-                # Each reference takes its own image from the same posterior.
+                # Both references have the same posterior, and images of their own.
                 estimate = estimator.estimate_from_posterior(*posterior, noisy, level, position)
-                truth = bounded.truth[reference]
-                stars_of_truth = MeasuredStars(bounded.star, bounded.field, position, truth)
+                truth = test_stars.truth[reference]
+                stars_of_truth = MeasuredStars(test_stars.star, test_stars.field, position, truth)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
                 row |= {"reference": reference, "method": name, "noise_level": level}
                 rows, table = stars_of_truth.errors(row, estimate, config.evaluation.data_range)
@@ -215,6 +222,8 @@ def collect_bounds(out: File, parts: Annotated[tuple[File, ...], {"argument": Tr
     ----------
     out : Path
         CSV.
+    parts : sequence of Path
+        CSV files of the stage bounds, or of the stage optics.
     """
     write_csv(out, read_tables(parts))
 
@@ -228,14 +237,14 @@ def efficiency(
 ) -> None:
     """Compare methods with the bounds; PARTS are the evaluations' Parquet files.
 
-    They are paired by star; the methods' errors are those of the bounded stars alone.
-    Methods that are given the star's field have a posterior mean of their own; all are
-    compared with the floor, and so are the posterior means. An efficiency is given for the
-    floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
-    is below such a bound by more than two standard errors of the difference and 5 % of the
-    bound (of the floor, which is no lower limit, 20 %), otherwise `ok`. Both are empty where a
-    posterior mean is not tight. Stars without a posterior mean are left out on both sides; both
-    are empty, too, where these are more than 1 %.
+    They are paired by star; only errors of the bounded stars are used. Methods that are given the
+    star's field have a posterior mean of their own; all methods, and the posterior means, are
+    compared with the floor. An efficiency is given for the floor and where the posterior mean is
+    tight; the verdict is `beaten` if a method's error is below such a bound by more than two
+    standard errors of the difference and 5 % of the bound (20 % for the floor, which is not a
+    strict lower limit), otherwise `ok`. Both are empty where a posterior mean is not tight. Stars
+    without a posterior mean are left out on both sides; both are also empty where these are more
+    than 1 %.
 
     Parameters
     ----------
@@ -244,7 +253,9 @@ def efficiency(
     bounds_per_star : sequence of Path
         Parquet of the stage bounds; repeat for more datasets.
     out : Path
-        CSV: every method beside every bound.
+        CSV with each method at each bound.
+    parts : sequence of Path
+        Parquet files of the stage evaluate.
     """
     # Keys of the posterior means that are tight.
     limits = read_tables(bounds)
@@ -253,8 +264,8 @@ def efficiency(
     levels = map("{:.6g}".format, tight_rows.noise_level)
     tight = {*zip(tight_rows.dataset, tight_rows.reference, tight_rows.method, levels, strict=True)}
     # Errors of methods by star, in groups that are columns of the paper's tables. The posterior
-    # mean over a bank is an estimator, too, and must respect the floor.
-    # Bounds are paired with errors star by star: scatter that both share cancels.
+    # mean over a bank is an estimator, too: its error must be above the floor. Bounds are paired
+    # with errors star by star, so that their common scatter cancels.
     bound_stars = pd.concat([read_table(path) for path in bounds_per_star], ignore_index=True)
     columns = [*CELL, "method", "star", "field", "mse"]
     methods = pd.concat([read_table(path, columns=columns) for path in parts])
@@ -263,26 +274,27 @@ def efficiency(
     # A cell is a dataset, split, reference and noise level.
     by_cell = dict(list(methods.groupby(CELL, sort=False)))
     rows: list[dict[str, object]] = []
-    for key, bounded in bound_stars.groupby(CELL, sort=False):
+    for key, bound in bound_stars.groupby(CELL, sort=False):
         # A cell that was bounded must have been evaluated.
         errors = by_cell[key]
         if errors.method.isin(tables.POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
-        rows += tables.compare_methods(dict(zip(CELL, key, strict=True)), errors, bounded, tight)
+        rows += tables.compare_methods(dict(zip(CELL, key, strict=True)), errors, bound, tight)
     write_csv(out, pd.DataFrame(rows).drop(columns="split"))
 
 
 @command("paper paper-rows")
 def paper_rows_table(bounds: File, efficiency: File, out: File) -> None:
-    """Set the paper's errors beside the posterior mean of the simulated scenes.
+    """Compare the paper's errors with the posterior mean of the simulated scenes.
 
     The reference is the realisation. Measured errors and the bound are means over the bounded
-    stars; `stderr` is that of the bound. The paper's error is `below what this scene allows` if it
-    is below a tight bound as in the stage efficiency. A bound that is not tight is above the least
-    possible error: an error below it proves nothing.
+    stars; `stderr` is the standard error of the bound. The paper's error is `below what this scene
+    allows` if it is below a tight bound as in the stage efficiency. A bound that is not tight is
+    above the minimum error: an error below it proves nothing.
 
-    A row is a method at a noise level of a dataset: the paper's error, that of this run, the bound
-    with its standard error, whether it is tight, the paper's error over the bound, and the verdict.
+    A row is a method at a noise level of a dataset: the paper's error, the error of this run, the
+    bound with its standard error, whether it is tight, the paper's error over the bound, and the
+    verdict.
 
     Parameters
     ----------
@@ -291,22 +303,22 @@ def paper_rows_table(bounds: File, efficiency: File, out: File) -> None:
     efficiency : Path
         CSV of the stage efficiency.
     out : Path
-        CSV: the paper's errors, measured errors and the least possible ones.
+        CSV with the paper's errors, measured errors and bounds.
     """
     key = ["dataset", "noise_level"]
     # The paper's errors under the names of the methods here.
-    paper = published("psf").query("metric == 'mse'").replace({"method": paper_rows()})
-    measured = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
+    paper = read_published("psf").query("metric == 'mse'").replace({"method": read_paper_names()})
+    measured_rows = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
     limits = read_table(bounds).query(
         "method == 'bayes' and reference == 'realisation' and metric == 'mse'"
     )
     table = paper[[*key, "method", "value"]].rename(columns={"value": "mse_paper"})
     # Only rows that the paper and this run both have.
-    table = table.merge(measured[[*key, "method", "mse"]], on=[*key, "method"])
+    table = table.merge(measured_rows[[*key, "method", "mse"]], on=[*key, "method"])
     table = table.merge(
         limits[[*key, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}), on=key
     )
-    # Above zero, the paper's error respects the bound.
+    # Above zero, the paper's error is above the bound.
     difference = table.mse_paper - table.mse_bound
     values = zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
     comparisons = [Comparison(*row) for row in values]

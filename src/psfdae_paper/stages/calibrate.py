@@ -1,8 +1,8 @@
-"""Stages `scan` and `calibrate`: parameters that the paper does not state, fitted to its tables.
+"""Stages `scan` and `calibrate`: parameters that the paper does not give, fitted to its tables.
 
-In go settings of the scenes, and simulated stars; out come tables of the fitted noise constant κ,
-the dynamic range of the SSIM and the pixel scales, beside the configured ones. Only the rows of the
-original noise are used, which depend on no method.
+Inputs: settings of the scenes, and simulated stars. Outputs: tables of the fitted noise constant κ,
+the dynamic range of the SSIM and the pixel scales, with the configured values. Only rows of the
+original noise are used, which do not depend on a method.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.wavefront import VonKarman
 from psfdae_paper.evaluation.calibration import (
     OriginalNoise,
+    compute_scale_residuals,
     fit_scales,
-    kappa_of_mse,
-    original_noise_rows,
-    residuals_by_scale,
+    read_original_noise,
+    solve_kappa,
 )
 from psfdae_paper.evaluation.measure import read_tables
 from psfdae_paper.stars.fields import assign_fields
@@ -43,7 +43,7 @@ from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 @command("paper scan", reads=(*SIMULATION, "noise", "calibration"))
 def scan(config: Config, dataset: str, out: File) -> None:
-    """Scan parameters that the paper does not state against its original-noise rows.
+    """Scan parameters that the paper does not give against its original-noise rows.
 
     The noise of each column is scaled to the MSE that the paper prints, so that the SSIM depends
     only on image structure and dynamic range.
@@ -53,14 +53,16 @@ def scan(config: Config, dataset: str, out: File) -> None:
 
     Parameters
     ----------
+    config : Config
+        Settings of the simulation, noise and calibration.
     dataset : str
         A dataset that the paper tabulates.
     out : Path
         CSV with the SSIM over scale, r0 and dynamic range.
     """
     limit_threads(1)  # batches run in parallel
-    # Columns of the paper's tables with the noise as it was, before any method.
-    rows = [row for row in original_noise_rows() if row.dataset == dataset]
+    # Columns of the paper's tables with the original noise, before any method.
+    rows = [row for row in read_original_noise() if row.dataset == dataset]
     r0_values = [float("nan")]
     if isinstance(config.wavefront, VonKarman):
         # The configured r0 is always scanned: its fit is compared with the configured scale.
@@ -78,29 +80,21 @@ def scan(config: Config, dataset: str, out: File) -> None:
             images = normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
             for row in rows:
                 # Noise with the MSE that the paper prints for this column.
-                noisy = _at_published_mse(images, row, config)
+                noisy = _add_published_noise(images, row, config)
                 ranges = config.calibration.data_ranges
                 # SSIM of each star at each dynamic range, shape (range, star).
                 similarity = np.atleast_2d(ssim(noisy, images, *ranges))
-                table += [
-                    {
-                        "experiment": config.scene.experiment,
-                        "dataset": dataset,
-                        "pixel_scale_arcsec": scale,
-                        "r0_m": r0,
-                        "noise_level": row.noise_level,
-                        "data_range": data_range,
-                        "ssim": values.mean(),
-                    }
-                    for data_range, values in zip(ranges, similarity, strict=True)
-                ]
-    write_csv(out, pd.DataFrame(table))
+                key = config.scene.experiment, dataset, scale, r0, row.noise_level
+                by_range = zip(ranges, similarity, strict=True)
+                table += [(*key, data_range, values.mean()) for data_range, values in by_range]
+    columns = ["experiment", "dataset", "pixel_scale_arcsec", "r0_m", "noise_level"]
+    write_csv(out, pd.DataFrame(table, columns=[*columns, "data_range", "ssim"]))
 
 
 class _CachedWavefronts:
     """Turbulent wavefronts whose OPD is computed once per grid, not once per pixel scale.
 
-    A scan computes the same wavefronts at many pixel scales: the pupil, and so the OPD, stays.
+    A scan computes the same wavefronts at many pixel scales, on the same pupil grids.
 
     Parameters
     ----------
@@ -114,10 +108,11 @@ class _CachedWavefronts:
         self._opd: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
+        """Return the number of wavefronts."""
         return len(self.source)
 
     def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        """Return the OPD of wavefronts like the source; double precision is not cached.
+        """Return the OPD of wavefronts as the source does; double precision is not cached.
 
         Only few stars need double precision.
 
@@ -126,13 +121,14 @@ class _CachedWavefronts:
         index : ndarray of int, shape (n,)
             Numbers of the wavefronts.
         pupil : Pupil
+            Pupil, on whose grid of N × N samples the OPD is computed.
         dtype : dtype
             float32 or float64.
 
         Returns
         -------
         ndarray, shape (n, N, N)
-            In metres.
+            In waves.
         """
         # Exact pixels of a few stars that compete for the maximum.
         if dtype != np.float32:
@@ -167,10 +163,10 @@ def _source(config: Config, r0: float) -> WavefrontSource:
     )
 
 
-def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
-    """Add noise to images, scaled so that its MSE is that of a column of the paper.
+def _add_published_noise(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
+    """Add noise to images, scaled to the MSE of a column of the paper.
 
-    The noise of λ = `row.noise_level` has the variance (κλ)² plus that of the star's photons.
+    The noise of λ = `row.noise_level` has the variance (κλ)² plus the photon noise of the star.
 
     Parameters
     ----------
@@ -187,7 +183,7 @@ def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) ->
     """
     level, background = row.noise_level, config.noise.background_photons
     # The constant κ whose noise has the published MSE on these stars.
-    kappa = kappa_of_mse(row.mse, level, images[0].size, background)
+    kappa = solve_kappa(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
     return NoiseModel(kappa, background).draw(images, level, rng)
 
@@ -201,15 +197,17 @@ def calibrate(
 ) -> None:
     """Fit noise, dynamic range and pixel scales to the scans.
 
-    The noise constant κ is that of the columns' MSE, each weighted alike in its logarithm; one
+    The noise constant κ follows from the columns' MSE, whose logarithms have equal weights; one
     dynamic range and one pixel scale for each scene follow from the SSIM by least squares.
 
-    Four tables come out: fitted values beside the configured ones (fit.csv); each of the paper's
-    columns beside simulated noise (columns.csv); residuals by pixel scale (scales.csv); and how
-    well other r0 would do (degeneracy.csv). The configuration itself is not changed.
+    There are four tables: fitted and configured values (fit.csv); each of the paper's columns with
+    simulated noise (columns.csv); residuals by pixel scale (scales.csv); and fits with other r0
+    (degeneracy.csv). The configuration itself is not changed.
 
     Parameters
     ----------
+    config : Config
+        Seed, noise and evaluation: the configured values.
     scans : sequence of Path
         CSV of the stage scan; repeat for more datasets.
     stars : sequence of pairs
@@ -217,36 +215,36 @@ def calibrate(
     out : Path
         Folder for fit.csv, columns.csv and degeneracy.csv.
     """
-    # Each of the paper's columns beside simulated stars with the configured parameters.
+    # Each of the paper's columns, and simulated stars with the configured parameters.
     products = dict(stars)
-    configured = _configured(products)
+    values = _read_simulated_values(products)
     limit_threads(config.evaluation.threads)
     scan_table = read_tables(scans)
     columns = pd.DataFrame(
-        [_column(row, products[row.dataset], config) for row in original_noise_rows()]
+        [_column(row, products[row.dataset], config) for row in read_original_noise()]
     )
-    # A joint fit of both scenes for each r0 of scene 2; scene 1 has none (NaN).
+    # A joint fit of both scenes for each r0 of scene 2; r0 of scene 1 is NaN.
     r0_column = scan_table.r0_m
     fit_by_r0 = {
         r0: fit_scales(scan_table[r0_column.isna() | (r0_column == r0)])
         for r0 in sorted(r0_column.dropna().unique())
     }
-    fit = fit_by_r0[min(fit_by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
-    # Least squares of log MSE: every column counts alike.
+    fit = fit_by_r0[min(fit_by_r0, key=lambda r0: abs(r0 - values["r0_m"]))]
+    # Least squares of log MSE: all columns have equal weight.
     fitted_columns = columns[columns.fitted]
     kappa = float(np.exp(np.log(fitted_columns.kappa).mean()))
     ssim_residual = fitted_columns.ssim_at_published_mse - fitted_columns.ssim_paper
     rms = float(np.sqrt((ssim_residual**2).mean()))
-    # Fitted values beside configured ones.
+    # Fitted and configured values.
     table = [
         ("kappa", kappa, config.noise.kappa, "1"),
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
-        ("pixel_scale_scene1", fit.pixel_scale["scene1"], configured["scene1"], "arcsec"),
-        ("pixel_scale_scene2", fit.pixel_scale["scene2"], configured["scene2"], "arcsec"),
-        ("r0_scene2", min(fit_by_r0, key=lambda r0: fit_by_r0[r0].rms), configured["r0_m"], "m"),
+        ("pixel_scale_scene1", fit.pixel_scale["scene1"], values["scene1"], "arcsec"),
+        ("pixel_scale_scene2", fit.pixel_scale["scene2"], values["scene2"], "arcsec"),
+        ("r0_scene2", min(fit_by_r0, key=lambda r0: fit_by_r0[r0].rms), values["r0_m"], "m"),
         ("ssim_residual_rms", fit.rms, rms, "1"),
     ]
-    # Different r0 with other pixel scales explain the paper's rows nearly as well.
+    # Different r0 with other pixel scales fit the paper's rows nearly as well.
     degeneracy = [
         (r0, r0_fit.pixel_scale["scene2"], r0_fit.data_range, r0_fit.rms)
         for r0, r0_fit in fit_by_r0.items()
@@ -254,7 +252,7 @@ def calibrate(
     frames = {
         "fit.csv": pd.DataFrame(table, columns=["quantity", "fitted", "configured", "unit"]),
         "columns.csv": columns,
-        "scales.csv": residuals_by_scale(scan_table, config.evaluation.data_range),
+        "scales.csv": compute_scale_residuals(scan_table, config.evaluation.data_range),
         "degeneracy.csv": pd.DataFrame(
             degeneracy, columns=["r0_m", "pixel_scale_scene2_arcsec", "data_range", "rms"]
         ),
@@ -263,7 +261,7 @@ def calibrate(
         write_csv(out / name, frame, 6)
 
 
-def _configured(stars: dict[str, Path]) -> dict[str, float]:
+def _read_simulated_values(stars: dict[str, Path]) -> dict[str, float]:
     """Return the pixel scales by scene and the r0 with which the stars were simulated.
 
     Stars of one scene must have the same static PSFs; raises ProductError.
@@ -283,7 +281,7 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     for path in stars.values():
         product = read_product(path, "stars", ())
         config = product.config
-        # The first product of a scene is what others are compared with.
+        # Other products of a scene are compared with its first one.
         first = scenes.setdefault(config["scene"]["experiment"], product)
         require(path, config, STATIC, first.config, first.path)
         values[config["scene"]["experiment"]] = config["telescope"]["pixel_scale_arcsec"]
@@ -311,13 +309,13 @@ def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]
     noise = NoiseModel(config.noise.kappa, background)
     # With the configured κ, as in the evaluation.
     noisy = noise.draw(images, row.noise_level, rng)
-    noisy_at_published_mse = _at_published_mse(images, row, config)
+    noisy_at_published_mse = _add_published_noise(images, row, config)
     data_range, error = config.evaluation.data_range, mse(noisy, images).mean()
     return {
         "dataset": row.dataset,
         "noise_level": row.noise_level,
-        "fitted": row.fitted,
-        "kappa": kappa_of_mse(row.mse, row.noise_level, images[0].size, background),
+        "fitted": row.is_fitted,
+        "kappa": solve_kappa(row.mse, row.noise_level, images[0].size, background),
         "mse_paper": row.mse,
         "mse": error,
         "mse_ratio": error / row.mse,

@@ -1,7 +1,7 @@
 """Stage `compare`: differences between finished networks or tables of errors, as Markdown.
 
-In go folders: of trained networks, of whole runs, or of the run of record. Out comes a text that
-says which settings differ, how the trainings went, and which errors differ by more than chance.
+Inputs: folders of trained networks, of whole runs, or of the run of record. Output: a text that
+lists the settings that differ, the trainings, and the errors that differ by more than chance.
 """
 
 from __future__ import annotations
@@ -62,17 +62,19 @@ def compare(
     """Compare the first of some RUNS with each of the others.
 
     A run is the folder of a trained network, such as results/dae/dataset3/random-realisation
-    or a point of a sweep; two folders of results compare all networks that both hold. Shown
-    are settings that differ, the trainings, and errors with their significance. Where a folder has
-    tables alone, such as results/reference, the mean errors are compared: which are equal, and
-    which differ by more than seeds do.
+    or a point of a sweep; of two folders of results, all networks that both have are compared. The
+    text has settings that differ, the trainings, and errors with their significance. Where a folder
+    has only tables, such as results/reference, the mean errors are compared: which are equal, and
+    which differ by more than the scatter between seeds.
 
     Differences are paired star by star where both runs have the same noisy images.
 
     Parameters
     ----------
+    runs : sequence of Path
+        Folders of trained networks, or of results; the first one is A.
     out : Path, optional
-        Write the Markdown to this file, too.
+        File that also receives the Markdown.
     """
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
@@ -99,7 +101,7 @@ def _networks(folder: Path) -> set[Path]:
 
 
 def _tables(folder: Path) -> list[Path]:
-    """Return the tables of mean errors: one per evaluation of a run, or that of a record."""
+    """Return the tables of mean errors: one per evaluation of a run, or the table of a record."""
     evaluations = sorted(folder.glob("evaluation/*/*.csv"))
     return evaluations or sorted(folder.glob("tables/psf_metrics.csv"))
 
@@ -108,7 +110,7 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """Return the runs to compare with each other: folder of the network, table of its errors."""
     # Folders of single networks.
     if all((folder / CONFIG).is_file() for folder in folders):
-        return [[(folder, errors_of(folder)) for folder in folders]]
+        return [[(folder, find_errors(folder)) for folder in folders]]
     # Whole results: all networks that they have in common, one group for each.
     networks = [_networks(folder) for folder in folders]
     for folder, names in zip(folders, networks, strict=True):
@@ -122,10 +124,10 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     common = sorted(set.intersection(*networks))
     if not common:
         raise ComparisonError(f"{', '.join(map(str, folders))}: no network in common")
-    return [[(folder / name, errors_of(folder / name)) for folder in folders] for name in common]
+    return [[(folder / name, find_errors(folder / name)) for folder in folders] for name in common]
 
 
-def errors_of(folder: Path) -> Path:
+def find_errors(folder: Path) -> Path:
     """Return the path of the errors per star of a network.
 
     The table is in the folder of the network, as for points of a sweep, or in the folder of
@@ -143,12 +145,12 @@ def errors_of(folder: Path) -> Path:
 
 def read_run(folder: Path, errors: Path) -> Run:
     """Read a network's settings, training history and errors per star; raises ProductError."""
-    # Settings and training are beside the network, its errors in the evaluation.
+    # Settings and history are in the folder of the network, its errors in the evaluation.
     config = read_yaml(folder / CONFIG)
     columns = ("epoch", "train_mse", "validation_mse", "seconds")
     # Some cells may be empty, hence text that is converted below.
     history = read_table(folder / HISTORY, *columns, dtype=str)
-    # A network may be there before it is evaluated.
+    # A trained network may lack its evaluation.
     if not errors.exists():
         raise ProductError(f"{errors}: no such file; evaluate the run first")
     history = history.apply(pd.to_numeric, errors="coerce")
@@ -157,22 +159,23 @@ def read_run(folder: Path, errors: Path) -> Run:
 
 def describe(first: Run, second: Run) -> str:
     """Return the differences between two runs as Markdown."""
-    errors = comparison.compare_evaluations(first.errors, second.errors, comparison.seed_scatter())
+    scatter = comparison.read_seed_scatter()
+    errors = comparison.compare_evaluations(first.errors, second.errors, scatter)
     # Difference ± its standard error ± the scatter between seeds, unless that is NaN.
     rows = []
     row: Any
     for row in errors.itertuples(index=False):
-        scatter = "" if np.isnan(row.seed_stderr) else f" ± {row.seed_stderr:.2g}"
-        difference = f"{row.difference:+.3g} ± {row.stderr:.2g}{scatter}"
+        seeds = "" if np.isnan(row.seed_stderr) else f" ± {row.seed_stderr:.2g}"
+        difference = f"{row.difference:+.3g} ± {row.stderr:.2g}{seeds}"
         rows.append((*row[:5], difference, row.sigmas, row.verdict))
     headers = ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"]
-    # What a training reached, and how long it took.
-    curves = [comparison.training_summary(run.history) for run in (first, second)]
+    # Validation errors of both trainings, and their durations.
+    curves = [comparison.summarise_training(run.history) for run in (first, second)]
     # Errors on the same noisy images are paired, which removes most of their scatter.
-    paired = comparison.same_noisy_stars(first.errors, second.errors)
-    pairing = "star by star on the same noisy images" if paired else "as independent samples"
-    # Settings that are numbers of stars: those of a trial on tiny sizes say nothing of a full run.
-    settings = comparison.config_differences(first.config, second.config)
+    is_paired = comparison.share_noisy_stars(first.errors, second.errors)
+    pairing = "star by star on the same noisy images" if is_paired else "as independent samples"
+    # Numbers of stars among the settings: errors of tiny trials do not compare with a full run.
+    settings = comparison.compare_settings(first.config, second.config)
     sizes = [row for row in settings if row[0] in ("parts.train_stars", "parts.test_stars")]
     # Errors to templates and to realisations have different truths.
     references = {run.config.get("reference", "") for run in (first, second)}
@@ -180,7 +183,7 @@ def describe(first: Run, second: Run) -> str:
     return "\n\n".join(
         [
             f"# {first.name} (A) and {second.name} (B)",
-            *warn_of_sizes(sizes),
+            *warn_about_sizes(sizes),
             "## Settings that differ",
             _table(settings, ["setting", "A", "B"]),
             "## Training",
@@ -195,7 +198,7 @@ def describe(first: Run, second: Run) -> str:
     )
 
 
-def warn_of_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
+def warn_about_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
     """Return a paragraph of warning if two runs have other numbers of stars; none if equal.
 
     Parameters
@@ -226,8 +229,8 @@ def describe_tables(first: Path, second: Path) -> str:
     Returns
     -------
     str
-        Numbers of rows that are equal, within the scatter between seeds, or beyond it, which are
-        listed; and whether the order of the paper's methods holds.
+        Numbers of rows that are equal, within the scatter between seeds, or beyond it (these are
+        listed); and whether the order of the paper's methods holds.
 
     Raises
     ------
@@ -240,7 +243,7 @@ def describe_tables(first: Path, second: Path) -> str:
     # of a standard error. The paper concludes that errors ascend from the DAE to the noisy image.
     negligible, ascending = 0.1, ("dae", "pca_som", "noisy")
     rows, order = comparison.compare_tables(
-        first_errors, second_errors, comparison.seed_scatter(), negligible, ascending
+        first_errors, second_errors, comparison.read_seed_scatter(), negligible, ascending
     )
     # The paper's methods by increasing error, as it names them.
     looks = [method(name).look for name in ascending]
@@ -257,12 +260,12 @@ def describe_tables(first: Path, second: Path) -> str:
     # Numbers of rows by verdict; rows that differ are listed.
     lines = [f"# {first} (A) and {second} (B)", ""]
     other_sizes = rows.loc[rows.n_first != rows.n_second, ["n_first", "n_second"]].head(1)
-    for warning in warn_of_sizes(("test stars", *row) for row in other_sizes.to_numpy()):
+    for warning in warn_about_sizes(("test stars", *row) for row in other_sizes.to_numpy()):
         lines += [warning, ""]
     counts = f"A has {len(first_errors)}, B {len(second_errors)}"
     lines += [f"{len(rows)} mean errors are in both ({counts})."]
     for verdict, text in verdict_texts.items():
-        # A line for each verdict, also where it has no rows.
+        # A line for each verdict, also without rows.
         verdict_rows = rows[rows.verdict == verdict]
         lines += [f"- {len(verdict_rows)} {text}"]
         if verdict in ("beyond", "not measured"):
@@ -302,7 +305,7 @@ def _cell(key: Sequence[Any]) -> str:
 
 
 def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
-    """Return a Markdown table, or "None." if there are no rows.
+    """Return a Markdown table, or "None." without rows.
 
     Parameters
     ----------

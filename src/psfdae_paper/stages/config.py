@@ -1,7 +1,7 @@
 """Stage `config`: the configuration, checked and resolved.
 
-In go overrides such as `dataset=alignment` or `preset=paper`; out comes the whole configuration, or
-the groups that one stage reads, as YAML on the terminal.
+With overrides such as `dataset=alignment` or `preset=paper`, it prints the whole configuration, or
+the groups that one stage reads, as YAML.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ def config(
 ) -> None:
     """Check the configuration and print it, resolved, as YAML.
 
-    What it prints is what a run would have with the same overrides, defaults included; a wrong key
-    is refused with its allowed range.
+    A run with the same overrides has the printed values, defaults included. The message for a wrong
+    key gives its allowed range.
 
     Parameters
     ----------
+    overrides : sequence of str
+        Words of Hydra such as dataset=alignment or noise.kappa=4.98.
     only : str, optional
         Only the groups that this stage reads.
     """
@@ -46,7 +48,7 @@ def config(
         # Groups of the stage without options; a stage may read more with some of them.
         groups = Groups(reader.names({}), reader.choice)
         settings = load_stage(groups.names({}), groups.with_choice(overrides))
-    # In the order of the classes, which is that of the documentation.
+    # In the order of the classes, as in the documentation.
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
 
 

@@ -1,8 +1,8 @@
 """Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars.
 
-In go the product "stars" and the fitted methods; out come the errors of every star (Parquet) and
-their means with standard errors (CSV), and the images of some stars, of which figures are drawn
-(product "restored"). The other stages make tables of the errors.
+Inputs: the product "stars" and the fitted methods. Outputs: the errors of every star (Parquet),
+their means with standard errors (CSV), and denoised images of some stars for figures (product
+"restored"). The other stages make tables of the errors.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
@@ -31,7 +31,7 @@ from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import paper_table, paper_table_markdown
+from psfdae_paper.evaluation.paper import format_paper_table, paper_table
 from psfdae_paper.stars.fields import square_grid
 
 READS = (
@@ -43,27 +43,18 @@ READS = (
 Methods that store no model are fitted by the stage, and their settings are among these groups.
 """
 
-if TYPE_CHECKING:
+STORED = {m.name: Folder if m.storage.files else File for m in registered() if m.storage}
+"""Type of the path of each method that stores a model: its folder or file."""
 
-    class Models:
-        """Options with the model of each method that stores one, by its name."""
-else:
-    Models = make_dataclass(
-        "Models",
-        [
-            (
-                method_class.name,
-                Annotated[
-                    (Folder if method_class.storage.files else File) | None,
-                    f"Result of `psfdae paper fit {method_class.name}`.",
-                ],
-                None,
-            )
-            for method_class in registered()
-            if method_class.storage
-        ],
-        namespace={"__doc__": "Fits of the methods."},
-    )
+Models = make_dataclass(
+    "Models",
+    [
+        (name, Annotated[path_type | None, f"Result of `psfdae paper fit {name}`."], None)
+        for name, path_type in STORED.items()
+    ],
+    namespace={"__doc__": "Fits of the methods."},
+)
+"""Options with the model of each method that stores one, by its name."""
 
 
 @command("paper evaluate", reads=READS)
@@ -71,7 +62,7 @@ def evaluate(
     config: Config,
     dataset: str,
     stars: File,
-    models: Models,
+    models: Models,  # type: ignore[valid-type]  # made at run time
     split: SplitKind = "random",
     reference: Reference = "realisation",
     *,
@@ -81,21 +72,26 @@ def evaluate(
 ) -> None:
     """Measure every method on the test stars at each noise level.
 
-    Metrics are the MSE per pixel and the SSIM against the reference. All methods restore the same
-    noisy images; standard errors are clustered by field, whose stars have a PSF in common.
+    Metrics are the MSE per pixel and the SSIM against the reference. All methods get the same noisy
+    images; standard errors are clustered by field, because stars of a field have similar PSFs.
 
-    Every method of the list `methods` needs its model, but for those that are fitted in a moment.
+    Every method of the list `methods` needs its model, except methods without a file, which are
+    fitted here.
     The table has a row for each method, noise level and metric; the Parquet file has one for each
     star, with its field and all metrics. The product has the images of stars spread over the field.
 
     Parameters
     ----------
+    config : Config
+        Seed, noise, parts, evaluation, methods, and settings of methods without a file.
+    models : Models
+        Folder or file of each method that stores one, an option of its name.
     split : str
         Split whose test stars are measured.
     reference : str
         Truth: the star's own noise-free image, or the static PSF of its field.
     dataset : str
-        Name that goes into the table.
+        Name in the table.
     stars : Path
         Product of the stage stars.
     per_star : Path
@@ -110,9 +106,9 @@ def evaluate(
     product = read_stars(stars, reference)
     # Methods that store a model are loaded; the others are fitted to the training stars.
     methods = estimators(config, product, vars(models), split, reference)
-    # Stars that no method has been fitted to.
+    # Test stars, which are not used in any fit.
     test = split_stars(product, split, config).test
-    test_stars = MeasuredStars.of(product, test, reference)
+    test_stars = MeasuredStars.from_product(product, test, reference)
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table, images = [], [], []
     # Eight stars side by side fill the width of a page.
@@ -130,7 +126,7 @@ def evaluate(
     # Means with standard errors, every star, and the stars of figures.
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
-    # Field angles (x, y) of all field points, of which each star has one.
+    # Field angle (x, y) of each star, one of the field points.
     grid = product.config["grid"]
     angle_deg = square_grid(grid["points"], grid["spacing_deg"])[1][test_stars.field[shown]]
     shape = (len(config.noise.levels), len(methods), *images[0].shape)
@@ -146,11 +142,7 @@ def evaluate(
 
 
 def estimators(
-    config: Config,
-    stars: Product,
-    models: Mapping[str, Path | None],
-    split: str,
-    reference: str,
+    config: Config, stars: Product, models: Mapping[str, Path | None], split: str, reference: str
 ) -> dict[str, Method]:
     """Load or fit the methods of a configuration, for the test stars of a split.
 
@@ -179,25 +171,25 @@ def estimators(
     """
     classes = [*map(method, config.methods)]
     # Check all models before any method is loaded or fitted.
-    places: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for method_class in classes:
         name = method_class.name
         if method_class.storage:
-            place = models.get(name)
-            if place is None:
+            path = models.get(name)
+            if path is None:
                 raise ConfigError(f"--{name.replace('_', '-')} is missing: it is in methods")
-            fits.require_fit(method_class, place, stars, config, split, reference)
-            places[name] = place
+            fits.require_fit(method_class, path, stars, config, split, reference)
+            paths[name] = path
     # Methods without a file are fitted here.
-    fitted: dict[str, Method] = {}
+    methods: dict[str, Method] = {}
     for method_class in classes:
         if method_class.storage:
-            place = places[method_class.name]
-            fitted[method_class.name] = method_class.load(place, reference, config.evaluation)
+            path = paths[method_class.name]
+            methods[method_class.name] = method_class.load(path, reference, config.evaluation)
         else:
             data = training_set(config, method_class, stars, split, reference)
-            fitted[method_class.name] = method_class.fit(data, **method_class.settings(config))
-    return fitted
+            methods[method_class.name] = method_class.fit(data, **method_class.settings(config))
+    return methods
 
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
@@ -208,19 +200,21 @@ Metric = Literal["mse", "ssim"]
 def collect(evaluations: Evaluations, out: File) -> None:
     """Join evaluations into one tidy table, with the scatter of each method between seeds.
 
-    The scatter, where it was measured, is that of a repeated fit with other random numbers.
+    The scatter, where it was measured, is the scatter of repeated fits with other random numbers.
 
     Columns are dataset, split, reference, method, noise_level, metric, value, stderr, seed_stderr
     and n, the number of stars.
 
     Parameters
     ----------
+    evaluations : sequence of Path
+        CSV files of the stage evaluate.
     out : Path
         Tidy CSV.
     """
-    # The standard error of a mean over stars does not hold the scatter between seeds.
-    table = comparison.with_seed_stderr(
-        read_tables(evaluations, MeasuredStars.columns), comparison.seed_scatter()
+    # The standard error of a mean over stars does not include the scatter between seeds.
+    table = comparison.add_seed_stderr(
+        read_tables(evaluations, MeasuredStars.columns), comparison.read_seed_scatter()
     )
     write_csv(out, table[[*MeasuredStars.columns[:-1], "seed_stderr", "n"]])
 
@@ -231,40 +225,44 @@ def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: Fil
 
     PER_STAR are the evaluations' Parquet files of both splits.
 
-    A row is a method at a noise level: the ratio of the errors of the same stars, as seen and as
-    held out, with its standard error. Above 1, the method is worse in fields that it has not seen.
+    A row is a method at a noise level: the ratio of the errors of the same stars, with their fields
+    held out and not, with its standard error. Above 1, the method is worse in held-out fields.
 
     Parameters
     ----------
+    per_star : sequence of Path
+        Parquet files of the stage evaluate, of both splits.
     out : Path
-        CSV: held-out over seen fields, on the stars that both splits test.
+        CSV with ratios of errors, on the stars that both splits test.
     """
-    columns = [*comparison.FITTED, "noise_level", "split", "star", "field", "mse"]
+    columns = [*comparison.FIT_KEYS, "noise_level", "split", "star", "field", "mse"]
     # Errors in the same fields, as seen in training and as held out.
     parts = [read_table(path, columns=columns) for path in per_star]
-    write_csv(out, comparison.held_out_ratios(pd.concat(parts)))
+    write_csv(out, comparison.measure_held_out_ratios(pd.concat(parts)))
 
 
 @command("paper paper-tables")
 def paper_tables(
     dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
 ) -> None:
-    """Write the paper's tables, with measured errors beside the published ones.
+    """Write the paper's tables, with published and measured errors.
 
     Rows are methods, columns noise levels; measured errors are given for each reference.
 
-    The table is written as CSV, and beside it as Markdown for the pages.
+    The table is written as CSV, and in the same folder as Markdown for the pages.
 
     Parameters
     ----------
     dataset : str
         Name in the tables.
+    evaluations : sequence of Path
+        CSV files of the stage evaluate.
     out : sequence of pairs
-        Metric and its CSV, the Markdown beside; repeat for more.
+        Metric and its CSV; repeat for more.
     """
-    # Each table as CSV, and beside it as Markdown.
-    measured = read_tables(evaluations, MeasuredStars.columns)
+    # Each table as CSV and as Markdown.
+    measured_rows = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
-        table = paper_table(measured, dataset, metric)
+        table = paper_table(measured_rows, dataset, metric)
         write_csv(path, table, 6)
-        write_text(path.with_suffix(".md"), paper_table_markdown(table, dataset, metric))
+        write_text(path.with_suffix(".md"), format_paper_table(table, dataset, metric))

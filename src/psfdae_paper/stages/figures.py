@@ -1,7 +1,7 @@
 """Stages `figure ...`: PNG figures of data products and tables.
 
-In go products of stars, restored stars or tables; out comes one PNG. The figures themselves are
-drawn by functions of `psfdae_paper.evaluation`, which take arrays and tables only.
+Each stage reads products or tables and writes one PNG. The figures themselves are drawn by
+functions of `psfdae_paper.evaluation`, which take arrays and tables only.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from psfdae.methods.metrics import mse
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation import bound_figures, curves
 from psfdae_paper.evaluation.drawing import reference_title
-from psfdae_paper.evaluation.figures import in_field_unit, stamp_energy_map, template_map
+from psfdae_paper.evaluation.figures import draw_energy, draw_templates, to_field_unit
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
-from psfdae_paper.evaluation.paper import published
+from psfdae_paper.evaluation.paper import read_published
 from psfdae_paper.stages.evaluate import Evaluations, Metric
-from psfdae_paper.stars.framing import without_margin
+from psfdae_paper.stars.framing import cut_margin
 
-Restored = Annotated[File, "Product of the stage evaluate: images of some stars."]
+RestoredStars = Annotated[File, "Product of the stage evaluate: images of some stars."]
 Templates = Annotated[File, "Product of the stage templates."]
 Png = Annotated[File, "PNG."]
 DatasetName = Annotated[str, "Name in the tables."]
@@ -44,12 +44,12 @@ def figure_templates(templates: Templates, out: Png) -> None:
     Each has a square-root scale up to its own maximum.
     """
     product = read_product(templates, "templates", ("psf", "grid", "field"))
-    psf = without_margin(product)
+    psf = cut_margin(product)
     title = (
         f"Static PSFs of scene {product.config['scene']['name']}: {len(psf)} field points, "
         f"stamps of {psf.shape[-1]} × {psf.shape[-1]} px"
     )
-    write_png(template_map(psf, product["grid"], product["field"], title), out)
+    write_png(draw_templates(psf, product["grid"], product["field"], title), out)
 
 
 @command("paper figure energy")
@@ -57,29 +57,33 @@ def figure_energy(templates: Templates, out: Png) -> None:
     """Draw the light inside the stamp over the field."""
     product = read_product(templates, "templates", ("energy", "grid", "field"))
     stamp_px = product.config["framing"]["stamp_px"]
-    write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
+    write_png(draw_energy(product["energy"], product["grid"], product["field"], stamp_px), out)
 
 
 @command("paper figure strip")
 def figure_strip(
-    restored: Restored,
+    restored: RestoredStars,
     levels: Annotated[tuple[Annotated[float, AboveZero], ...], {"flag": "--level"}],
     out: Png,
 ) -> None:
-    """Draw test stars before and after restoration.
+    """Draw test stars before and after denoising.
 
-    A row is a method at a noise level, a column a star; below each stamp stands its MSE × 10⁶. The
+    A row is a method at a noise level, a column a star, with the MSE × 10⁶ below each stamp. The
     first row is the reference.
 
     Parameters
     ----------
+    restored : Path
+        Product of the stage evaluate: images of some stars.
     levels : sequence of float
         Noise level λ; repeat for more rows.
+    out : Path
+        PNG.
     """
     product = read_product(restored, "restored")
     dataset, reference = product.config["dataset"], product.config["reference"]
     # Field angles of the stars as titles of the columns.
-    angle, unit = in_field_unit(product["field"])
+    angle, unit = to_field_unit(product["field"])
     columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle]
     title = (
         f"{dataset}: test stars at field angle (x, y) in {unit},\n"
@@ -92,53 +96,59 @@ def figure_strip(
         rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
     # All methods at the first noise level, then all at the next.
     for level in levels:
-        for row in restored_rows(product, level).values():
+        for row in make_strip_rows(product, level).values():
             rows.append(replace(row, label=f"{row.label}\nλ = {level:g}"))
     write_png(restoration_strip(rows, columns, title), out)
 
 
 @command("paper figure headline")
 def figure_headline(
-    restored: Restored,
+    restored: RestoredStars,
     level: Annotated[float, AboveZero],
     bounds: Bounds,
     efficiency: Efficiency,
     out: Png,
 ) -> None:
-    """Draw restored stars beside the errors and their bounds.
+    """Draw denoised stars, and errors with their bounds.
 
     At the left are five stars at one noise level, noisy and by every method, with the truth below;
     at the right is the MSE of each method against the noise level, with the bounds.
 
     Parameters
     ----------
-    dataset : str
-        Name in the tables.
+    restored : Path
+        Product of the stage evaluate: images of some stars.
     level : float
         Noise level λ.
+    bounds : Path
+        CSV of the stage bounds.
+    efficiency : Path
+        CSV of the stage efficiency.
+    out : Path
+        PNG.
     """
     product = read_product(restored, "restored")
     dataset, truth = product.config["dataset"], product["truth"]
     # Five of the stars, from one side of the field to the other.
     five = np.linspace(0, len(truth) - 1, 5).round().astype(int)
-    # Rows of restored stars, one for each method, and below them the truth.
-    restored_by_method = restored_rows(product, level, five)
+    # Rows of denoised stars, one for each method, and below them the truth.
+    restored_by_method = make_strip_rows(product, level, five)
     rows = [
         row if kind.look.restores else replace(row, label=f"{row.label} star")
         for kind, row in restored_by_method.items()
     ]
     rows.append(StripRow("truth", truth[five]))
     # Errors of methods and bounds of the same dataset.
-    errors, limits = (rows_of(path, dataset, "realisation") for path in (efficiency, bounds))
+    errors, limits = (read_rows(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    write_png(bound_figures.headline(rows, [*restored_by_method], errors, limits, titles), out)
+    write_png(bound_figures.draw_headline(rows, [*restored_by_method], errors, limits, titles), out)
 
 
-def restored_rows(
+def make_strip_rows(
     product: Product, level: float, stars: slice | np.ndarray = slice(None)
 ) -> dict[type[Method], StripRow]:
-    """Return a row of restored stamps at a noise level for each method that is drawn.
+    """Return a row of denoised stamps at a noise level for each method that is drawn.
 
     Parameters
     ----------
@@ -149,27 +159,27 @@ def restored_rows(
     stars : slice or ndarray of int
         Stars of the product, by default all.
 
-    Raises
-    ------
-    ProductError
-        If the product has no stars of this noise level.
-
     Returns
     -------
     dict of StripRow
         By class of the method: its label, and stamps (n, d, d) of flux 1 with their errors.
+
+    Raises
+    ------
+    ProductError
+        If the product lacks this noise level.
     """
     # Levels from two files may differ in the last bit.
-    (is_level,) = np.isclose(product["levels"], level, rtol=1e-5).nonzero()
-    if not is_level.size:
+    (indices,) = np.isclose(product["levels"], level, rtol=1e-5).nonzero()
+    if not indices.size:
         raise ProductError(f"{product.path}: no stars of λ = {level:g}")
     rows, truth = {}, product["truth"][stars]
-    # One method after the other, in the order in which they have restored the stars.
+    # One method after the other, in the order of the product.
     for name, images in zip(
-        product.config["methods"], product["restored"][is_level[0]], strict=True
+        product.config["methods"], product["restored"][indices[0]], strict=True
     ):
         kind = method(name)
-        # Images that are not restored have their own colour scale: noise exceeds the PSF.
+        # Noisy images have their own colour scale: noise exceeds the PSF.
         if kind.look.drawn:
             errors, is_noisy = mse(images[stars], truth), not kind.look.restores
             rows[kind] = StripRow(kind.look.label, images[stars], errors, is_noisy)
@@ -190,17 +200,19 @@ def figure_curves(
     ----------
     labels : sequence of str
         One per history, in order.
+    histories : sequence of Path
+        CSV files.
+    out : Path
+        PNG.
     """
     # Each history needs a label, and the columns that are drawn.
     if len(histories) != len(labels):
         raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
-    tables = {}
-    for path, label in zip(histories, labels, strict=True):
-        tables[label] = read_table(path)
-        missing = {"step", "train_mse", "validation_mse"} - set(tables[label].columns)
-        if missing:
-            raise ProductError(f"{path}: no column {min(missing)!r}")
-    write_png(curves.training_curves(tables, "Training of the denoising autoencoders"), out)
+    columns = ("step", "train_mse", "validation_mse")
+    tables = {
+        label: read_table(path, *columns) for path, label in zip(histories, labels, strict=True)
+    }
+    write_png(curves.draw_training_curves(tables, "Training of the denoising autoencoders"), out)
 
 
 @command("paper figure errors")
@@ -209,12 +221,14 @@ def figure_errors(
 ) -> None:
     """Draw metrics against the noise level, with the paper's points.
 
-    Each metric is a figure; it is refused if the tables have no row of the dataset.
+    Each metric is a figure. It is an error if the tables lack the dataset.
 
     Parameters
     ----------
     dataset : str
         Name in the tables.
+    evaluations : sequence of Path
+        CSV files of the stage evaluate.
     out : sequence of pairs
         Metric and its PNG; repeat for more.
     """
@@ -224,20 +238,20 @@ def figure_errors(
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
-        write_png(curves.error_against_noise(metrics, published("psf"), dataset, metric), path)
+        write_png(curves.draw_errors(metrics, read_published("psf"), dataset, metric), path)
 
 
 @command("paper figure bounds")
 def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' errors above the bounds, against the noise level."""
-    tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
-    write_png(bound_figures.errors_above_bounds(*tables, dataset), out)
+    tables = (read_rows(efficiency, dataset), read_rows(bounds, dataset))
+    write_png(bound_figures.draw_bounds(*tables, dataset), out)
 
 
 @command("paper figure efficiency")
 def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' efficiency against the noise level."""
-    write_png(bound_figures.efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
+    write_png(bound_figures.draw_efficiency(read_rows(efficiency, dataset), dataset), out)
 
 
 @command("paper figure bank-growth")
@@ -246,16 +260,18 @@ def figure_bank_growth(dataset: DatasetName, growth: File, out: Png) -> None:
 
     Parameters
     ----------
+    dataset : str
+        Name in the tables.
     growth : Path
         CSV of the stage bounds: error by size of the bank.
+    out : Path
+        PNG.
     """
-    write_png(bound_figures.bank_growth(rows_of(growth, dataset), dataset), out)
+    write_png(bound_figures.draw_bank_growth(read_rows(growth, dataset), dataset), out)
 
 
-def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
+def read_rows(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
     """Read the rows of a dataset, and of a reference if one is given.
-
-    ProductError if there are none.
 
     Parameters
     ----------
@@ -270,6 +286,11 @@ def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFr
     -------
     DataFrame
         At least one row.
+
+    Raises
+    ------
+    ProductError
+        If the table lacks such rows.
     """
     table = read_table(path)
     rows = table[table.dataset == dataset]

@@ -1,7 +1,7 @@
 """Stage `fit`: fit of a method to one dataset and split, for one reference or for both.
 
-In goes the product "stars"; out comes the fitted method, as a folder or an HDF5 product, with the
-configuration of the fit and of its stars beside it.
+Input: the product "stars". Output: the fitted method, as a folder or an HDF5 product, with the
+configuration of the fit and of its stars.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
     Parameters
     ----------
     name : str
-        Name of a method; empty for all that any method reads.
+        Name of a method; empty for the groups of all methods.
     **options
-        The other options of the command, which do not matter.
+        The other options of the command, which are not used.
     """
     return groups_of(name) if name else ("seed", "noise", "parts", *all_groups())
 
@@ -52,33 +52,39 @@ def fit(
 ) -> None:
     """Fit METHOD, a name of the list `methods` in config.yaml.
 
-    It learns from the training stars of the split, with noise as its settings say. The same
+    It is trained on the training stars of the split, with noise as its settings say. The same
     settings give the same bytes, whether the fit was interrupted or not.
 
-    Settings of the method are groups of the configuration, such as gmm.components=[4]. Beside the
-    fit stands its resolved configuration, by which other stages refuse a fit of other stars.
+    Settings of the method are groups of the configuration, such as gmm.components=[4]. The fit
+    includes its resolved configuration, by which other stages reject a fit to other stars.
 
     Parameters
     ----------
+    config : Config
+        Seed, noise, parts, and settings of the method.
+    name : str
+        Name of the method.
+    stars : Path
+        Product of the stage stars.
     split : str
-        Split whose training stars the method learns from.
+        Split whose training stars the method is fitted to.
     reference : str
         Truth: the star's own noise-free image, or the static PSF of its field.
     start : Path, optional
-        Fit to the realisations, from which one to templates goes on.
+        Fit to the realisations, from which a fit to templates starts.
     checkpoint : Path, optional
         State of an interrupted fit, if it keeps one.
     out : Path
         Folder or HDF5 product.
     """
-    # Stars of the split with their noise; training state goes to a file beside the fit.
     # The class of the method, and as many threads as its settings say.
     method_class = method(name)
     limit_threads(method_class.threads(config))
+    # Stars of the split with their noise; the training state is saved next to the fit.
     product = read_stars(stars, fits.learnt(method_class, reference))
     checkpoint_path = checkpoint or fits.path_beside(method_class, out, "checkpoint.pt")
     data = training_set(config, method_class, product, split, reference, checkpoint=checkpoint_path)
-    # Warm start: a fit to templates begins with the result of one to the realisations.
+    # Warm start: a fit to templates begins with the result of a fit to the realisations.
     if start is not None:
         if reference != "template" or not method_class.continues(config):
             raise click.UsageError(
@@ -86,9 +92,9 @@ def fit(
             )
         fits.require_fit(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
-    # Fit, store with its configuration, and forget the state of the training.
-    described = fits.described_by(method_class, config.model_dump(), split, reference)
+    # Fit, save with its configuration, and delete the state of the training.
+    fit_config = fits.described_by(method_class, config.model_dump(), split, reference)
     # The same call as for an astronomer's own stars.
-    fitted = method_class.fit(data, **method_class.settings(config))
-    fits.store(fitted, out, described, product)
+    estimator = method_class.fit(data, **method_class.settings(config))
+    fits.store(estimator, out, fit_config, product)
     checkpoint_path.unlink(missing_ok=True)

@@ -1,8 +1,8 @@
 """Epochs of trainings in MLflow while they run: `make reproduce TRACK=live`.
 
-A training logs where the environment asks for it (`psfdae.methods.networks.training.listener`).
-Its run lasts until `psfdae paper track` imports the finished one. The path of a checkpoint goes in,
-which says whose training it is, and a function of the rows of the history comes out.
+A training logs its epochs if the environment asks for it
+(`psfdae.methods.networks.training.listener`). Its run lasts until `psfdae paper track` imports the
+finished one. The path of its checkpoint identifies the training.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 from psfdae_paper.stages.track import (
     LIVE,
-    client_of,
     delete_live,
-    experiment_of,
+    find_experiment,
     first_line,
-    locked,
+    is_external_error,
+    lock_database,
     log_metrics,
-    ours_to_explain,
+    make_client,
     server,
 )
 from psfdae_paper.tracking import epoch_metrics
@@ -33,13 +33,14 @@ if TYPE_CHECKING:
 def logger(checkpoint: Path) -> Callable[[Row], None]:
     """Return a function that logs an epoch of the training with this checkpoint.
 
-    Trainings that MLflow does not show, such as points of sweeps, are passed over. So are those of
-    jobs of a cluster, unless MLFLOW_TRACKING_URI names a server: its nodes open no database.
+    Trainings that MLflow does not show, such as points of sweeps, are not logged, nor are trainings
+    on a cluster unless MLFLOW_TRACKING_URI names a server: nodes of a cluster do not open the
+    database.
 
     Parameters
     ----------
     checkpoint : Path
-        File of the training's state, whose place in the results folder names the training.
+        File of the training's state, whose path in the results folder names the training.
 
     Returns
     -------
@@ -57,27 +58,27 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
 
     def log(row: Row) -> None:
         nonlocal is_shown, run_id, last_epoch
-        # Passed over from the start, or since MLflow has failed.
+        # Not shown from the start, or since MLflow has failed.
         if not is_shown:
             return
         # The history counts seconds from the start of the training, MLflow from 1970.
         start_ms = int(1000 * (time.time() - row["seconds"]))
         try:
-            with locked(database):
-                client = client_of(uri, database)
+            with lock_database(database):
+                client = make_client(uri, database)
                 if row["epoch"] <= last_epoch or not run_id:
-                    # A training that starts anew, or goes on from its checkpoint, has a new run.
-                    experiment = experiment_of(client, LIVE, uri, database)
-                    # A run of an earlier attempt would stay beside the new one.
+                    # A training that starts again, or resumes from its checkpoint, has a new run.
+                    experiment = find_experiment(client, LIVE, uri, database)
+                    # A run of an earlier attempt would remain.
                     delete_live(client, source)
                     tags = {"source": source, "preset": os.environ["PRESET"] or "fast"}
                     run_id = client.create_run(experiment, start_ms, tags, source).info.run_id
                 log_metrics(client, run_id, epoch_metrics([row], start_ms))
                 last_epoch = row["epoch"]
         except Exception as error:
-            if not ours_to_explain(error):
+            if not is_external_error(error):
                 raise
-            is_shown = False  # a training ends whatever becomes of its picture
+            is_shown = False  # errors of MLflow must not stop a training
             print(f"the training is not shown in MLflow any more: {first_line(error)}", flush=True)
 
     return log

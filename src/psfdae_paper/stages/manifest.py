@@ -14,10 +14,8 @@ def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
     """Write the checksums of a run to SHA256SUMS.
 
     `sha256sum --check --quiet SHA256SUMS` in the folder then names the files that are damaged.
-    Listed are the products; logs, costs and MLflow's copies are not, nor are other runs in folders
-    of this one.
-
-    In goes the folder of a run; SHA256SUMS is in it, in the form that `sha256sum` reads.
+    Products are listed; logs, costs and MLflow's copies are not, nor are other runs in folders of
+    this one. SHA256SUMS has the form that `sha256sum` reads.
 
     Parameters
     ----------
@@ -31,9 +29,9 @@ def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
     lines = []
     for path in sorted(results.glob("*/**/*")):
         # Names relative to the run, so that it may be moved.
-        place = path.relative_to(results)
-        is_hidden = any(part.startswith(".") for part in place.parts)
-        is_product = not is_hidden and place.parts[0] not in no_products
+        name = path.relative_to(results)
+        is_hidden = any(part.startswith(".") for part in name.parts)
+        is_product = not is_hidden and name.parts[0] not in no_products
         if path.is_file() and is_product and other_runs.isdisjoint(path.parents):
-            lines.append(f"{sha256_of(path)}  {place.as_posix()}\n")
+            lines.append(f"{sha256_of(path)}  {name.as_posix()}\n")
     write_text(results / "SHA256SUMS", "".join(lines))

@@ -1,7 +1,7 @@
 """Stages `night images`, `night table`, `night page`, `night count`: many images of a telescope.
 
-In goes a list of images, some at a time; out come, for each image, a model, a catalogue and a
-report page, and for the night one table and one page. What cannot be used is a row with a reason.
+Input: a list of images. Outputs: for each image a model, a catalogue and a report page, and for the
+night one table and one page. An image that cannot be used is a row with a reason.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation.night import (
     TABLE_COLUMNS,
     VERDICTS,
+    add_verdicts,
     night_page,
     read_night,
-    with_verdicts,
 )
-from psfdae_paper.stars.nights import positions_of_places, shapes_at_places
+from psfdae_paper.stars.nights import locate_places, measure_places
 
 if TYPE_CHECKING:
     from psfdae.denoise.star_model import StarModel
@@ -44,36 +44,36 @@ Row = dict[str, object]
 
 
 class NightError(Error, ValueError):
-    """A list without images, or a night of which no image can be used."""
+    """A list without images, or a night without a usable image."""
 
 
-def listed_images(text: str) -> list[dict[str, str]]:
+def list_images(text: str) -> list[dict[str, str]]:
     """Return a row for each image of a pattern such as night/*.fits, or of a CSV list.
 
     Parameters
     ----------
     text : str
-        A list has the column `image` and further ones; those that are named as a field of
-        `ImageOptions` are stated of the image, all are kept.
+        Pattern, or CSV list with the column `image`. Further columns with the name of a field of
+        `ImageOptions` are options of the image; all columns are kept.
 
     Returns
     -------
     list of dict of str to str
-        Cells by column; `name` begins the names of the image's files, `reason` says why it is not
-        to be used.
+        Cells by column; `name` begins the names of the image's files, `reason` says why it cannot
+        be used.
 
     Raises
     ------
     NightError
-        If there is no image.
+        If no image is found.
     """
-    # Images of a pattern stand in the order of their names, which mostly is that of time.
+    # Images of a pattern are in the order of their names, usually the order of time.
     rows = [{"image": path} for path in sorted(glob.glob(text))]  # noqa: PTH207  # any folder
     if text.endswith(".csv"):
-        # A column of the list that the table of the night has as well keeps a name of its own.
+        # A column of the list whose name is also in the table of the night gets another name.
         rows = [
             {f"{name}_list" if name in TABLE_COLUMNS else name: cell for name, cell in row.items()}
-            for row in text_rows(Path(text), "image")
+            for row in read_text_rows(Path(text), "image")
         ]
     if not rows:
         raise NightError(f"images = {text}: no image, expected night/*.fits or a CSV list")
@@ -81,8 +81,8 @@ def listed_images(text: str) -> list[dict[str, str]]:
     names, images = set[str](), set[tuple[str, str]]()
     for row in rows:
         stem = ImageInput(Path(row["image"])).name
-        numbered = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
-        row["name"] = next(name for name in numbered if name not in names)
+        stems = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        row["name"] = next(name for name in stems if name not in names)
         image = str(Path(row["image"]).absolute()), row.get("extension", "")
         row["reason"] = "listed twice" if image in images else ""
         names.add(row["name"])
@@ -90,8 +90,8 @@ def listed_images(text: str) -> list[dict[str, str]]:
     return rows
 
 
-def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Return the rows of a CSV file with some columns, every cell as it stands there."""
+def read_text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with some required columns, every cell as text."""
     table = read_table(path, *columns, dtype=str, keep_default_na=False)
     return [{str(name): text for name, text in row.items()} for row in table.to_dict("records")]
 
@@ -100,8 +100,8 @@ def text_rows(path: Path, *columns: str) -> list[dict[str, str]]:
 def night_images(rows: File, folder: Folder, out: File) -> None:
     """Model images that follow each other in time, and measure all of their stars.
 
-    The most usual image of each camera is fitted; the others start from the model of the image
-    whose stars are most like their own, or are fitted as well if none is. An image that cannot be
+    The most typical image of each camera is fitted; the others start from the model of the image
+    with the most similar stars, or are fitted as well if none is similar. An image that cannot be
     used is a row with its reason.
 
     Parameters
@@ -111,12 +111,12 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
     folder : Path
         Folder for models, catalogues and report pages.
     out : Path
-        CSV with a row for each image and what was measured in it.
+        CSV with a row for each image and its measurements.
     """
     from pandas import DataFrame
 
-    listed = text_rows(rows, "image", "name", "reason")
-    results: dict[str, Row] = {row["name"]: {**row} for row in listed}
+    listed_rows = read_text_rows(rows, "image", "name", "reason")
+    results: dict[str, Row] = {row["name"]: {**row} for row in listed_rows}
     # Bright stars of the images, by camera, filter and size of stamps, which a model cannot change.
     groups: dict[tuple[object, ...], dict[str, ImageStars]] = {}
     for name, row in results.items():
@@ -124,39 +124,36 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
             if not row["reason"]:
                 stars = bright_stars(row)
                 camera = *stars.observation.instrument.items(), stars.observation.shape
-                stated = row.get("camera"), row.get("filter"), stars.settings.framing.stamp_px
-                groups.setdefault((*camera, *stated), {})[name] = stars
+                options = row.get("camera"), row.get("filter"), stars.settings.framing.stamp_px
+                groups.setdefault((*camera, *options), {})[name] = stars
         except Exception as error:
-            row["reason"] = reason_of(error, row)
+            row["reason"] = explain_error(error, row)
     for stars_by_name in groups.values():
-        sizes = log_sizes(stars_by_name)
+        sizes = measure_sizes(stars_by_name)
         starts: dict[str, StarModel] = {}
-        for name in from_most_usual(stars_by_name, sizes):
+        for name in order_images(stars_by_name, sizes):
             try:
-                # Its stars take memory: those of an image that is done are not needed any more.
+                # Stars take memory: they are removed when their image is done.
                 stars = stars_by_name.pop(name)
-                # Stars that differ by more than 4 % in size show another field than a start has.
+                # Stars that differ by more than 4 % in size need a fit of their own.
                 distance = {start: np.abs(sizes[start] - sizes[name]).max() for start in starts}
                 nearest = min(distance, key=distance.__getitem__, default="")
                 start = starts[nearest] if nearest and distance[nearest] < 0.04 else None
-                model = model_of_image(stars, start)
-                results[name] |= measured(results[name], stars, model, folder)
-                # Where the optics are known, one image of each job tells the telescope's state.
+                model = fit_image(stars, start)
+                results[name] |= measure_image(results[name], stars, model, folder)
+                # Where the optics are known, one image of each job gives the telescope's state.
                 if not starts and (telescope := results[name].get("telescope_file")):
-                    results[name] |= telescope_state(stars, Path(str(telescope)))
+                    results[name] |= fit_telescope(stars, Path(str(telescope)))
                 results[name]["start"] = nearest if model.info.adapted else ""
                 starts |= {} if model.info.adapted else {name: model}
             except Exception as error:
-                results[name]["reason"] = reason_of(error, results[name])
+                results[name]["reason"] = explain_error(error, results[name])
             print(name, results[name]["reason"] or "done", flush=True)
     write_csv(out, DataFrame(list(results.values())))
 
 
 @command("paper night table")
-def night_table(
-    parts: Annotated[tuple[File, ...], {"argument": True}],
-    out: File,
-) -> None:
+def night_table(parts: Annotated[tuple[File, ...], {"argument": True}], out: File) -> None:
     """Join the images of a night in one table, with a verdict on each.
 
     Parameters
@@ -164,7 +161,7 @@ def night_table(
     parts : sequence of Path
         Tables of `night images`, in the order of time.
     out : Path
-        CSV of the night; an ECSV with units is written beside it.
+        CSV of the night; an ECSV with units is written to the same folder.
     """
     from astropy.table import QTable
     from pandas import concat
@@ -173,7 +170,7 @@ def night_table(
     tables = [read_night(path, "image", "name", "reason") for path in parts]
     night = concat(tables, ignore_index=True)
     texts = [name for name in night if night[name].dtype.kind == "O"]
-    night = with_verdicts(night.fillna(dict.fromkeys(texts, "")))
+    night = add_verdicts(night.fillna(dict.fromkeys(texts, "")))
     write_csv(out, night)
     table = QTable.from_pandas(night)
     units = {"fwhm_px": "pix", "mag_20th": "mag", "zero_point": "mag"}
@@ -184,7 +181,7 @@ def night_table(
 
 @command("paper night page")
 def write_night_page(table: File, folder: Folder, out: File) -> None:
-    """Draw what an observer wants to know in the morning: bad images, and how the PSF moved.
+    """Draw the page of a night: bad images, and the PSF against time.
 
     Parameters
     ----------
@@ -206,14 +203,14 @@ def write_night_page(table: File, folder: Folder, out: File) -> None:
             name = str(with_model.name.iloc[number])
             model = load_model(folder / f"{name}{SUFFIX}")
             assert model.image_px is not None  # of a model that was fitted to an image
-            psfs[f"{label}\n{name}"] = model.draw_on_pixels(positions_of_places(model.image_px))
+            psfs[f"{label}\n{name}"] = model.draw_on_pixels(locate_places(model.image_px))
     links = os.path.relpath(folder, out.parent)
     write_text(out, night_page(night, psfs, links))
 
 
 @command("paper night count")
 def night_count(table: Annotated[File, {"argument": True}]) -> None:
-    """Print how many images are good, poor and failed; refuse a night without any model.
+    """Print how many images are good, poor and failed; an error if all have failed.
 
     Parameters
     ----------
@@ -227,13 +224,13 @@ def night_count(table: Annotated[File, {"argument": True}]) -> None:
     print(f"{table}: {sentence}")
 
 
-def reason_of(error: Exception, row: Mapping[str, object]) -> str:
+def explain_error(error: Exception, row: Mapping[str, object]) -> str:
     """Return why an image cannot be used, in one line; a bug is printed with its traceback."""
     message = refusal(error)
     if message is None:
         traceback.print_exception(error)
         message = f"{type(error).__name__}: {error}"
-    # The row names the image already.
+    # The row already names the image.
     return " ".join(message.removeprefix(f"{row['image']}: ").split())
 
 
@@ -242,12 +239,12 @@ def bright_stars(row: Mapping[str, object]) -> ImageStars:
     from psfdae.training.from_image import collect_stars
     from psfdae.training.settings import settings_model
 
-    stated = typed_values(ImageOptions, {name: str(text) for name, text in row.items()})
-    source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in stated, **stated})
+    values = typed_values(ImageOptions, {name: str(text) for name, text in row.items()})
+    source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in values, **values})
     return collect_stars([source], settings_model()())
 
 
-def log_sizes(stars_by_name: Mapping[str, ImageStars]) -> dict[str, np.ndarray]:
+def measure_sizes(stars_by_name: Mapping[str, ImageStars]) -> dict[str, np.ndarray]:
     """Return the logarithms of the FWHM (px) and axis ratio of an image's mean PSF, by its name."""
     from psfdae.stars.moments import measure_shapes
 
@@ -256,25 +253,26 @@ def log_sizes(stars_by_name: Mapping[str, ImageStars]) -> dict[str, np.ndarray]:
     return dict(zip(stars_by_name, sizes, strict=True))
 
 
-def from_most_usual(
+def order_images(
     stars_by_name: Mapping[str, ImageStars], sizes: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """Return the names of images, that which is most like the median image of the group first.
+    """Return the names of images, the most typical image of the group first.
 
-    Of those with at least the median number of stars, it is the one with the most usual size and
-    shape of stars (`log_sizes`): neither cloudy nor trailed. All others keep their order.
+    It has at least the median number of stars and, of these images, the size and shape of stars
+    (`measure_sizes`) nearest to the median: it is neither cloudy nor trailed. The others keep their
+    order.
     """
-    least_count = np.median([len(stars) for stars in stars_by_name.values()])
+    min_count = np.median([len(stars) for stars in stars_by_name.values()])
     middle = np.median([*sizes.values()], axis=0)
-    most_usual = min(
-        (name for name, stars in stars_by_name.items() if len(stars) >= least_count),
+    most_typical = min(
+        (name for name, stars in stars_by_name.items() if len(stars) >= min_count),
         key=lambda name: np.abs(sizes[name] - middle).sum(),
     )
-    return [most_usual, *(name for name in stars_by_name if name != most_usual)]
+    return [most_typical, *(name for name in stars_by_name if name != most_typical)]
 
 
-def model_of_image(stars: ImageStars, start: StarModel | None) -> StarModel:
-    """Return the field model of an image, changed from that of another image if there is one."""
+def fit_image(stars: ImageStars, start: StarModel | None) -> StarModel:
+    """Fit the field model of an image, starting from the model of another image if there is one."""
     from psfdae.training.exposures import adapt_to_stars
     from psfdae.training.fitting import fit_model
     from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
@@ -283,21 +281,22 @@ def model_of_image(stars: ImageStars, start: StarModel | None) -> StarModel:
     training_stars = np.count_nonzero(~stars.held_out)
     if start is None or training_stars < MIN_STARS_WITH_ERROR:
         model = fit_model(stars, method="field")
-        # Where wavefronts grow with the square of the place, as Seidel aberrations do, second
-        # moments grow with its fourth power: a curved field gets order 4 at least, if there are two
-        # stars for each of its 15 terms. Few of the stars that chose the order are in the corners.
+        # Where wavefronts grow with the square of the position, as Seidel aberrations do, second
+        # moments grow with its fourth power: a curved field gets at least order 4, if there are two
+        # stars for each of its 15 terms. Few of the stars that decide the order are in corners.
         if 2 <= model.order < 4 and training_stars >= 30:
             model = fit_model(stars, method="field", orders=[4, 6])
         return model
     return adapt_to_stars(start, stars)
 
 
-def telescope_state(stars: ImageStars, telescope: Path) -> Row:
-    """Return the numbers of a telescope that explain the brightest stars of an image, and errors.
+def fit_telescope(stars: ImageStars, telescope: Path) -> Row:
+    """Fit the numbers of a telescope, with errors, to the brightest stars of an image.
 
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of the image, with their observation.
     telescope : Path
         YAML file of the telescope, as `psfdae wavefront` takes it.
 
@@ -311,11 +310,11 @@ def telescope_state(stars: ImageStars, telescope: Path) -> Row:
     from psfdae.sensing.results import wavefront
     from psfdae.telescope.settings import read_telescope
 
-    # Thirty stars tell ten numbers, and take some seconds.
+    # Thirty stars determine ten numbers, in some seconds.
     bright = stars.candidates.bright.row
     brightest = bright[np.argsort(-stars.candidates.snr[bright])[:30]]
     observation = stars.observation.with_margin(0).select(brightest)
-    # A telescope that cannot be used makes no image bad.
+    # An image is usable without the state of the telescope.
     try:
         optics = read_telescope(telescope)
         check_scale(observation, optics)
@@ -331,22 +330,26 @@ def telescope_state(stars: ImageStars, telescope: Path) -> Row:
     return row
 
 
-def measured(row: Mapping[str, object], stars: ImageStars, model: StarModel, folder: Path) -> Row:
-    """Write model, catalogue and report page of an image, and return what its row tells.
+def measure_image(
+    row: Mapping[str, object], stars: ImageStars, model: StarModel, folder: Path
+) -> Row:
+    """Write model, catalogue and report page of an image, and return its row of measurements.
 
     Parameters
     ----------
     row : mapping
         Row of the list; its `reference` is a star list with magnitudes.
     stars : ImageStars
+        Bright stars of the image, with the opened image.
     model : StarModel
+        Model of the image.
     folder : Path
         Files begin with the row's name.
 
     Returns
     -------
     dict
-        Time, airmass; FWHM (px) and ellipticity at places of the field, order of the field; numbers
+        Time, airmass; FWHM (px) and ellipticity at `PLACES`, order of the field; numbers
         of bright, measured and flagged stars; magnitude of the 20th brightest star in counts;
         zero point and its scatter; median χ² of the stars.
     """
@@ -362,7 +365,7 @@ def measured(row: Mapping[str, object], stars: ImageStars, model: StarModel, fol
     write_table(path.with_name(f"{path.name}.fits"), table)
     validate(model, stars).save(path.with_name(f"{path.name}.html"))
     model.save(path.with_name(f"{path.name}{SUFFIX}"))
-    # The flux of the 20th brightest star that has no flag tells clouds from few stars.
+    # The flux of the 20th brightest star without a flag distinguishes clouds from few stars.
     cards = {key: value for key, value, _ in stars.observation.header_cards}
     flux, has_flag = np.array(table["flux"], float), np.array(table["flags"]) > 0
     brightest = np.sort(flux[~has_flag & (flux > 0)])[::-1][:20]
@@ -371,7 +374,7 @@ def measured(row: Mapping[str, object], stars: ImageStars, model: StarModel, fol
     return {
         "time": cards.get("DATE-OBS", cards.get("MJD-OBS", "")),
         "airmass": cards.get("AIRMASS", math.nan),
-        **shapes_at_places(model.draw_on_pixels, (shape[1], shape[0])),
+        **measure_places(model.draw_on_pixels, (shape[1], shape[0])),
         "order": model.order,
         "bright_stars": len(stars),
         "stars": len(table),

@@ -1,8 +1,8 @@
 """Stages `runtime` and `reference`: the cost of a run, and the run of record.
 
-A finished run in `results` goes in. Out come `runtime.csv` with the cost of each job, and
-`results/reference` with tables and figures of the run and, in `provenance.json`, how they were
-made. The record is in git, and pages take their numbers from it.
+Input: a finished run in `results`. Outputs: `runtime.csv` with the cost of each job, and
+`results/reference` with tables and figures of the run and their provenance (`provenance.json`). The
+record is in git, and pages take their numbers from it.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
     from psfdae_paper.configuration.schema import Config
 
 MAY_STAY = re.compile(r"(sweeps|paper)/.+")
-"""Names of products that may stay from an earlier record: they take too long for every record."""
+"""Names of products that may stay from an earlier record, because they take too long."""
 
 
 @command("paper runtime")
 def runtime(results: Folder, out: File) -> None:
     """Collect wall time, CPU time and memory of a run's jobs.
 
-    Wall time and memory are Snakemake's. The CPU time of all processes of a job is in the last
-    line of its log, which has the name of its benchmark.
+    Snakemake measures wall time and memory. The CPU time of all processes of a job is in the last
+    line of its log.
 
     Columns are the rule, its wildcards, wall_s and cpu_s in seconds, and peak_mb.
 
@@ -55,13 +55,13 @@ def runtime(results: Folder, out: File) -> None:
     out : Path
         CSV with the cost of every job.
     """
-    write_csv(out, job_costs(results), 6)
+    write_csv(out, read_job_costs(results), 6)
 
 
-def job_costs(results: Path) -> pd.DataFrame:
+def read_job_costs(results: Path) -> pd.DataFrame:
     """Return a table with wall time, CPU time (s) and peak memory (MB) of every job.
 
-    NaN stands where Snakemake has no number, or the log of a job no CPU time.
+    Values that are missing in Snakemake's table or in the log of a job are NaN.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def job_costs(results: Path) -> pd.DataFrame:
     for path in sorted(folder.rglob("*.tsv")):
         job = path.relative_to(folder).with_suffix("")
         rule, *wildcards = job.parts
-        # The last line of a log is that of bash's `times`, 1m2.003s for user and system each
+        # The last line of a log is from bash's `times`, 1m2.003s for user and system each
         # (workflow/rules/cpu_time.smk).
         log = results / "logs" / job.with_name(f"{job.name}.log")
         last_line = log.read_text(encoding="utf-8").splitlines()[-1:] if log.is_file() else []
@@ -99,14 +99,14 @@ def reference(
 ) -> None:
     """Replace the committed run of record by a finished run.
 
-    The new record belongs to the commit that is checked out. It is refused unless code, workflow
-    and settings are as committed, and Snakemake finds every file up to date with them, on whatever
-    machine it was made. Files that take long (`MAY_STAY`) and are not up to date stay from the
-    earlier record; provenance names them with the commit of that record, which must be in the
-    history, and its date.
+    The new record belongs to the commit that is checked out. Code, workflow and settings must be as
+    committed, and Snakemake must find every file up to date with them, on whatever machine it was
+    made. Files that take long (`MAY_STAY`) and are not up to date stay from the earlier record;
+    provenance names them with the commit of that record, which must be in the history, and its
+    date.
 
-    The folder gets tables, figures, runtime.csv and provenance.json; pages take their numbers from
-    these files alone.
+    The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
+    from these files alone.
 
     Parameters
     ----------
@@ -119,21 +119,21 @@ def reference(
     """
     from psfdae_paper.configuration.compose import load
 
-    # What a commit does not have, and what it would make anew, is refused.
+    # The commit must be complete, and all files up to date with it.
     commit = clean_commit()
-    renewed = files_up_to_date(results, plans)
+    new_names = list_current_files(results, plans)
     # Files of the earlier record that stay, with its commit and date.
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
     names = (path.relative_to(out).as_posix() for path in sorted(out.rglob("*")) if path.is_file())
     earlier_record = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
-    retained: dict[str, dict[str, str]] = {
+    old_records: dict[str, dict[str, str]] = {
         name: earlier.get("kept", {}).get(name) or earlier_record
         for name in names
-        if name not in renewed and MAY_STAY.fullmatch(name)
+        if name not in new_names and MAY_STAY.fullmatch(name)
     }
     # A commit that is in the history can be checked out again.
-    for name, record in retained.items():
+    for name, record in old_records.items():
         try:
             git("merge-base", "--is-ancestor", record["commit"], "HEAD")
         except subprocess.CalledProcessError:
@@ -141,8 +141,8 @@ def reference(
                 f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
                 " make it anew, or remove it from the record"
             ) from None
-    sources = {name: results / name for name in renewed}
-    sources |= {name: out / name for name in retained}
+    sources = {name: results / name for name in new_names}
+    sources |= {name: out / name for name in old_records}
     # The new record is complete before it replaces the earlier one.
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
@@ -151,8 +151,8 @@ def reference(
         target.parent.mkdir(parents=True, exist_ok=True)
         # Bytes only: dates of the files are not part of the record.
         shutil.copyfile(path, target)
-    described = provenance(results, load()) | {"commit": commit, "kept": retained}
-    text = json.dumps(described, indent=2, sort_keys=True)
+    new_record = provenance(results, load()) | {"commit": commit, "kept": old_records}
+    text = json.dumps(new_record, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
@@ -166,21 +166,21 @@ def clean_commit() -> str:
     ProductError
         If files that decide the products of a run differ from it, or git fails.
     """
-    # Pages, tests and tables may differ: they make no product.
+    # Pages, tests and tables may differ: products do not depend on them.
     try:
-        changed = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
+        status = git("status", "--porcelain", "--", "Snakefile", "config", "src", "workflow")
         commit = git("rev-parse", "HEAD")
     except (OSError, subprocess.CalledProcessError) as error:
         raise ProductError(
             f"the run of record belongs to a commit, and git fails: {error}"
         ) from None
     # The last word of the status is the name of a file.
-    if changed:
-        raise ProductError(f"{changed.split()[-1]}: differs from commit {commit:.12}; commit first")
+    if status:
+        raise ProductError(f"{status.split()[-1]}: differs from commit {commit:.12}; commit first")
     return commit
 
 
-def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
+def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
     """Return the files of the record that Snakemake finds up to date.
 
     Parameters
@@ -198,7 +198,7 @@ def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
     Raises
     ------
     ProductError
-        If others, which may not stay from an earlier record, are not up to date.
+        If files that may not stay from an earlier record are not up to date.
     """
     # Snakemake's plan for every file of the run: "no update", or the reason to make it.
     plan_by_name: dict[str, str] = {}
@@ -211,27 +211,28 @@ def files_up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
         raise ProductError(
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
-    # A record is of one commit, but for files that take too long to be made for each.
+    # A record belongs to one commit, except files that take too long.
     in_record = re.compile(
         r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
         r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
     )
-    recorded = {name: plan for name, plan in plan_by_name.items() if in_record.fullmatch(name)}
-    outdated = {name for name, plan in recorded.items() if plan != "no update"}
-    refused = sorted(name for name in outdated if not MAY_STAY.fullmatch(name))
-    if refused:
+    entries = {name: plan for name, plan in plan_by_name.items() if in_record.fullmatch(name)}
+    outdated_names = {name for name, plan in entries.items() if plan != "no update"}
+    missing_names = sorted(name for name in outdated_names if not MAY_STAY.fullmatch(name))
+    if missing_names:
         raise ProductError(
-            f"{results / refused[0]}: missing, or not what this commit makes (so are"
-            f" {len(refused)} files of {len(recorded)}); run the targets of the record first"
+            f"{results / missing_names[0]}: missing, or not what this commit makes (so are"
+            f" {len(missing_names)} files of {len(entries)}); run the targets of the "
+            "record first"
         )
-    return [name for name in recorded if name not in outdated]
+    return [name for name in entries if name not in outdated_names]
 
 
 def provenance(results: Path, config: Config) -> dict[str, object]:
     """Describe a run: date, machine, versions, threads, and its cost.
 
-    Times are in seconds, sizes in MB. `wall_s` is the time during which a job of `make reproduce`
-    ran, `on_request_s` that of each target beyond it.
+    Times are in seconds, sizes in MB. `wall_s` is the time during which jobs of `make reproduce`
+    ran, `on_request_s` the time of each further target.
 
     Parameters
     ----------
@@ -243,11 +244,11 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
     Returns
     -------
     dict
-        What `provenance.json` holds, but for commit and retained files.
+        Content of `provenance.json`, except commit and files of earlier records.
     """
     # Jobs of `make reproduce`: the CPU time of all together and the largest memory of one.
-    costs = job_costs(results)
-    # Jobs of targets beyond `make reproduce`, such as the bounds.
+    costs = read_job_costs(results)
+    # Jobs of further targets, such as the bounds.
     on_request = sorted(
         path for path in (results / "benchmarks_on_request").glob("*") if path.is_dir()
     )
@@ -275,7 +276,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
             "training": config.train.threads,
             "evaluation": config.evaluation.threads,
         },
-        "matrix_product_gflops": round(matrix_product_speed(), 1),
+        "matrix_product_gflops": round(measure_matrix_speed(), 1),
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
         "on_request_s": {path.name: round(_busy_seconds(path), 1) for path in on_request},
         **installation,
@@ -288,7 +289,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
 def cpu_model() -> str:
     """Return the model of the processor as the operating system names it."""
-    # Linux; others say it to Python.
+    # A file of Linux; elsewhere Python asks the system.
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text().splitlines():
@@ -297,7 +298,7 @@ def cpu_model() -> str:
     return platform.processor() or platform.machine()
 
 
-def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
+def measure_matrix_speed(size: int = 1024, repeats: int = 5) -> float:
     """Measure the speed of a float32 matrix product in GFLOP/s, the best of some repeats.
 
     Run times of two machines are expected to be in the inverse ratio of these speeds.
@@ -307,7 +308,7 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
     size : int
         Rows and columns of the matrices.
     repeats : int
-        Number of products; other work on the machine slows most of them, but hardly all.
+        Number of products; other work on the machine slows most of them, but rarely all.
     """
     # Values do not matter for the speed.
     a = np.ones((size, size), dtype=np.float32)
@@ -318,7 +319,7 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
 def _busy_seconds(benchmarks: Path) -> float:
     """Return the wall time during which at least one job ran.
 
-    Pauses between jobs, such as those before a run is resumed, do not count.
+    Pauses between jobs, such as before a run is resumed, are left out.
 
     Parameters
     ----------

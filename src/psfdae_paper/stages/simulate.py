@@ -1,8 +1,8 @@
 """Stages `simulate`, `figure telescope`, `example-field`, `example-night`: simulated PSFs, images.
 
-In go the settings of a telescope; out come its static PSFs over the field as a product, a figure,
-a table and, if asked for, a FITS cube and an image with a star per field. `example-field` makes the
-image of a star field with which the pages try the library, `example-night` many of them.
+`simulate` turns the settings of a telescope into its static PSFs over the field: a product, a
+figure, a table and, on request, a FITS cube and an image with a star per field. `example-field`
+makes the image of a star field for the examples of the pages, `example-night` many images.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from psfdae_paper.stars.example import (
     write_field,
 )
 from psfdae_paper.stars.example import example_field as simulate_field
-from psfdae_paper.stars.framing import FramingError, Propagation, normalise_flux, without_margin
+from psfdae_paper.stars.framing import FramingError, Propagation, cut_margin, normalise_flux
 from psfdae_paper.stars.nights import (
     NightRecipe,
-    reference_stars,
-    simulated_night,
-    telescope_of,
+    describe_telescope,
+    simulate_night,
+    simulate_reference_stars,
 )
 from psfdae_paper.stars.scenes import template_wavefronts
 
@@ -77,9 +77,9 @@ def simulate(
     Writes templates.h5, psfs.png and fields.csv.
 
     The telescope is an option of the group `telescope`, or a file of your own. The figure shows the
-    PSFs at their places in the field; the table has, for each field point, the light inside the
-    stamp, the FWHM in arcsec, ellipticity and position angle in degrees. Telescopes whose PSFs do
-    not fit into their stamps are refused, before any file is written.
+    PSFs at their positions in the field; the table has, for each field point, the light inside the
+    stamp, the FWHM in arcsec, ellipticity and position angle in degrees. If the PSFs do not fit
+    into their stamps, there is an error before any file is written.
 
     Parameters
     ----------
@@ -92,19 +92,21 @@ def simulate(
     seed : int
         Seed of the image's noise.
     least_energy : float
-        Refuse stamps with less than this part of the light.
+        Minimum fraction of the light in a stamp.
+    overrides : sequence of str
+        Words of Hydra such as telescope=NAME.
     """
-    # A user's telescope is put into the dataset that is made for it.
+    # A user's telescope is used with the dataset for single telescopes.
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
         overrides = ("dataset=_telescope", *overrides)
     config = load_stage(STATIC, overrides)
-    # Groups of the static PSFs are checked; then they are propagated and measured.
+    # Settings of the static PSFs are checked; then the PSFs are propagated and measured.
     folder = out or Path(config.telescope.name)
     # No file is written if the PSFs do not fit.
     with atomic_path(folder / "templates.h5") as temporary:
         templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
-        warnings = stamp_warnings(config, fields, least_energy)
+        warnings = check_stamps(config, fields, least_energy)
     # The figure and the table of the same measurements.
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
     names = ["templates.h5", "psfs.png", "fields.csv"]
@@ -143,13 +145,13 @@ def figure_telescope(templates: File, table: File, out: File) -> None:
     out : Path
         PNG.
     """
-    from psfdae_paper.evaluation.figures import field_of_psfs
+    from psfdae_paper.evaluation.figures import draw_field
 
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
     write_csv(table, fields.table, digits=6)
-    write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
+    write_png(draw_field(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
 
 
 def measure_fields(product: Product) -> FieldOfPsfs:
@@ -172,7 +174,7 @@ def measure_fields(product: Product) -> FieldOfPsfs:
 
     from psfdae_paper.evaluation.figures import FieldOfPsfs
 
-    psf, (x, y) = without_margin(product), np.rad2deg(product["field"]).T
+    psf, (x, y) = cut_margin(product), np.rad2deg(product["field"]).T
     shapes = measure_shapes(psf)
     columns = {
         "x_deg": x,
@@ -186,7 +188,7 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     return FieldOfPsfs(psf, product["grid"], product["field"], pd.DataFrame(columns))
 
 
-def stamp_warnings(
+def check_stamps(
     config: Config, fields: FieldOfPsfs, least_energy: float, enough_light: float = 0.8
 ) -> list[str]:
     """Return warnings: stamps with too little light, and undersampled PSFs.
@@ -196,10 +198,11 @@ def stamp_warnings(
     config : Config
         Stage configuration of `templates`.
     fields : FieldOfPsfs
+        Static PSFs on stamps, with the light inside each stamp and the FWHM.
     least_energy : float
-        Fraction of the light below which a stamp is refused.
+        Fraction of the light below which a stamp is an error.
     enough_light : float
-        Fraction of the light below which a stamp is called too small.
+        Fraction of the light below which there is a warning.
 
     Raises
     ------
@@ -210,11 +213,11 @@ def stamp_warnings(
     # Light of each PSF inside its stamp.
     energy, side = fields.table.energy.to_numpy(), config.framing.stamp_px
     if energy.min() < enough_light:
-        # The field with the least light decides which stamp suffices.
+        # The field with the least light decides which stamp is large enough.
         worst_field = int(energy.argmin())
         x, y = np.rad2deg(fields.field[worst_field])
         # Stamps up to four times as wide are tried.
-        sufficient_px = _sufficient_stamp_px(config, worst_field, 4 * side, enough_light)
+        sufficient_px = _find_stamp_px(config, worst_field, 4 * side, enough_light)
         advice = (
             f"framing.stamp_px={sufficient_px} contains {enough_light:.0%} everywhere"
             if sufficient_px
@@ -238,12 +241,12 @@ def stamp_warnings(
     return warnings
 
 
-def _sufficient_stamp_px(
+def _find_stamp_px(
     config: Config, worst_field: int, max_px: int, enough_light: float
 ) -> int | None:
-    """Return the smallest even stamp with enough light of the field that needs the largest one.
+    """Return the side of the smallest even stamp with enough light of a field.
 
-    None if there is none up to `max_px`, or if the PSF cannot be computed on such a stamp.
+    None if it would be larger than `max_px`, or if the PSF cannot be computed on such a stamp.
 
     Parameters
     ----------
@@ -285,13 +288,14 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
     config : Config
         Stage configuration of `templates`.
     fields : FieldOfPsfs
+        Static PSFs and their shapes.
     path : Path
         FITS file.
     """
     from astropy.io import fits
     from astropy.table import Table
 
-    # Primary HDU: the PSFs, with what a reader needs to place their pixels on the sky.
+    # Primary HDU: the PSFs, with the scale of their pixels on the sky.
     telescope = config.telescope
     cube = fits.PrimaryHDU(fields.psf.astype(np.float32))
     for card in (
@@ -303,7 +307,7 @@ def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
         ("CREATOR", f"psfdae {__version__}", ""),
     ):
         cube.header.append(card)
-    # Table of the fields; names say no units, which FITS has beside them.
+    # Table of the fields; units are in the header, not in the names.
     names = {"fwhm_arcsec": "fwhm", "position_angle_deg": "position_angle"}
     rows = fields.table.drop(columns="pupil_samples").rename(columns=names)
     rows.insert(0, "id", np.arange(len(rows)))
@@ -317,8 +321,8 @@ def write_image(
 ) -> None:
     """Write an image with one noisy star per field, and its catalogue.
 
-    The stars are close together, with 8 px of sky between their stamps. Their order on the
-    detector is that of the field, and the catalogue has their field angles. Their flux is
+    The stars are close together, with 8 px of sky between their stamps. They have the same order on
+    the detector as in the field, and the catalogue has their field angles. Their flux is
     F = snr √(B A), with the sky B and the noise-equivalent area A of the mean PSF (King 1983,
     PASP 95, 163): the S/N of a matched filter that is limited by the sky.
 
@@ -327,9 +331,11 @@ def write_image(
     config : Config
         Stage configuration of `templates`.
     fields : FieldOfPsfs
+        Static PSFs, each of which becomes a star.
     snr : float
-        > 0.
+        Signal-to-noise ratio of each star, > 0.
     seed : int
+        Seed of the photon noise.
     path, catalogue : Path
         FITS image and CSV file.
     """
@@ -337,20 +343,20 @@ def write_image(
     stamps, _ = normalise_flux(fields.psf.astype(np.float64))
     sky = 1000.0  # photons per pixel
     flux = snr * np.sqrt(sky * noise_equivalent_px(stamps.mean(axis=0)))
-    # Expected photons: sky, and the stars at the positions of their field points.
-    # 8 px of sky between stamps.
+    # Expected photons: sky, and the stars at the positions of their field points, with 8 px of sky
+    # between stamps.
     pitch = stamps.shape[-1] + 8
-    # The detector has a place for each field of the square grid.
+    # The detector has a cell for each field of the square grid.
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
-    expected = np.full((int(rows) * pitch, int(columns) * pitch), sky)
-    add_stamps(expected, flux * stamps, x, y)
-    # Photon noise is all the noise: a gain of 1 and no read noise.
+    expected_photons = np.full((int(rows) * pitch, int(columns) * pitch), sky)
+    add_stamps(expected_photons, flux * stamps, x, y)
+    # Photon noise only: a gain of 1, without read noise.
     rng = stream(seed, "simulated image", config.telescope.name)
     write_field(
         path,
         catalogue,
-        rng.poisson(expected).astype(np.float32),
+        rng.poisson(expected_photons).astype(np.float32),
         x,
         y,
         pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
@@ -372,13 +378,13 @@ def write_example_field(
 ) -> None:
     """Simulate an image of a star field with its star list, as an example.
 
-    The list is what a catalogue of the image would have: numbers, pixel and sky coordinates of all
-    stars but the faint halves of blends. The same seed gives the same image.
+    The list is like a catalogue of the image: numbers, pixel and sky coordinates of all stars
+    except the faint halves of blends. The same seed gives the same image.
 
     Parameters
     ----------
     seed : int
-        Seed of the places, fluxes and noise of the stars.
+        Seed of positions, fluxes and noise of the stars.
     catalogue : Path
         CSV file for the star list.
     side : int
@@ -395,7 +401,7 @@ def write_example_field(
 
 
 def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> ExampleField:
-    """Write a simulated image and its star list; `attributes` are those of `FieldRecipe`.
+    """Write a simulated image and its star list; `attributes` are fields of `FieldRecipe`.
 
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
@@ -405,19 +411,18 @@ def write_example(out: Path, catalogue: Path, seed: int, **attributes: int) -> E
     out, catalogue : Path
         FITS image, in counts, and CSV list.
     seed : int
-        Seed of places, fluxes and noise of the stars.
+        Seed of positions, fluxes and noise of the stars.
     **attributes
         Fields of `FieldRecipe`, such as `side_px=600` or `bright=80`.
 
     Returns
     -------
     ExampleField
-        The image with the true place, flux and PSF of every star.
+        The image with the true position, flux and PSF of every star.
     """
-    # Sizes and numbers of stars as asked for; all else as the recipe says.
+    # The recipe with the given sizes and numbers of stars.
     recipe = FieldRecipe(**attributes)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulate_field(recipe, seed)
-    # Positions of all stars, in pixels.
     x, y = field.centroid.T
     write_field(
         *(out, catalogue, field.image.astype(np.float32), x, y),
@@ -436,7 +441,7 @@ def example_night(
 ) -> None:
     """Simulate a night of a telescope, with bad images among them, as an example.
 
-    truth.csv has a row for each image: what is wrong with it, and FWHM and ellipticity of its PSF
+    truth.csv has a row for each image: its fault if it has one, FWHM and ellipticity of its PSF
     in the middle and in the corners, without clouds or trail. reference.csv has the stars with
     their magnitudes, telescope.yaml the telescope. The same seed gives the same images.
 
@@ -452,11 +457,11 @@ def example_night(
     import pandas as pd
 
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
-    stars = reference_stars(recipe, seed)
+    stars = simulate_reference_stars(recipe, seed)
     write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
-    write_text(out / "telescope.yaml", as_yaml(telescope_of(recipe.field)))
+    write_text(out / "telescope.yaml", as_yaml(describe_telescope(recipe.field)))
     rows: list[dict[str, object]] = []
-    for number, (counts, cards, truth) in enumerate(simulated_night(recipe, stars, seed)):
+    for number, (counts, cards, truth) in enumerate(simulate_night(recipe, stars, seed)):
         path = out / f"exposure_{number:03d}.fits"
         write_cube(path, counts, **cards)
         # Half of the file is lost, as when a disk is full.

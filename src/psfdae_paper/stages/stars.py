@@ -1,8 +1,8 @@
 """Stages `templates` and `stars`: static PSFs, and noise-free stars with both references.
 
-In go settings of a scene; out come HDF5 products with stamps of flux 1: the static PSF of every
-field point, and single stars, each with its own noise-free image (realisation) and the static PSF
-of its field (template). Noise is added later, by the stages that need it.
+Input: settings of a scene. Outputs: HDF5 products with stamps of flux 1, namely the static PSF of
+every field point, and single stars, each with its own noise-free image (realisation) and the static
+PSF of its field (template). Noise is added later, by the stages that need it.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ def templates(config: Config, out: File) -> None:
     A PSF is the fraction of the light on each pixel. Its brightest pixel is in the middle, and it
     has a margin, from which stamps with any centring error are cut.
 
-    The product also has the light inside each stamp, the place of the brightest pixel, the angle of
-    each field point in radians, and the number of pupil samples.
+    The product also has the light inside each stamp, the position of the brightest pixel, the angle
+    of each field point in radians, and the number of pupil samples.
 
     Parameters
     ----------
+    config : Config
+        Scene, telescope, framing, grid, wavefront and optics.
     out : Path
         HDF5 product with the static PSF of every field point.
     """
     limit_threads(1)  # batches run in parallel
-    # PSFs have a margin, from which stamps with any centring error are cut.
     framing = config.framing
     # Wavefront of each field, and its image around the brightest pixel.
     source = template_wavefronts(config)
@@ -75,10 +76,12 @@ def stars(config: Config, templates: File, out: File) -> None:
     stamp of flux 1 with the same centring error, and the random numbers that made it.
 
     Without random aberrations (stars.aberration_fraction = 0) realisations and templates are the
-    same. Noise is no part of the product: each stage draws it for the noise levels that it needs.
+    same. The product is without noise: each stage draws it for the noise levels that it needs.
 
     Parameters
     ----------
+    config : Config
+        Settings of the simulation, with seed and number of stars.
     templates : Path
         Product of the stage templates.
     out : Path
@@ -98,7 +101,7 @@ def stars(config: Config, templates: File, out: File) -> None:
     phase = np.zeros((count, 2))
     if framing.subpixel:
         phase = draw_phase(count, stream(config.seed, "phase", name))
-    # Stars of a set, each on a stamp of d × d pixels.
+    # All stars, each on a stamp of d × d pixels.
     shape = (count, framing.stamp_px, framing.stamp_px)
     columns: dict[str, Column | Empty] = {
         "template": Empty(shape, np.float32, "1", "static PSF, sum 1"),
@@ -134,10 +137,10 @@ def stars(config: Config, templates: File, out: File) -> None:
             # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.
-            framed = static["psf"][star_field[part]].astype(np.float64)
-            cropped = crop_jittered(framed, jitter[part], framing.jitter_px)
-            arrays = dict(zip(("template", "energy"), normalise_flux(cropped), strict=True))
-            # The star's own image: its light inside the stamp is that of the realisation.
+            static_psfs = static["psf"][star_field[part]].astype(np.float64)
+            jittered_psfs = crop_jittered(static_psfs, jitter[part], framing.jitter_px)
+            arrays = dict(zip(("template", "energy"), normalise_flux(jittered_psfs), strict=True))
+            # The star's own image; the light inside the stamp refers to the realisation.
             if propagation is not None:
                 stamps, peak = propagation.framed(framing.stamp_px, jitter[part], part, phase[part])
                 arrays["realisation"], arrays["energy"] = normalise_flux(stamps)

@@ -1,18 +1,17 @@
 """Stages `sweep list` and `sweep point`: the points of a sweep, and one of its trainings.
 
-In go the name of a sweep, that of one of its points and the data that it is trained and tested
-on. Out come `result.json` with its metrics, its tables of errors, what it cost, and
-the files of the trained model.
+Inputs: the names of a sweep and of one of its points, and the data that it is trained and tested
+on. Outputs: `result.json` with its metrics, its tables of errors, its cost, and the files of the
+trained model.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 import click
@@ -27,14 +26,14 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value
-from psfdae_paper.sweeps.measured import Measured, Task, Training
-from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, with_values
+from psfdae_paper.sweeps.measurement import Measurement, Task
+from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, set_values
 
 
-def training_class(model: str) -> str:
-    """Return module and name of the class that trains and measures a model, as MODULE:NAME.
+def training_module(model: str) -> str:
+    """Return the name of the module that trains and measures a model.
 
-    It is imported by this name: the code of a point does not include that of the other kind.
+    It is imported by this name, so that the code of a point does not include the other kind.
 
     Parameters
     ----------
@@ -42,8 +41,8 @@ def training_class(model: str) -> str:
         Name of a method, or of a network of scene 3.
     """
     if model in swept_networks():
-        return "psfdae_paper.stages.network_point:StateNetworkTraining"
-    return "psfdae_paper.stages.method_point:MethodTraining"
+        return "psfdae_paper.stages.network_point"
+    return "psfdae_paper.stages.method_point"
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Trial:
     search : dict
         space, seed, startup, metric and direction of the sweep.
     earlier_points : sequence of str
-        Names of the points from whose results it learns.
+        Names of the points on whose results it depends.
     """
 
     slot: int
@@ -90,33 +89,37 @@ def sweep_point(
 ) -> None:
     """Train one point of a sweep and measure it.
 
-    A point is named by the hash of all that decides its result, and found by the name of OUT; give
+    The name of a point is the hash of everything that decides its result, and the name of OUT; give
     the overrides with which the sweep was planned. `psfdae paper sweep list NAME` prints the
     points.
 
-    The folder gets result.json with metrics and settings, cost.json with seconds, tables of errors,
-    and the files of the model. A training that fails is a result, too.
+    The folder receives result.json with metrics and settings, cost.json with seconds, tables of
+    errors, and the files of the model. A training that fails is a result, too.
 
     Parameters
     ----------
+    name : str
+        Name of the sweep, a file of config/sweep.
     data : sequence of pairs
         Role and product: stars; for scene 3 states, validation and test.
     checkpoint : Path
         State of an interrupted training.
     out : Path
         Folder for the point's files; its name is the point's.
+    overrides : sequence of str
+        Words of Hydra with which the sweep was planned.
     """
     plan = plan_sweep(name, overrides)
     sweep = plan.sweep
-    # A misspelt folder, or overrides other than those of the plan.
+    # A misspelt folder, or other overrides than in the plan.
     if out.name not in plan.points:
         raise SweepError(f"{out}: sweep {name} has no point {out.name}")
     entry = plan.points[out.name]
-    # Networks of scene 3 choose between epochs on states of their own; methods split their stars.
+    # Networks of scene 3 have separate validation and test states; methods split their stars.
     roles = {"states", "validation", "test"} if sweep.model in swept_networks() else {"stars"}
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {sweep.model} needs {', '.join(sorted(roles))}")
-    # Networks of scene 3 have no dataset; tables have their name in its place.
+    # For networks of scene 3, tables have the name of the network as dataset.
     dataset = sweep.dataset or sweep.model
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
     # An adaptive sweep proposes values for a trial when it runs.
@@ -138,9 +141,8 @@ def point(
 ) -> None:
     """Train and measure one point; leave `result.json`, `cost.json` and the model's files.
 
-    A training that cannot go on (not finite, or dead in all its starts) is a result, too: status
-    failed, with the reason. `result.json` is written last; nothing in it differs between two
-    runs.
+    A training that cannot continue (not finite, or dead in all its starts) is a result, too, with
+    the status failed and the reason. `result.json` is written last, and is the same in every run.
 
     Parameters
     ----------
@@ -149,10 +151,11 @@ def point(
     model : str
         Name of a method, or of a network of scene 3.
     values : mapping
-        Value of every axis; those of a trial are proposed here.
+        Value of every axis; values of a trial are proposed here.
     keys : mapping
         Configuration keys that differ from the dataset's.
     task : Task
+        Data, noise levels, and the folder for the results.
     trial : Trial, optional
         Trial of an adaptive sweep.
 
@@ -174,14 +177,14 @@ def point(
         adaptive = import_module("psfdae_paper.sweeps.adaptive")
         values = adaptive.ask(space, trial.search, trial.slot, earlier_results)
         trial_keys = changes(space, values)
-        tree = with_values(config.model_dump(), trial_keys)
+        tree = set_values(config.model_dump(), trial_keys)
         config, keys = parse_settings(type(config), tree), {**keys, **trial_keys}
-    # No file of an earlier training may stay beside the new ones.
-    training: Training = resolve_name(training_class(model))(config, task, model)
-    for name in (*training.files, *task.tables.values(), "cost.json", "result.json"):
+    # Files of an earlier training are removed.
+    training = import_module(training_module(model))
+    for name in (*training.list_files(model), *task.tables.values(), "cost.json", "result.json"):
         (task.folder / name).unlink(missing_ok=True)
-    outcome = _train(training)
-    # Metrics and settings only: what a point cost is in a file of its own.
+    outcome = _train(lambda: training.measure(config, task, model), config, task)
+    # Metrics and settings only: the cost of a point is in a file of its own.
     result = {
         "point": task.folder.name,
         "slot": trial.slot if trial else None,
@@ -196,42 +199,44 @@ def point(
     write_text(task.folder / "result.json", json.dumps(result, indent=1) + "\n")
 
 
-def _train(training: Training) -> dict[str, object]:
-    """Train and measure a point, and write what it cost.
+def _train(measure: Callable[[], Measurement], config: Config, task: Task) -> dict[str, object]:
+    """Train and measure a point, and write its cost.
+
+    Parameters
+    ----------
+    measure : callable
+        Trains and measures the point.
+    config : Config
+        Configuration of the point, which is recorded if the training fails.
+    task : Task
+        Its folder receives `cost.json`.
 
     Returns
     -------
     dict
         status, reason, epochs, attempt, metrics and config.
-
-    Parameters
-    ----------
-    training : Training
-        Its folder gets `cost.json`.
     """
-    task = training.task
     # The duration of a training that fails is its cost, too.
-    started, started_cpu = time.monotonic(), time.process_time()
+    start_s, start_cpu_s = time.monotonic(), time.process_time()
     status, reason = "finished", ""
     try:
-        measured = training.measure()
-        status = "stopped" if measured.stopped else "finished"
+        measurement = measure()
+        status = "stopped" if measurement.is_stopped else "finished"
     except FitError as error:
-        # A training that cannot go on is a result: the point has no metrics.
+        # A training that cannot continue is a result without metrics.
         status, reason = "failed", str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
         task.checkpoint.unlink(missing_ok=True)
-        seconds, cpu_seconds = time.monotonic() - started, time.process_time() - started_cpu
-        config = training.config.model_dump()
-        measured = Measured({}, config, seconds, cpu_seconds, attempt=None)
+        seconds, cpu_seconds = time.monotonic() - start_s, time.process_time() - start_cpu_s
+        measurement = Measurement({}, config.model_dump(), seconds, cpu_seconds, attempt=None)
     # The cost differs from run to run and has a file of its own; times are to a millisecond.
-    cost = {key: round(getattr(measured, key), 3) for key in ("seconds", "cpu_seconds")}
+    cost = {key: round(getattr(measurement, key), 3) for key in ("seconds", "cpu_seconds")}
     write_text(task.folder / "cost.json", json.dumps(cost) + "\n")
     return {
         "status": status,
         "reason": reason,
-        "epochs": measured.epochs,
-        "attempt": measured.attempt,
-        "metrics": measured.metrics,
-        "config": measured.described,
+        "epochs": measurement.epochs,
+        "attempt": measurement.attempt,
+        "metrics": measurement.metrics,
+        "config": measurement.config,
     }

@@ -1,7 +1,7 @@
 """Stages `sweep summary`, `sweep figure` and `best`: tables and figures of a sweep's points.
 
-In go the results of all points; out come their table, the best point as overrides, what each
-training cost, and two figures. Errors on the test part choose nothing.
+Input: the results of all points. Outputs: their table, the best point as overrides, the cost of
+each training, and two figures. The best point is chosen without errors on the test part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from psfdae.base.reading import read_json, read_table, read_yaml
 from psfdae.base.settings import as_overrides
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation import sweep_figures
-from psfdae_paper.sweeps.measured import read_cost
+from psfdae_paper.sweeps.measurement import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
 
 
@@ -40,15 +40,19 @@ def sweep_summary(
 
     Parameters
     ----------
+    name : str
+        Name of the sweep, a file of config/sweep.
     points : Path
         Folder with a folder for each point.
     out : Path
         Folder for summary.csv, cost.csv, best.yaml and sweep.yaml.
+    overrides : sequence of str
+        Words of Hydra with which the sweep was planned.
     """
     plan = plan_sweep(name, overrides)
-    # Points in the order of the plan, whatever the order in which they ended.
+    # Points in the order of the plan, not in the order in which they ended.
     files = [points / point / "result.json" for point in plan.points]
-    summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
+    tabulate_points(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
 
 
 @command("paper best")
@@ -57,13 +61,15 @@ def best(name: Annotated[str, {"argument": True}], results: Folder = Path("resul
 
     Parameters
     ----------
+    name : str
+        Name of the sweep.
     results : Path
         Folder that the workflow writes to.
     """
     print(" ".join(best_overrides(results, name)))
 
 
-def summary(
+def tabulate_points(
     name: str,
     definition: Mapping[str, Any],
     overrides: Sequence[str],
@@ -97,13 +103,13 @@ def summary(
     results = [read_json(path) for path in points]
     best_result = choose(results, definition["metric"], definition["direction"])
     if best_result is None:
-        failed = f"{results[0]['point']}: {results[0]['reason']}"
-        raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
-    # Metrics are the same in every run of a point; what it cost is in a table of its own.
+        reason = f"{results[0]['point']}: {results[0]['reason']}"
+        raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {reason}")
+    # Metrics are the same in every run of a point; its cost is in a table of its own.
     rows = []
     for result in results:
-        values = {name: result["values"][name] for name in definition["space"]}
         # A value of an axis may be a list, which is one cell of the table as JSON.
+        values = {axis: result["values"][axis] for axis in definition["space"]}
         values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
         outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
         outcome["best"] = "yes" if result is best_result else "no"
@@ -114,11 +120,11 @@ def summary(
         for result, path in zip(results, points, strict=True)
     ]
     write_text(out / "cost.csv", pd.DataFrame(costs).to_csv(index=False))
-    described = {"sweep": name, "given": list(overrides), **definition}
-    # Unsorted: the order of the axes is that of the figures.
-    write_text(out / "sweep.yaml", yaml.safe_dump(described, sort_keys=False))
-    # The best point as overrides, those of the workflow before those of the point. The preset has a
-    # key of its own, because `make reproduce` takes it separately.
+    sweep_tree = {"sweep": name, "given": list(overrides), **definition}
+    # Unsorted: the order of the axes is used in the figures.
+    write_text(out / "sweep.yaml", yaml.safe_dump(sweep_tree, sort_keys=False))
+    # The best point as overrides: first of the workflow, then of the point. The preset has a key of
+    # its own, because `make reproduce` takes it separately.
     preset = "preset="
     point_overrides = [word.removeprefix("++") for word in as_overrides(best_result["keys"])]
     best_point = {
@@ -167,15 +173,15 @@ def best_overrides(results: Path, name: str) -> list[str]:
     name : str
         Name of the sweep.
 
-    Raises
-    ------
-    ProductError
-        If the sweep has not been run.
-
     Returns
     -------
     list of str
         Words for `make reproduce SET="…"`.
+
+    Raises
+    ------
+    ProductError
+        If the sweep has not been run.
     """
     path = results / "sweeps" / name / "best.yaml"
     if not path.is_file():
@@ -201,6 +207,8 @@ def sweep_figure(
 
     Parameters
     ----------
+    kind : str
+        Which of the two figures.
     definition : Path
         sweep.yaml of the command `sweep summary`.
     table : Path
@@ -208,13 +216,13 @@ def sweep_figure(
     out : Path
         PNG.
     """
-    described = read_yaml(definition)
+    sweep_tree = read_yaml(definition)
     # Axes as text: they may be numbers or names of options.
-    table_of_points = read_table(table, dtype=dict.fromkeys(described["space"], str))
-    points = sweep_figures.SweepPoints(table_of_points, described)
+    table_of_points = read_table(table, dtype=dict.fromkeys(sweep_tree["space"], str))
+    points = sweep_figures.SweepPoints(table_of_points, sweep_tree)
     # Both figures take the same points.
     draw = {
-        "parallel": sweep_figures.parallel_coordinates,
-        "response": sweep_figures.response_curves,
+        "parallel": sweep_figures.draw_parallel_coordinates,
+        "response": sweep_figures.draw_response_curves,
     }[kind]
     write_png(draw(points), out)

@@ -56,7 +56,7 @@ class FieldRecipe:
 
 @dataclass(frozen=True)
 class ExampleField:
-    """A simulated exposure with the true place, flux and PSF of its n stars."""
+    """A simulated exposure with the true position, flux and PSF of its n stars."""
 
     image: np.ndarray  # counts, uint16
     position: np.ndarray  # (n, 2), x, y of the chief ray, 0-based pixel centres
@@ -122,6 +122,8 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
+    recipe : FieldRecipe
+        Optics, seeing, pixel scale and size of the stamps.
     position : ndarray, shape (n, 2)
         (x, y) in pixels.
 
@@ -156,10 +158,10 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
         rows = np.exp(-2j * np.pi * np.fft.fftfreq(fine) * subpixels[:, 1, None])
         columns = np.exp(-2j * np.pi * np.fft.rfftfreq(fine) * subpixels[:, 0, None])
         phase = rows[:, :, None] * columns[:, None, :]
-        blurred = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
+        blurred_stamps = np.fft.irfft2(np.fft.rfft2(sharp) * blur * phase, s=(fine, fine))
         # Sum of the sub-pixels of each pixel, without ripples below 0, of flux 1.
-        binned = blurred.reshape(len(part), side, oversampling, side, oversampling)
-        pixels = np.clip(binned.sum(axis=(2, 4)), 0.0, None)
+        sub_pixels = blurred_stamps.reshape(len(part), side, oversampling, side, oversampling)
+        pixels = np.clip(sub_pixels.sum(axis=(2, 4)), 0.0, None)
         stamps[part] = pixels / pixels.sum(axis=(1, 2), keepdims=True)
     return stamps
 
@@ -167,7 +169,7 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
 def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
     """Add stamps (n, d, d) to an image, in place, without pixels that are off the image.
 
-    The stamp's pixel (d/2, d/2) goes to the pixel nearest to the 0-based position.
+    The stamp's pixel (d/2, d/2) is added to the pixel nearest to the 0-based position.
     """
     side = stamps.shape[-1]
     rows = central_pixel(y)[:, None, None] - side // 2 + np.arange(side)[:, None]
@@ -220,9 +222,11 @@ def write_field(
         Files to write: the image, and its list with the columns id, X_IMAGE, Y_IMAGE (1-based, as
         in SExtractor), ra and dec (degrees).
     image : ndarray, shape (h, w)
+        Counts.
     x, y : ndarray, shape (n,)
         0-based positions of the stars.
     pixel_scale_arcsec : float
+        Width of a pixel on the sky.
     columns : mapping of str to ndarray, shape (n,), optional
         Further columns of the list, by name.
     **cards

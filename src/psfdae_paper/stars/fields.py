@@ -38,7 +38,7 @@ def relative_field(grid: Grid) -> np.ndarray:
 def assign_fields(count: int, fields: int, rng: np.random.Generator) -> np.ndarray:
     """Return a field for every star: a random permutation of k mod `fields`, k < `count`.
 
-    All fields have equally many stars, up to one. Integers, shape (count,).
+    Numbers of stars in different fields differ by at most one. Integers, shape (count,).
     """
     return rng.permutation(np.arange(count) % fields)
 
@@ -54,7 +54,7 @@ def perturb(
 
     The paper (section 3.1) gives "variance of different percentage"; `fraction` is read
     as a standard deviation. The jitter also moves terms that vanish, such as focus on the
-    optical axis. All draws are independent; Seidel coefficients are those of H = 1.
+    optical axis. All draws are independent; Seidel coefficients are given at H = 1.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def perturb(
     ndarray, shape (n, J)
         Coefficients in waves.
     """
-    perturbed = coefficients * (1.0 + fraction * factors.standard_normal(coefficients.shape))
+    result = coefficients * (1.0 + fraction * factors.standard_normal(coefficients.shape))
     if jitter_waves and shifts:
-        perturbed = perturbed + jitter_waves * shifts.standard_normal(coefficients.shape)
-    return perturbed
+        result = result + jitter_waves * shifts.standard_normal(coefficients.shape)
+    return result

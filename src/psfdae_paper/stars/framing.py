@@ -1,8 +1,8 @@
 """Framing: from wavefronts to stamps around their brightest pixels.
 
-In goes a source of wavefronts, made by a scene; out come stamps, each with its brightest pixel in
-the middle up to a centring error, and normalised to flux 1. `Propagation` has the propagation and
-the search for the brightest pixel, which all stages share.
+A scene makes a source of wavefronts; these become stamps, each with its brightest pixel in the
+middle up to a centring error, and normalised to flux 1. `Propagation` has the propagation and the
+search for the brightest pixel, which all stages share.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ def brightest_pixel(image: np.ndarray, tie: float) -> tuple[int, int]:
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Light on each pixel.
     tie : float
         Relative tolerance below the maximum.
 
@@ -57,12 +58,13 @@ def brightest_pixel(image: np.ndarray, tie: float) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def contested_pixels(images: np.ndarray, tie: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_contested(images: np.ndarray, tie: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the pixels that compete for the maximum of search images in single precision.
 
     Parameters
     ----------
     images : ndarray, shape (B, h, h)
+        Search images.
     tie : float
         Relative tolerance below the maximum, as for `brightest_pixel`.
 
@@ -71,13 +73,13 @@ def contested_pixels(images: np.ndarray, tie: float) -> tuple[np.ndarray, np.nda
     image, row, column : ndarray of int, shape (K,)
         Pixels of images that have more than one candidate; a single candidate needs no check.
     """
-    # A search image errs by 8e-5 of its maximum at most (256 stars each of scene 1 at 10 and
-    # 50 %, and of scene 2): a pixel that is 1e-3 below a tie with the maximum may still be the
+    # A search image has an error of at most 8e-5 of its maximum (256 stars each of scene 1 at 10
+    # and 50 %, and of scene 2): a pixel that is 1e-3 below a tie with the maximum may still be the
     # brightest.
     threshold = (1.0 - tie) * (1.0 - 1e-3)
-    shortlisted = images >= threshold * images.max(axis=(1, 2), keepdims=True)
-    contested = shortlisted.sum(axis=(1, 2)) > 1
-    image, row, column = np.nonzero(shortlisted & contested[:, None, None])
+    is_candidate = images >= threshold * images.max(axis=(1, 2), keepdims=True)
+    is_contested = is_candidate.sum(axis=(1, 2)) > 1
+    image, row, column = np.nonzero(is_candidate & is_contested[:, None, None])
     return image, row, column
 
 
@@ -90,6 +92,8 @@ def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.nda
         Brightest pixel at index d/2 + margin.
     jitter : ndarray of int, shape (B, 2) or (2,)
         (row, column) by which the brightest pixel moves in the stamp, |jitter| ≤ margin.
+    margin : int
+        Pixels around the stamp on each side.
 
     Returns
     -------
@@ -163,14 +167,20 @@ class Propagation:
     Parameters
     ----------
     source : WavefrontSource
-    telescope, optics, framing : config groups
+        Wavefronts of all stars.
+    telescope : Telescope
+        Obscuration, pixel scale, and seeing if it has one.
+    optics : Optics
+        Pupil samples, precision, batch size and threads.
+    framing : Framing
+        Size of the stamps, largest centring error and tolerance of equal maxima.
     search_px : int
         The brightest pixel is searched within ± this distance of the chief ray.
 
     Raises
     ------
     SamplingError
-        If the largest grid size is below what a wavefront needs.
+        If a wavefront needs more samples than the largest grid has.
     """
 
     def __init__(
@@ -204,15 +214,15 @@ class Propagation:
                 )
         # The smallest pupil grid without aliasing within ± edge, from the wavefront's slopes.
         slopes = source.slopes()
-        needed = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
-        self.samples = choose_samples(needed, tuple(optics.pupil_samples))
+        min_samples = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
+        self.samples = choose_samples(min_samples, tuple(optics.pupil_samples))
         self._centre, self._reach = search_windows(slopes, pixel, search_px)
         self._pupils: dict[int, Pupil] = {}
 
     def stamps(
         self, stamp_px: int, offset_px: np.ndarray, stars: np.ndarray | None = None
     ) -> np.ndarray:
-        """Propagate wavefronts to pixel-integrated stamps at given places of the focal plane.
+        """Propagate wavefronts to pixel-integrated stamps at given positions in the focal plane.
 
         Parameters
         ----------
@@ -254,7 +264,7 @@ class Propagation:
         """Return stamps that have their brightest pixel in the middle, up to a centring error.
 
         Pixel j of the focal plane spans j … j + 1 pixels from the chief ray. The
-        brightest one goes to the 0-based index (side/2, side/2) + `jitter` (`side` even),
+        brightest one is placed at the 0-based index (side/2, side/2) + `jitter` (`side` even),
         so the centre of the stamp is `peak` − `jitter` from the chief ray.
 
         Parameters
@@ -263,11 +273,15 @@ class Propagation:
             Side of a stamp in pixels.
         jitter : ndarray of int, shape (B, 2)
             Centring error (row, column) in pixels.
-        stars, phase_px : as for `brightest`
+        stars : ndarray of int, shape (B,), optional
+            The wavefronts; all of the source by default.
+        phase_px : ndarray, shape (B, 2), optional
+            Displacement of the pixel grid (row, column), as for `brightest`.
 
         Returns
         -------
         stamps : ndarray, shape (B, side, side), float64
+            Fraction of the light through the pupil on each pixel.
         peak : ndarray of int, shape (B, 2)
             The brightest pixels.
         """
@@ -340,9 +354,11 @@ class Propagation:
         Parameters
         ----------
         stars : ndarray of int, shape (B,)
+            Numbers of the wavefronts.
         phase_px : ndarray, shape (B, 2)
             (row, column) of the window's centre from the chief ray.
         reach : int
+            Half the side of the windows, in pixels.
 
         Returns
         -------
@@ -363,7 +379,7 @@ class Propagation:
                 image = search(opd, phase if phase.any() else None)
                 # Pixels that compete for the maximum are computed exactly. The centre of pixel j
                 # is at j + 1/2 pixels; a one-pixel stamp is centred there.
-                star, row, column = contested_pixels(image, tie)
+                star, row, column = find_contested(image, tie)
                 offsets = np.stack([row, column], axis=1) - reach + 0.5 + phase[star]
                 exact_values = np.empty(star.size)
                 for start in range(0, star.size, self.optics.batch):
@@ -390,7 +406,7 @@ class Propagation:
     def _run(
         self, stars: np.ndarray, prepare: Callable[[int], Callable[[np.ndarray], None]]
     ) -> None:
-        """Process wavefronts in batches of one grid size, with what `prepare` makes for it."""
+        """Process wavefronts in batches of one grid size, by the function from `prepare`."""
         # torch has threads of its own, inside every product.
         threads = 1 if self.optics.backend == "torch" else self.optics.threads
         in_batches(self.samples[stars], self.optics.batch, threads, prepare)
@@ -405,7 +421,7 @@ class Propagation:
         return StampPropagator(*geometry, extra, precision, self.optics.backend)
 
 
-def without_margin(templates: Product) -> np.ndarray:
+def cut_margin(templates: Product) -> np.ndarray:
     """Return static PSFs as they are in stamps without centring error, shape (F, d, d)."""
     # Templates have a margin on every side, from which a stamp is cut with any centring error.
     margin = templates.config["framing"]["jitter_px"]

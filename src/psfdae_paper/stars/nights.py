@@ -1,9 +1,9 @@
-"""A simulated night of a telescope with its truth, and the places at which PSFs are measured.
+"""A simulated night of a telescope with its truth, and the positions at which PSFs are measured.
 
-In go a recipe and a seed; out come exposures of two fields, some minutes apart. The seeing follows
-the airmass and wanders; the focus runs away until the observer mends it; each exposure is pointed a
-little differently. Five exposures are bad: two through clouds, one trailed, one with the shutter
-closed, and one of which the file is cut short.
+A recipe and a seed give exposures of two fields, some minutes apart. The seeing follows the airmass
+and drifts; the focus drifts until the observer corrects it; each exposure is pointed a little
+differently. Five exposures are bad: two through clouds, one trailed, one with the shutter closed,
+and one whose file is truncated.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PLACES = {
     "upper_left": (0.1, 0.9),
     "upper_right": (0.9, 0.9),
 }
-"""Places where the PSF of an image is measured: x and y over the numbers of columns and rows."""
+"""Positions where the PSF of an image is measured: x and y over numbers of columns and rows."""
 
 FAULTS = {
     0.14: "clouds",
@@ -46,7 +46,7 @@ FAULTS = {
     0.74: "clouds",
     0.87: "no stars",
 }
-"""Fault of the exposure after this part of the night."""
+"""Fault of the exposure after this fraction of the night."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class NightRecipe:
     )
     minutes: float = 3.0  # from one exposure to the next
     dither_px: float = 12.0  # largest offset of a pointing along either axis
-    # The focus runs away between these parts of the night, by so many waves W020 at the edge of
-    # the pupil, and is mended then.
+    # The focus drifts between these fractions of the night, by this many waves W020 at the edge of
+    # the pupil, and is then corrected.
     focus_drift: tuple[float, float] = (0.3, 0.7)
     focus_waves: float = 0.6
     extinction_mag: float = 0.15  # per airmass
@@ -77,15 +77,15 @@ class NightRecipe:
     trail_px: float = 8.0
 
 
-def positions_of_places(image_px: tuple[int, int]) -> np.ndarray:
-    """Return x and y (5, 2) of `PLACES` in an image of so many columns and rows.
+def locate_places(image_px: tuple[int, int]) -> np.ndarray:
+    """Return x and y (5, 2) of `PLACES` in an image of `image_px` columns and rows.
 
-    They are in the middle of a pixel, so that sizes do not depend on a phase.
+    They are at centres of pixels, so that sizes do not depend on the sub-pixel phase.
     """
     return np.asarray(np.rint(np.array(list(PLACES.values())) * (np.array(image_px) - 1)))
 
 
-def shapes_at_places(
+def measure_places(
     psf_at: Callable[[np.ndarray], np.ndarray], image_px: tuple[int, int], prefix: str = ""
 ) -> dict[str, float]:
     """Return FWHM (px) and ellipticity of the PSF at `PLACES`, by names such as `fwhm_px_centre`.
@@ -99,7 +99,7 @@ def shapes_at_places(
     prefix : str
         Begins each name.
     """
-    shapes = measure_shapes(psf_at(positions_of_places(image_px)))
+    shapes = measure_shapes(psf_at(locate_places(image_px)))
     return {
         f"{prefix}{name}_{place}": float(value)
         for name, values in (("fwhm_px", shapes.fwhm_px), ("ellipticity", shapes.ellipticity))
@@ -107,7 +107,7 @@ def shapes_at_places(
     }
 
 
-def telescope_of(recipe: FieldRecipe) -> dict[str, object]:
+def describe_telescope(recipe: FieldRecipe) -> dict[str, object]:
     """Return the telescope of an exposure in focus, as a file of config/telescope describes it.
 
     Seidel terms are sums of Zernike terms: with Noll's normalisation, ρ² = Z4/(2√3) + …,
@@ -147,11 +147,11 @@ def telescope_of(recipe: FieldRecipe) -> dict[str, object]:
     }
 
 
-def reference_stars(recipe: NightRecipe, seed: int) -> Table:
+def simulate_reference_stars(recipe: NightRecipe, seed: int) -> Table:
     """Return the stars of the night's two fields.
 
     Columns are the number of the field, pixel position (x, y) without a dither, sky position (ra,
-    dec) in degrees, and magnitude, that of one count being 25.
+    dec) in degrees, and magnitude with zero point 25 for one count.
     """
     from astropy.table import Table, vstack
 
@@ -169,7 +169,7 @@ def reference_stars(recipe: NightRecipe, seed: int) -> Table:
     return vstack(fields)
 
 
-def simulated_night(
+def simulate_night(
     recipe: NightRecipe, stars: Table, seed: int
 ) -> Iterator[tuple[np.ndarray, dict[str, str | float], dict[str, object]]]:
     """Yield the exposures of a night; the same recipe and seed give the same pixels.
@@ -177,13 +177,16 @@ def simulated_night(
     Parameters
     ----------
     recipe : NightRecipe
+        Exposures, focus, seeing, clouds and trail.
     stars : Table
-        Stars of both fields (`reference_stars`).
+        Stars of both fields (`simulate_reference_stars`).
     seed : int
+        Seed of pointing, seeing and photon noise.
 
     Yields
     ------
     counts : ndarray of uint16, shape (h, w)
+        Pixels of the camera.
     cards : dict
         Cards of the header.
     truth : dict
@@ -209,18 +212,18 @@ def simulated_night(
         )
         # Stars of the field at this pointing, their light dimmed by air and clouds. A trail is the
         # sum of short exposures along a line.
-        pointed = stars[stars["field"] == int(2 * part)]
+        field_stars = stars[stars["field"] == int(2 * part)]
         dither = rng.uniform(-recipe.dither_px, recipe.dither_px, size=2)
-        position = np.stack([pointed["x"], pointed["y"]], axis=1) + dither
+        position = np.stack([field_stars["x"], field_stars["y"]], axis=1) + dither
         cloud = {"clouds": recipe.cloud_transmission, "no stars": 0.0}.get(fault, 1.0)
-        magnitude = pointed["mag"] + recipe.extinction_mag * (airmass - 1.0)
+        magnitude = field_stars["mag"] + recipe.extinction_mag * (airmass - 1.0)
         electrons = optics.gain * cloud * 10 ** (0.4 * (25.0 - np.array(magnitude)))
         steps = np.linspace(-0.5, 0.5, 9) * recipe.trail_px if fault == "trailed" else np.zeros(1)
         starlight = np.zeros(shape)
         for step in steps:
-            place = position + np.array([step, 0.0])
-            stamps = electrons[:, None, None] / len(steps) * star_images(optics, place)
-            add_stamps(starlight, stamps, *place.T)
+            trail_position = position + np.array([step, 0.0])
+            stamps = electrons[:, None, None] / len(steps) * star_images(optics, trail_position)
+            add_stamps(starlight, stamps, *trail_position.T)
         # Header of the exposure: pointing, time and camera.
         wcs = tangent_plane(shape, optics.pixel_scale_arcsec, (150 + int(2 * part), 2))
         wcs.wcs.crpix += dither
@@ -233,8 +236,8 @@ def simulated_night(
             "GAIN": optics.gain,
         }
         cards |= {"SATURATE": float(optics.saturation), **wcs.to_header()}
-        truth = shapes_at_places(partial(star_images, optics), shape, "true_")
-        # Defocus W020 ρ² of the drift, and that of the telescope in focus, as Zernike term.
+        truth = measure_places(partial(star_images, optics), shape, "true_")
+        # Defocus W020 ρ² of the drift and of the telescope in focus, as Zernike term.
         w020 = optics.seidel[0] + optics.defocus_waves
         truth["true_telescope_z4.constant_wave"] = float(w020 / np.sqrt(12.0))
         yield expose(optics, starlight, rng), cards, {"fault": fault, **truth}

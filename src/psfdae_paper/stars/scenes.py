@@ -1,8 +1,8 @@
 """Scenes: the wavefronts of the field points of a telescope, and of single stars.
 
-In go a grid of field points, a telescope and settings of its wavefront; out come the static
-wavefronts of all fields, and those of stars with random aberrations. What the wavefront is of
-decides: Seidel terms (scene 1), turbulence (scene 2), or the telescope's own aberrations.
+Inputs: a grid of field points, a telescope and settings of its wavefront. Outputs: the static
+wavefronts of all fields, and the wavefronts of stars with random aberrations. The wavefronts are
+Seidel terms (scene 1), turbulence (scene 2), or the telescope's own aberrations.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class TurbulentWavefronts:
     Parameters
     ----------
     footprints : Footprints
+        OPD over the pupil in each direction.
 
     Attributes
     ----------
@@ -53,6 +54,7 @@ class TurbulentWavefronts:
         self._slopes: np.ndarray | None = None
 
     def __len__(self) -> int:
+        """Return the number of directions."""
         return len(self.footprints)
 
     def slopes(self) -> np.ndarray:
@@ -94,12 +96,12 @@ class TurbulentWavefronts:
             If the grid cannot represent the highest frequency of the turbulence.
         """
         samples = 2.0 / pupil.spacing  # the pupil is 2 radii wide
-        needed = 2 * self.highest_cycles
-        if samples < needed - 0.5:
+        min_samples = 2 * self.highest_cycles
+        if samples < min_samples - 0.5:
             raise SamplingError(
                 f"optics.pupil_samples: the turbulence has up to {self.highest_cycles} cycles "
                 f"per diameter, which {samples:.0f} samples would alias; "
-                f"the grid needs N = {needed} or more"
+                f"the grid needs N = {min_samples} or more"
             )
         return self.footprints.opd(index, pupil.axis, dtype)
 
@@ -122,8 +124,8 @@ def template_wavefronts(config: Config) -> WavefrontSource:
     # Scene 2: an ideal telescope behind turbulence.
     if isinstance(config.wavefront, VonKarman):
         return turbulent_wavefronts(config.wavefront, config.telescope, config.grid)
-    # Scene 1, or a telescope that is described by Seidel coefficients: they are those of the edge
-    # of the field, and grow with the relative field of each point.
+    # Scene 1, or a telescope with Seidel coefficients: they are given at the edge of the field, and
+    # scale with the relative field of each point.
     aberrations = _static_aberrations(config)
     if isinstance(aberrations, Seidel):
         field = relative_field(config.grid)
@@ -145,7 +147,7 @@ def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
     Raises
     ------
     ConfigError
-        If the scene has no random aberrations.
+        If random aberrations are not defined in the scene.
     """
     stars = config.stars
     if isinstance(config.wavefront, VonKarman):
@@ -163,8 +165,8 @@ def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
     # The jitter also moves terms that vanish at a field, such as focus on the axis.
     noll, static = _static_zernikes(config)
     shifts = stream(config.seed, "aberration jitter", stars.name)
-    perturbed = perturb(static[star_field], fraction, factors, aberrations.jitter_waves, shifts)
-    return zernike_wavefronts(noll, perturbed)
+    coefficients = perturb(static[star_field], fraction, factors, aberrations.jitter_waves, shifts)
+    return zernike_wavefronts(noll, coefficients)
 
 
 def _static_aberrations(config: Config) -> Seidel | Zernike | Raytraced:
@@ -207,7 +209,7 @@ def turbulent_wavefronts(
             f"{telescope.diameter_m:g}: a phase variance of {omitted_variance:.2g} rad² lies "
             f"beyond {highest_cycles} cycles per diameter (at most 0.1)"
         )
-    # Each layer has its own random stream, so that it is the same beside other layers.
+    # Each layer has its own random stream, so that it does not depend on the other layers.
     highest = highest_cycles / telescope.diameter_m
     layers = [
         draw_waves(

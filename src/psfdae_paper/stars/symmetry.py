@@ -1,7 +1,7 @@
 """The eight mirror images and rotations of a square, and how they move a framed image.
 
 A rotationally symmetric telescope gives, at a mirrored field point, the mirrored
-image. One propagated star therefore stands for eight: its image, transposed and
+image. One propagated star therefore represents eight: its image, transposed and
 flipped, is the star of the same coefficients at the field transposed and flipped.
 Only the frame does not follow. The brightest pixel belongs at index d/2 of an even
 stamp, and a flip takes index d/2 to d/2 − 1, so a flipped stamp is cut one pixel

@@ -33,7 +33,7 @@ Its last factor is half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/
 def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
     """Return Fried's parameter of each layer in metres, r0_l = r0 · s_l^(−3/5).
 
-    `r0` is that of all layers together, `strengths` are the fractions s_l of each.
+    `r0` belongs to all layers together, `strengths` are the fractions s_l of each.
     """
     fraction = np.asarray(strengths, float)
     return r0 * fraction ** (-3.0 / 5.0)
@@ -69,7 +69,7 @@ def draw_waves(
     that reaches f = 0. Within a ring the radius is drawn with a density
     proportional to the spectrum (its integral has a closed form) and all waves
     share the ring's power equally: the ensemble's spectrum is exact below
-    `highest`, there is no cut at low frequencies. Moduli are fixed and phases
+    `highest`, without a cut at low frequencies. Moduli are fixed and phases
     uniform, which leaves less scatter between realisations than Gaussian
     amplitudes; with tens of waves per octave the sum is Gaussian all the same.
     Angles are stratified over a half-turn within a ring, which keeps a single
@@ -85,6 +85,7 @@ def draw_waves(
         Highest frequency in cycles per metre. The variance that is missing
         beyond it is 0.086 (r0 · highest)^(−5/3) rad².
     rng : Generator
+        Random stream of the layer.
     per_ring : int
         Waves in a ring of the frequency plane; their angles are stratified.
 
@@ -120,7 +121,7 @@ def draw_waves(
     return PlaneWaves(frequency.reshape(-1, 2), amplitude.ravel())
 
 
-def fitted_planes(wavevector: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+def fit_planes(wavevector: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
     """Fit the least-squares plane p + t_x x + t_y y of waves exp(iκ·x) over the lit pupil.
 
     In closed form, hence the same for every pupil grid: over the disc of radius
@@ -164,6 +165,7 @@ class Footprints:
     Parameters
     ----------
     layers : sequence of PlaneWaves
+        Plane waves of each layer, L in all.
     heights : sequence of float
         Height h_l of every layer in metres.
     directions : ndarray, shape (B, 2)
@@ -204,7 +206,7 @@ class Footprints:
         self.coefficients = amplitude / (2.0 * np.pi) * np.exp(2j * np.pi * turns)
         # Piston and tilts to subtract from each direction, shape (B, 3); terms that are not removed
         # are 0 here.
-        self.planes = (self.coefficients @ fitted_planes(self.wavevector, obscuration)).real
+        self.planes = (self.coefficients @ fit_planes(self.wavevector, obscuration)).real
         removed_terms = {"none": 0, "piston": 1, "tilt": 3}[remove]
         self.planes[:, removed_terms:] = 0.0
         # Waves above the ground shift with the direction (moving); those at height 0 are common to
@@ -214,6 +216,7 @@ class Footprints:
         self._cache: dict[tuple[bytes, str], tuple[np.ndarray, ...]] = {}
 
     def __len__(self) -> int:
+        """Return the number of directions."""
         return len(self.coefficients)
 
     def opd(self, index: np.ndarray, axis: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Adaptive search: Optuna's ask and tell, one process per trial.
+"""Adaptive search by Optuna, one process per trial.
 
-In go the axes of a sweep and the results of earlier trials; out come the values of the next trial.
-The values of a trial follow only from the results of earlier trials, which are files of the
-workflow: each process makes a new study and adds these results to it.
+Inputs: the axes of a sweep and the results of earlier trials. Output: the values of the next trial.
+They follow only from the results of earlier trials, which are files of the workflow: each process
+makes a new study and adds these results to it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from psfdae.base.rng import stream
 from psfdae_paper.configuration.sweep import Axis, Value
-from psfdae_paper.sweeps.points import tidy
+from psfdae_paper.sweeps.points import round_value
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -53,8 +53,8 @@ def ask(
     seed = int(stream(search["seed"], "sweep", "trial", slot).integers(2**31))
     # Without this, Optuna writes a message for each trial.
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    # The sampler draws `startup` trials at random, then where a Parzen estimator of good trials is
-    # large against that of the other ones.
+    # The sampler draws `startup` trials at random, then where the Parzen estimator of good trials
+    # is large compared with the estimator of the others.
     study = optuna.create_study(
         direction=search["direction"],
         sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=search["startup"]),
@@ -67,14 +67,14 @@ def ask(
         trial = create_trial(
             state=TrialState.COMPLETE if has_metrics else TrialState.FAIL,
             value=float(result["metrics"][search["metric"]]) if has_metrics else None,
-            params={name: _stored_value(axis, values[name]) for name, axis in space.items()},
+            params={name: _to_optuna(axis, values[name]) for name, axis in space.items()},
             distributions=_distributions(space),
         )
         study.add_trial(trial)
     # Options come back as JSON, numbers of a range are rounded like random draws.
     parameters = study.ask(_distributions(space)).params
     return {
-        name: json.loads(parameters[name]) if axis.options else tidy(axis, parameters[name])
+        name: json.loads(parameters[name]) if axis.options else round_value(axis, parameters[name])
         for name, axis in space.items()
     }
 
@@ -83,11 +83,11 @@ def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
     """Return Optuna's distributions of the axes: categories, whole numbers, or a range."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    # Steps and logarithms of a range are those of the axis.
+    # Whole numbers and logarithmic ranges as the axis says.
     distributions: dict[str, BaseDistribution] = {}
     for name, axis in space.items():
         if axis.options:
-            options = [_stored_value(axis, option) for option in axis.options]
+            options = [_to_optuna(axis, option) for option in axis.options]
             distributions[name] = CategoricalDistribution(options)
         elif axis.integer:
             # Both ends belong to the range, as in `draws`.
@@ -98,6 +98,6 @@ def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
     return distributions
 
 
-def _stored_value(axis: Axis, value: Any) -> Any:
-    """Return a value as Optuna stores it; options, which may be lists, as JSON."""
+def _to_optuna(axis: Axis, value: Any) -> Any:
+    """Return a value for Optuna's storage; options, which may be lists, as JSON."""
     return json.dumps(value) if axis.options else value

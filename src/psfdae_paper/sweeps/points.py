@@ -1,7 +1,7 @@
 """The points of a sweep: every combination or random draws, each with its configuration.
 
-In go the name of a sweep and the overrides of the workflow; out comes a `Plan`, whose points have
-values of the axes, the whole configuration of a training, and a name that is the hash of it.
+A `Plan` follows from the name of a sweep and the overrides of the workflow. Each of its points has
+values of the axes, the whole configuration of a training, and a name, the hash of the latter.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from psfdae_paper.configuration.sweep import Axis, Sweep, Value, load_sweep
 
 
 class SweepError(Error, ValueError):
-    """A sweep cannot be used; the message names the file or key and says what to do."""
+    """A sweep cannot be used; the message names the file or key, and a remedy."""
 
 
 def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
@@ -67,11 +67,11 @@ def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, V
             ends = np.array([axis.ends[0] - margin, axis.ends[1] + margin])
             # A logarithmic range is uniform in ln(value).
             value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
-            values[name] = tidy(axis, float(value))
+            values[name] = round_value(axis, float(value))
     return points
 
 
-def tidy(axis: Axis, value: float) -> int | float:
+def round_value(axis: Axis, value: float) -> int | float:
     """Round a number of a range to a whole number or four significant digits, inside the range.
 
     Four digits are enough for a search, and short to paste.
@@ -92,13 +92,13 @@ def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str,
     return keys
 
 
-def with_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str, Any]:
+def set_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str, Any]:
     """Return a copy of a configuration tree with other values at dotted keys.
 
     Raises
     ------
     SweepError
-        If the tree has no such key, or if it is a whole group.
+        If a key does not exist, or is a whole group.
     """
     changed_tree, known_keys = dict(tree), [key for key, _ in leaves(tree)]
     for dotted_key, value in keys.items():
@@ -148,7 +148,9 @@ class Plan:
     Attributes
     ----------
     name : str
+        File of `config/sweep`, without its ending.
     sweep : Sweep
+        Content of this file.
     tree : dict
         Whole configuration that the points start from.
     """
@@ -178,7 +180,7 @@ class Plan:
 
     @property
     def levels(self) -> list[float]:
-        """Noise levels λ of validation and test: the dataset's, whatever a point trains on."""
+        """Noise levels λ of validation and test: always the dataset's."""
         return list(self.tree["noise"]["levels"])
 
     @property
@@ -189,7 +191,7 @@ class Plan:
         return self.sweep.model_dump(include=set(keys), exclude_none=True)
 
     def earlier_trials(self, point: Point) -> list[Point]:
-        """Return the trials from whose results a trial of an adaptive sweep learns.
+        """Return the trials on whose results a trial of an adaptive sweep depends.
 
         These are all that are certain to be finished while `parallel` trials run at once,
         so that the proposed values do not depend on which trial happens to end first.
@@ -200,7 +202,7 @@ class Plan:
 
     def _point(self, values: dict[str, Value], slot: int | None = None) -> Point:
         """Make the point at some values of the axes, or the trial of a number."""
-        # Keys that all points share, and those of the axes.
+        # Keys that all points share, and keys of the axes.
         keys = {**self.sweep.overrides, **(changes(self.sweep.space, values) if values else {})}
         config = self._point_config(keys, values)
         # All that can change the result: points with the same content have the same name.
@@ -214,16 +216,16 @@ class Plan:
             "search": None if slot is None else {**self.search, "slot": slot},
         }
         # 12 hexadecimal digits: among 1e5 points, two names agree by chance once in 5e4 sweeps.
-        return Point(hash_of(content)[:12], values, keys, config, slot)
+        return Point(compute_hash(content)[:12], values, keys, config, slot)
 
     def _point_config(
         self, keys: Mapping[str, Value], values: Mapping[str, Value]
     ) -> dict[str, Any]:
         """Return the groups of a point with some keys set; SweepError names file and point."""
-        # A value that the configuration refuses is a mistake in the sweep's file.
+        # A value that the configuration rejects is a mistake in the sweep's file.
         path = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
-            config = validate_tree(with_values(self.tree, keys)).model_dump()
+            config = validate_tree(set_values(self.tree, keys)).model_dump()
         except (SweepError, ConfigError) as error:
             settings = ", ".join(f"{name}={value}" for name, value in values.items())
             point = f" (point {settings})" if values else ""
@@ -260,8 +262,8 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     return Plan(name, sweep, tree)
 
 
-def hash_of(tree: object) -> str:
+def compute_hash(tree: object) -> str:
     """Return the SHA-256 of a tree as JSON with sorted keys and without spaces."""
-    # One text for one tree, whatever the order of its keys.
+    # The text does not depend on the order of the keys.
     canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()

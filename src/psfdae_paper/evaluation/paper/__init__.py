@@ -1,6 +1,6 @@
-"""The paper's published tables as data, and tables of measured errors in the same shape.
+"""The paper's published tables as data, and tables of measured errors in the same form.
 
-The CSV files beside this module have the numbers as they are printed.
+The CSV files in the folder of this module have the numbers as printed in the paper.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import pandas as pd
 from psfdae_paper.configuration.methods import registered
 
 
-def paper_rows() -> dict[str, str]:
-    """Return the names of methods here by their names in the paper's tables."""
+def read_paper_names() -> dict[str, str]:
+    """Return the names of our methods by their names in the paper's tables."""
     return {m.look.paper[0]: m.name for m in registered() if m.look.paper}
 
 
-def published(table: str) -> pd.DataFrame:
+def read_published(table: str) -> pd.DataFrame:
     """Read a published table: `psf`, `alignment` or `correlation`."""
     with resources.files(__package__).joinpath(f"tables_{table}.csv").open() as file:
         return pd.read_csv(file)
@@ -37,43 +37,43 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     -------
     DataFrame
         Columns source (paper or psfdae), reference, method, one per noise level.
-        The paper has no rows for datasets that it does not tabulate. Methods of psfdae have in
-        brackets what they are given beside the image; for the paper's that is unknown.
+        Datasets that the paper does not tabulate have rows of psfdae only. Inputs of a method in
+        addition to the image follow its label in brackets; for the paper they are unknown.
     """
     # Measured errors of the methods that the paper has, on test stars of all fields.
     labels = {m.name: m.look.paper[1] for m in registered() if m.look.paper}
-    measured = metrics[
+    measured_rows = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
         & (metrics.split == "random")
         & metrics.method.isin(list(labels))
     ].assign(source="psfdae")
-    # Its values do not say which reference they are for.
-    paper = published("psf")
+    # The paper does not name the reference of its values.
+    paper = read_published("psf")
     paper = paper[(paper.dataset == dataset) & (paper.metric == metric)].assign(
         source="paper", reference="as published"
     )
-    paper["method"] = paper["method"].map(paper_rows())
+    paper["method"] = paper["method"].map(read_paper_names())
     # One row per source, reference and method, in the order of the configuration.
-    rows = pd.concat([paper, measured], ignore_index=True)
+    rows = pd.concat([paper, measured_rows], ignore_index=True)
     rows["order"] = rows["method"].map({method: i for i, method in enumerate(labels)})
     table = rows.pivot(
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     table = table.reset_index().drop(columns="order")
-    # Labels of the methods, with what they are given; columns of noise levels as text.
+    # Labels of the methods, with their inputs; columns of noise levels as text.
     inputs = table["method"].map({m.name: str(m.needs) for m in registered()})
     table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
     table.columns = [f"{c:g}" if isinstance(c, float) else c for c in table.columns]
     return table
 
 
-def paper_table_markdown(table: pd.DataFrame, dataset: str, metric: str) -> str:
+def format_paper_table(table: pd.DataFrame, dataset: str, metric: str) -> str:
     """Return a table of `paper_table` as Markdown, MSE in scientific notation."""
     digits = ".4e" if metric == "mse" else ".4f"
-    formatted = table.copy()
-    for column in formatted.columns[3:]:
-        formatted[column] = formatted[column].map(lambda value: format(value, digits))
-    formatted.columns = [*formatted.columns[:3], *(f"λ = {c}" for c in formatted.columns[3:])]
-    body = formatted.to_markdown(index=False, disable_numparse=True)
+    text_table = table.copy()
+    for column in text_table.columns[3:]:
+        text_table[column] = text_table[column].map(lambda value: format(value, digits))
+    text_table.columns = [*text_table.columns[:3], *(f"λ = {c}" for c in text_table.columns[3:])]
+    body = text_table.to_markdown(index=False, disable_numparse=True)
     return f"{metric.upper()} of {dataset}, split random\n\n{body}\n"

@@ -1,12 +1,11 @@
 """Measurement of a sweep's points: tasks, tables of errors, results and their files.
 
-In goes a point, that is a configuration and the products that it is trained and tested on; out
-come, in the point's folder, its tables of errors and what it cost. `result.json` has its metrics.
+A point is a configuration with the products that it is trained and tested on. Its folder receives
+its tables of errors and its cost; `result.json` has its metrics.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +42,8 @@ class Task:
     checkpoint : Path
         File from which an interrupted training resumes.
     tables : dict of str
-        Names of the tables of errors by part of the data; that of the test is the main workflow's.
+        Names of the tables of errors by part of the data; the test part has the main workflow's
+        name.
     """
 
     tables: ClassVar = {"validation": "validation.csv", "test": "evaluation.csv"}
@@ -58,76 +58,43 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """Metrics and cost of a point that was trained.
 
     Attributes
     ----------
     metrics : dict
         validation_<metric> and test_<metric> over all levels, and at each: …_<λ>.
-    described : dict
-        The point's whole configuration, with that of its stars or states.
+    config : dict
+        The point's whole configuration, with the configuration of its stars or states.
     seconds, cpu_seconds : float
-        Duration of the training; NaN if it was resumed and has no record of it.
+        Duration of the training in seconds; NaN if a resumed training did not record it.
     epochs : int or None
         Passes over the training data; None for methods without epochs.
-    stopped : bool
+    is_stopped : bool
         The training ended by early stopping.
     attempt : int or None
         New starts after a dead network; None for a training that failed.
     """
 
     metrics: dict[str, float]
-    described: dict[str, Any]
+    config: dict[str, Any]
     seconds: float
     cpu_seconds: float
     epochs: int | None = None
-    stopped: bool = False
+    is_stopped: bool = False
     attempt: int | None = 0
 
 
-@dataclass(frozen=True)
-class Training(ABC):
-    """Training and measurement of one point; each kind of model has a class of its own.
-
-    Attributes
-    ----------
-    config : Config
-        Groups that a point of the model reads.
-    task : Task
-    model : str
-        Name of the method, or of the network of scene 3.
-    """
-
-    config: Config
-    task: Task
-    model: str
-
-    @property
-    @abstractmethod
-    def files(self) -> tuple[str, ...]:
-        """Names of the files of the trained model, in the folder of the point."""
-
-    @abstractmethod
-    def measure(self) -> Measured:
-        """Train as the main workflow does, and measure on validation and test data.
-
-        Raises
-        ------
-        FitError
-            If the training cannot continue.
-        """
-
-
 def geometric_mean(values: Sequence[float]) -> float:
-    """Return the geometric mean, in which relative changes at all noise levels count alike."""
+    """Return the geometric mean, which weights relative changes at all noise levels equally."""
     return float(np.exp(np.mean(np.log(values))))
 
 
-def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def average_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return MSE and SSIM of a part, over all noise levels and at each.
 
-    The MSE of different levels differ by orders of magnitude, and get the geometric mean.
+    The MSE of different levels differs by orders of magnitude: its mean is the geometric one.
 
     Parameters
     ----------
@@ -155,14 +122,15 @@ def measure_images(
 ) -> dict[str, float]:
     """Measure a model on validation and test stars, and write both tables.
 
-    The noise of a part is the same for all points of a sweep; that of the test part is
-    the main workflow's.
+    The noise of a part is the same for all points of a sweep; the test part has the noise of
+    the main workflow.
 
     Parameters
     ----------
     config : Config
         Stage configuration (seed, noise, parts, evaluation).
     task : Task
+        Stars, noise levels, and the folder for the tables.
     method : str
         Name in the tables.
     validate_with : Method
@@ -173,7 +141,7 @@ def measure_images(
     Returns
     -------
     dict
-        See `Measured.metrics`.
+        See `Measurement.metrics`.
     """
     # Stars and their split, as in the main workflow.
     product = read_stars(task.data["stars"], task.reference)
@@ -196,14 +164,14 @@ def measure_images(
         ("test", parts.test, noisy_test, test_with),
     ):
         # Truth, field and position of the stars; then their errors at each noise level.
-        stars = MeasuredStars.of(product, indices, task.reference)
+        stars = MeasuredStars.from_product(product, indices, task.reference)
         images = product["realisation"][indices]
         rows = []
         for level in task.levels:
             estimate = model.estimate(noisy(images, level), level, stars.position)
             row = {**key, "method": method, "noise_level": level}
             rows += stars.errors(row, estimate, config.evaluation.data_range)[0]
-        metrics |= image_metrics(part, rows)
+        metrics |= average_metrics(part, rows)
         # Written after all levels: a table is whole or absent.
         write_csv(task.folder / task.tables[part], pd.DataFrame(rows))
     return metrics
@@ -217,8 +185,8 @@ def read_cost(folder: Path) -> dict[str, float]:
     return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
 
 
-def fit_in(kind: type[Method], folder: Path) -> Path:
-    """Return the place of a point's fit: the folder itself, or a file in it.
+def locate_fit(kind: type[Method], folder: Path) -> Path:
+    """Return the path of a point's fit: the folder itself, or a file in it.
 
     A method with several files, such as a network, has a folder; one with a product has a file.
     """
