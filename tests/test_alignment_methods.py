@@ -234,7 +234,7 @@ def test_noise_free_parameters_are_recovered(model, scene3, noise, movable):
     likelihood = StateLikelihood(optics, noise, 0.002, images)
     settings = scene3.fit.model_copy(update={"iterations": 25, "tolerance": 1e-7})
     fit = likelihood.maximise(optics.to_parameters(truth + 0.08), settings)
-    assert fit.converged.all()
+    assert fit.has_converged.all()
     assert fit.parameters == pytest.approx(parameters, abs=1e-6)
     assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
 

@@ -16,8 +16,8 @@ from psfdae.denoise.image_prediction import other_instrument
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
-from psfdae.methods.field_law import FieldSettings
-from psfdae.methods.field_spline import FieldModel
+from psfdae.methods.field.prior import FieldSettings
+from psfdae.methods.field.spline import FieldModel
 from psfdae.methods.interface import TrainingSet
 from psfdae.stars.bright_stars import BrightStars, magnitude
 from psfdae.stars.noise import NoiseModel

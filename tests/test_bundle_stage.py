@@ -23,7 +23,7 @@ from psfdae.denoise.bundle import (
 )
 from psfdae.denoise.error_model import brightest, interpolate_at_noise, mahalanobis
 from psfdae.denoise.flux_model import FluxModel
-from psfdae.methods import groups_of
+from psfdae.methods import list_groups
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split
 from psfdae.training.calibration import StarErrors, cross_validate_coverage
@@ -61,7 +61,7 @@ def folder(tmp_path_factory):
     """Stars, a network trained on them, and its bundle."""
     folder = tmp_path_factory.mktemp("bundle")
     stars = write_stars(folder / "stars.h5", STARS)
-    config = load_stage(groups_of("dae"), TINY)
+    config = load_stage(list_groups("dae"), TINY)
     fit(config, "dae", stars, out=folder / "dae")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "0")
@@ -157,7 +157,7 @@ def test_half_width_covers_fresh_stars(tiny):
 def mixture(folder):
     """The bundle of a Gaussian mixture, which tells how sure it is of each star."""
     small = [*TINY, "gmm.components=[24]", "gmm.shrinkage=[10.0]"]
-    fit(load_stage(groups_of("gmm"), small), "gmm", folder / "stars.h5", out=folder / "g")
+    fit(load_stage(list_groups("gmm"), small), "gmm", folder / "stars.h5", out=folder / "g")
     pack(folder, folder / "g.psf.safetensors", models=Models(gmm=folder / "g"))
     return read_bundle(folder / "g.psf.safetensors")
 

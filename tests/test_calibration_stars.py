@@ -13,7 +13,7 @@ from psfdae.image.stamps import cut, sky_around
 from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, stamp_snr
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
 from psfdae.stars.bright_stars import BrightStars
-from psfdae.stars.moments import shift_stamps, windowed_centres
+from psfdae.stars.moments import find_centroids, shift_stamps
 from psfdae.stars.noise import NoiseModel, noise_equivalent_px
 from psfdae.stars.splits import held_out_fields
 
@@ -96,7 +96,7 @@ def test_centres_are_found_to_a_hundredth_of_a_pixel():
     assert inside.all()
     assert brightest_pixels(gaussians([[4.0, 0.0], [3.0, -3.0]]), 3)[1].tolist() == [False, True]
     assert (np.abs(peak - centre) <= 0.5 + 1e-9).all()
-    measured = windowed_centres(stamps, peak, np.full(40, 1.5), 10, 1.5)
+    measured = find_centroids(stamps, peak, np.full(40, 1.5), 10, 1.5)
     assert np.abs(measured - centre).max() < 0.01
 
 
@@ -167,11 +167,11 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
         piece = cut(stars.stamps[image_star : image_star + 1], 16, offset[None])[0]
         assert realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
     # The others lie anywhere in their pixel, and so do their templates.
-    place = windowed_centres(realisation.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
+    place = find_centroids(realisation.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     phase = (place - jitter)[subpixel]
     assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
-    moved_centre = windowed_centres(images.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
+    moved_centre = find_centroids(images.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     assert np.abs(moved_centre - place).max() < 0.03
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.base.settings import ConfigError, as_overrides, deciding
-from psfdae.methods import groups_of
+from psfdae.base.settings import ConfigError, as_overrides, dump_deciding
+from psfdae.methods import list_groups
 from psfdae.methods.networks.settings import DaeSettings, Train
 from psfdae.methods.networks.training import fingerprint
 from psfdae_paper.configuration import compose
@@ -111,7 +111,7 @@ def test_every_mistake_is_named(override, message):
 
 def test_a_stage_refuses_an_unknown_group_and_a_folder_without_a_root(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="colour: unknown key"):
-        load_stage(groups_of("dae"), ["+colour=blue"])
+        load_stage(list_groups("dae"), ["+colour=blue"])
     monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path))
     with pytest.raises(ConfigError, match=r"no config\.yaml"):
         config_dir()
@@ -130,12 +130,12 @@ def test_search_distances_follow_from_the_telescope():
 
 
 def test_settings_that_cannot_change_a_result_are_set_apart():
-    tree = compose.stage_tree(groups_of("dae"), compose.compose())
+    tree = compose.stage_tree(list_groups("dae"), compose.compose())
     indecisive = {*as_overrides(tree)} - {*as_overrides(compose.decisive_settings(tree))}
     assert [text.split(".", 1)[1] for text in indecisive] == ["checkpoint_seconds=20.0"]
 
     def checkpoint(*overrides):
-        return fingerprint(deciding(load(overrides).train), np.zeros(3))
+        return fingerprint(dump_deciding(load(overrides).train), np.zeros(3))
 
     assert checkpoint("train.checkpoint_seconds=3") == checkpoint() != checkpoint("train.lr=0.003")
 

@@ -402,7 +402,7 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     assert paired[raw.candidates.bright.row].mean() < 0.02
     assert paired[clean.candidates.bright.row].mean() > 0.2 and len(clean) > 1.2 * len(raw)
     bright = clean.candidates.bright
-    single, images = ~paired[bright.row], bright.aligned()
+    single, images = ~paired[bright.row], bright.align()
     ratio = bright.flux / np.array(sky[2]["flux"])[bright.row]
     for part in (single, ~single):
         assert np.median(ratio[part]) == pytest.approx(0.987, abs=0.003)

@@ -10,8 +10,8 @@ from skimage.metrics import mean_squared_error, structural_similarity
 
 from psfdae.methods.metrics import (
     all_metrics,
-    clustered_mean,
-    clustered_ratio,
+    cluster_mean,
+    cluster_ratio,
     mse,
     ssim,
 )
@@ -55,10 +55,10 @@ def test_ssim_refuses_what_it_cannot_measure(gaussian_stars):
 def test_clustered_error_counts_fields_where_stars_repeat(stars):
     """50 equal stars per field are 20 measurements, not 1000; of one field nothing is known."""
     fields = np.random.default_rng(1).normal(size=20)
-    mean, stderr = clustered_mean(np.repeat(fields, stars), np.repeat(np.arange(20), stars))
+    mean, stderr = cluster_mean(np.repeat(fields, stars), np.repeat(np.arange(20), stars))
     assert mean == pytest.approx(fields.mean())
     assert stderr == pytest.approx(fields.std(ddof=1) / np.sqrt(20), rel=1e-9)
-    assert np.isnan(clustered_mean(np.ones(5), np.zeros(5, dtype=int))[1])
+    assert np.isnan(cluster_mean(np.ones(5), np.zeros(5, dtype=int))[1])
 
 
 def test_error_of_a_paired_ratio_is_its_scatter():
@@ -69,7 +69,7 @@ def test_error_of_a_paired_ratio_is_its_scatter():
     for _ in range(300):
         stars = rng.gamma(1.0, 1.0, field.size)
         larger_errors = 1.1 * stars * rng.normal(1, 0.1, 40)[field]
-        ratios.append(clustered_ratio(larger_errors, stars, field))
+        ratios.append(cluster_ratio(larger_errors, stars, field))
     ratio, stderr = np.transpose(ratios)
     assert ratio.mean() == pytest.approx(1.1, abs=0.005)
     assert stderr.mean() == pytest.approx(ratio.std(), rel=0.15)

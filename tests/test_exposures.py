@@ -13,8 +13,8 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import PredictionError, Stars, load_model
 from psfdae.image.image_input import ImageInput
-from psfdae.methods.field_search import fit_field
-from psfdae.methods.field_spline import deformations
+from psfdae.methods.field.search import fit_field
+from psfdae.methods.field.spline import deformations
 from psfdae.psf.wings import Wings
 from psfdae.report.validation import validate
 from psfdae.training.exposures import adapt_to_exposures, exposure
@@ -147,7 +147,7 @@ def test_without_other_stars_the_field_stays(sky):
         sparse.image.with_name("rich.fits"), sparse.image.with_name("rich.csv"),
         stamp_px=STAMP, train_stars=60, test_stars=10,
     ).candidates.bright  # fmt: skip
-    adapted = field.of_exposure(observed.of(np.arange(8)), SKY)
+    adapted = field.refit_exposure(observed.select(np.arange(8)), SKY)
     off = np.abs(adapted.coefficients - field.coefficients).max() / np.abs(field.coefficients).max()
     assert off < 0.02
 

@@ -69,7 +69,7 @@ def test_a_mixture_predicts_without_torch(shipped, without):
 def test_what_no_extra_brings_stays_a_traceback(module):
     error = ModuleNotFoundError("…", name=module)
     assert refusal(error) is None
-    with pytest.raises(ModuleNotFoundError) as caught, errors.needed_by("it"):
+    with pytest.raises(ModuleNotFoundError) as caught, errors.require_extra("it"):
         raise error
     assert caught.value is error
 

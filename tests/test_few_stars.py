@@ -45,7 +45,7 @@ def test_faint_stars_lower_the_least_signal_to_noise():
     least_snr = stars.settings.calibration_stars.snr_min
     assert len(stars) >= 20 and 20 <= least_snr < 100
     assert stars.candidates.bright.snr.min() >= least_snr
-    assert max(stars.settings.calibration_stars.degraded()) <= least_snr / 2
+    assert max(stars.settings.calibration_stars.list_degraded_snr()) <= least_snr / 2
 
 
 def test_refusal_names_the_options():

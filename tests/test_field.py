@@ -18,11 +18,11 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.denoise.bundle import read_bundle, write_bundle
-from psfdae.methods.field import FieldMixture, stars_of_fit
-from psfdae.methods.field_law import PosteriorLimits
-from psfdae.methods.field_nodes import node_step
-from psfdae.methods.field_posterior import log_node_prior
-from psfdae.methods.field_search import fit_field
+from psfdae.methods.field import FieldMixture, select_fit_stars
+from psfdae.methods.field.nodes import node_step
+from psfdae.methods.field.posterior import log_node_prior
+from psfdae.methods.field.prior import PosteriorLimits
+from psfdae.methods.field.search import fit_field
 from psfdae.methods.interface import TrainingSet
 from psfdae.psf.interface import PredictionError
 from psfdae.stars.bright_stars import BrightStars
@@ -365,17 +365,17 @@ def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
 
 def test_same_stars_give_the_same_fit(stars, field):
     refitted = fitted(stars)
-    arrays = field.stored_arrays()
-    for name, array in refitted.stored_arrays().items():
+    arrays = field.to_arrays()
+    for name, array in refitted.to_arrays().items():
         assert array.tobytes() == arrays[name].tobytes(), name
 
 
 def test_large_frames_are_fitted_to_fewer_stars_the_brighter_the_likelier():
     """All stars of usual stamps count; of 52² px, the 739 that 2e6 pixels have room for."""
     snr = np.random.default_rng(3).permutation(np.geomspace(100.0, 1000.0, 1500))
-    assert (stars_of_fit(snr, 20**2, 1) == np.arange(1500)).all()
-    rows = stars_of_fit(snr, 52**2, 1)
-    assert (rows == stars_of_fit(snr, 52**2, 1)).all()
+    assert (select_fit_stars(snr, 20**2, 1) == np.arange(1500)).all()
+    rows = select_fit_stars(snr, 52**2, 1)
+    assert (rows == select_fit_stars(snr, 52**2, 1)).all()
     assert len(np.unique(rows)) == int(2e6 / 52**2)
     # Faint ones are there, too, so that a PSF that changes with the magnitude is seen.
     is_bright = snr > np.median(snr)
@@ -399,13 +399,13 @@ def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, star
 
 
 def test_packed_is_the_same_to_half_precision(field):
-    arrays, _ = field.pack(SIDE, 1e-3)
+    arrays, _ = field.export(SIDE, 1e-3)
     config = {
         "noise": {"kappa": 1.0, "background_photons": 1e6},
         "field": field.settings.model_dump(),
     }
     faint = Faint(50, 10.0)
-    result = faint.measured(FieldMixture.restored(arrays, config, "realisation"))
+    result = faint.measured(FieldMixture.from_arrays(arrays, config, "realisation"))
     assert result.psf == pytest.approx(faint.measured(field).psf, abs=1e-4)
 
 

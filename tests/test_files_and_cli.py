@@ -257,7 +257,7 @@ def test_progress_is_a_bar_in_a_terminal(monkeypatch):
     error = io.StringIO()
     error.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", error)
-    with progress.displayed_by(bar):
+    with progress.use_display(bar):
         for _ in progress.steps("stars", range(4)):
             assert list(progress.steps("inner", "abcd")) == ["a", "b", "c", "d"]
         with progress.task("field", 9) as advance:
@@ -276,7 +276,7 @@ def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):
     """A log has ten lines of 100 steps of 1 s, and with them what is left at this pace."""
     seconds = itertools.count(0.0, 1.0)
     monkeypatch.setattr("time.time", seconds.__next__)
-    with progress.displayed_by(bar_or_lines), progress.task("training", 100) as advance:
+    with progress.use_display(bar_or_lines), progress.task("training", 100) as advance:
         for step in range(100):
             advance(1, f"epoch {step + 1}")
     lines = capsys.readouterr().err.splitlines()

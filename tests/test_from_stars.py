@@ -29,7 +29,7 @@ from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae.report.validation import Report
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import shift_stamps
@@ -202,7 +202,7 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
     (path,) = network.glob("*.psf.safetensors")
     assert read_bundle(path).info.method == "dae"
     overrides = (network / "overrides.txt").read_text().split()
-    noise = load_stage(groups_of("dae"), overrides).noise
+    noise = load_stage(list_groups("dae"), overrides).noise
     assert noise.kappa == 1.0 and len(noise.levels) == 4
     by_hand = ["fit", "dae", "--stars", network / "stars.h5", "--split", "held_out"]
     words = [*by_hand, "--out", tmp_path / "dae", *overrides]

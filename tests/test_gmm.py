@@ -10,10 +10,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from psfdae.denoise.bundle import BundleError
-from psfdae.methods import mixing, mixture_fit
-from psfdae.methods.clusters import without_slope
+from psfdae.methods import mixing
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.methods.interface import Needs, TrainingSet
+from psfdae.methods.mixture import fit as mixture_fit
+from psfdae.methods.mixture.clusters import remove_slope
 from psfdae.stars.noise import NoiseModel
 from psfdae.training.packing import packed
 
@@ -230,7 +231,7 @@ def test_rows_of_a_cluster_have_the_products_of_their_formulas():
     rng, nu = np.random.default_rng(7), 3.0
     x, p = rng.normal(size=(9, 5)), rng.normal(size=(9, 2))
     inverse = np.linalg.inv(p.T @ p + nu * np.eye(2))
-    rows, slope = without_slope(x, p, inverse, nu)
+    rows, slope = remove_slope(x, p, inverse, nu)
     assert rows.T @ rows == pytest.approx(x.T @ x - x.T @ p @ inverse @ p.T @ x, abs=1e-4)
     assert slope == pytest.approx(inverse @ p.T @ x, abs=1e-5)
     small, large = (mixture_fit.rows_without_noise(x, noise * np.eye(5)) for noise in (1e-3, 1e3))
@@ -248,7 +249,7 @@ def test_validation_stars_choose_and_the_last_value_that_was_tried_is_named(caps
     assert len(mixture.count) == 12 and mixture.shrinkage == [5.0]
     assert mixture.count.sum() == 400
     assert "K = 12" in capsys.readouterr().out
-    no_judge = GaussianMixture.fit(training().without_validation(), settings)
+    no_judge = GaussianMixture.fit(training().drop_validation(), settings)
     assert len(no_judge.count) == 12 and no_judge.count.sum() == 350
 
 
@@ -257,7 +258,7 @@ def test_a_search_goes_both_ways_and_more_clusters_must_pay():
 
     def climbed(errors, start, pays=0.0):
         tries.clear()
-        return mixture_fit.climbed([*errors], start, lambda k: tries.append(k) or errors[k], pays)
+        return mixture_fit.climb([*errors], start, lambda k: tries.append(k) or errors[k], pays)
 
     falling = {1: 9.0, 4: 5.0, 16: 4.0, 64: 3.98, 256: 1.0}
     assert climbed(falling, 4, pays=0.02) == 16 and 256 not in tries and 1 not in tries
@@ -312,7 +313,7 @@ def test_it_is_stored_and_the_same_again(tmp_path):
         stored.estimate(noisy, LEVEL).psf, mixture.estimate(noisy, LEVEL).psf
     )
     twice = _fitted.__wrapped__(12, False, GaussianMixture)
-    for name in GaussianMixture.stored():
+    for name in GaussianMixture.list_arrays():
         np.testing.assert_array_equal(getattr(twice, name), getattr(mixture, name))
 
 
@@ -321,15 +322,15 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
     noisy = noisy_of(truth)
 
     def restored(arrays):
-        return GaussianMixture.restored(arrays, CONFIG, "realisation").estimate(noisy, LEVEL)
+        return GaussianMixture.from_arrays(arrays, CONFIG, "realisation").estimate(noisy, LEVEL)
 
-    arrays, _ = mixture.pack(D, NOISE.kappa * LEVEL)
+    arrays, _ = mixture.export(D, NOISE.kappa * LEVEL)
     assert arrays["rows"].sum() == len(arrays["deviation"]) < 400
     full, main = mixture.estimate(noisy, LEVEL), restored(arrays)
     assert np.square(main.psf - full.psf).mean() < 1e-4 * np.square(full.psf - truth).mean()
     np.testing.assert_allclose(main.sigma, full.sigma, rtol=0.01)
     np.testing.assert_allclose(main.evidence, full.evidence, atol=0.5)
-    assert len(mixture.pack(D, 0.1)[0]["deviation"]) < 0.6 * len(arrays["deviation"])
+    assert len(mixture.export(D, 0.1)[0]["deviation"]) < 0.6 * len(arrays["deviation"])
     size = sum(array.nbytes for array in arrays.values())
     unlimited = packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]
     assert unlimited["rows"].tolist() == arrays["rows"].tolist()
@@ -350,10 +351,10 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
     ],
 )
 def test_arrays_that_no_fit_leaves_are_named(name, change):
-    arrays = fitted(4).pack(D, NOISE.kappa * LEVEL)[0]
+    arrays = fitted(4).export(D, NOISE.kappa * LEVEL)[0]
 
     def violated(arrays):
-        laws = GaussianMixture.restored(arrays, CONFIG, "realisation").conditions()
+        laws = GaussianMixture.from_arrays(arrays, CONFIG, "realisation").conditions()
         return [law for law, _, is_fulfilled in laws if not np.all(is_fulfilled)]
 
     assert violated(arrays) == []

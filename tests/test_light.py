@@ -10,7 +10,7 @@ import psfdae
 from psfdae.denoise.field_models import load_field
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
-from psfdae.methods.field_law import FieldSettings
+from psfdae.methods.field.prior import FieldSettings
 from psfdae.photometry import crowded
 from psfdae.photometry.image_photometry import photometry_of_image
 from psfdae.psf.exchange import write_psfex

@@ -96,7 +96,7 @@ def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
     rng = np.random.default_rng(0)
     mixing = rng.normal(size=(64, 5)) * 0.01
     images = (rng.normal(size=(20000, 5)) @ mixing.T + 1 / 64).reshape(-1, 8, 8)
-    fitted = LinearMmse.of(images[:10000], images[:10000], noise)
+    fitted = LinearMmse.from_images(images[:10000], images[:10000], noise)
     level = 2e-3
     sigma2 = (noise.kappa * level) ** 2 + (1 / 64) / float(noise.flux(level))
     noisy = images[10000:] + rng.normal(size=(10000, 8, 8)) * np.sqrt(sigma2)
@@ -112,7 +112,7 @@ def test_linear_mmse_finds_references_that_are_another_image(noise):
     rng = np.random.default_rng(0)
     modes, images, references = rng.normal(size=(500, 4)), *rng.normal(size=(2, 4, 64)) * 1e-3
     x, y = ((1 / 64 + modes @ mixing).reshape(-1, 8, 8) for mixing in (images, references))
-    estimate = LinearMmse.of(x[:400], y[:400], noise).predict(x[400:], 1e-8)
+    estimate = LinearMmse.from_images(x[:400], y[:400], noise).predict(x[400:], 1e-8)
     assert mse(estimate, y[400:]).max() < 1e-4 * y.var()
 
 
@@ -371,12 +371,12 @@ def test_half_precision_rounds_all_layers_but_the_last(monkeypatch):
     expected = network(images)
     # A processor without instructions for it computes as always.
     monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
-    with loop.half_precision():
+    with loop.use_half_precision():
         assert torch.equal(network(images), expected)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
-    with loop.half_precision(False):
+    with loop.use_half_precision(False):
         assert torch.equal(network(images), expected)
-    with loop.half_precision():
+    with loop.use_half_precision():
         rounded = network(images)
     # Eight bits err by 2^-9, and more where terms cancel; the result itself has all its digits.
     assert rounded.dtype == torch.float32 and not torch.equal(rounded, rounded.bfloat16().float())
@@ -389,12 +389,12 @@ def test_half_precision_rounds_all_layers_but_the_last(monkeypatch):
 
 def test_second_half_of_the_epochs_has_half_precision(data, monkeypatch):
     halves = []
-    half_precision = loop.half_precision
+    half_precision = loop.use_half_precision
     monkeypatch.setattr(
-        loop, "half_precision", lambda half: (halves.append(half), half_precision(False))[1]
+        loop, "use_half_precision", lambda half: (halves.append(half), half_precision(False))[1]
     )
     training = DaeTraining(data, DAE, TRAIN.model_copy(update={"epochs": 4}), 3, 0)
-    while not training.finished():
+    while not training.is_finished():
         training.run_epoch()
     assert halves == [False] * 2 * training.steps + [True] * 2 * training.steps
 
@@ -492,7 +492,7 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
 
 
 def test_methods_have_the_functions_of_their_capabilities_and_no_others():
-    field = ("measure", "psf_at", "order", "is_out_of_range", "draw_stars", "fitted_flux_error")
+    field = ("measure", "psf_at", "order", "is_outside_range", "draw_stars", "estimate_flux_error")
     functions = {**dict.fromkeys(field, "knows_field"), "flux": "finds_flux"}
     for kind in all_methods():
         for function, capability in functions.items():

@@ -25,7 +25,7 @@ from psfdae.report import validation
 from psfdae.sensing import sampling
 from psfdae.sensing.sampling import Chains
 from psfdae.stars.moments import measure_shapes
-from psfdae.telescope.field import terms_of
+from psfdae.telescope.field import build_terms
 from psfdae.telescope.settings import Prior
 from psfdae_paper.evaluation.night import TABLE_COLUMNS, read_night
 from psfdae_paper.stages import night
@@ -476,7 +476,7 @@ def test_columns_of_wavefront(monkeypatch):
     telescope, rng = three_terms(), np.random.default_rng(4)
     telescope = telescope.model_copy(update={"prior": Prior(waves=0.2)})
     angle = field_of(telescope, 12, rng)
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     truth = terms.mean + 0.9 * terms.sd * rng.standard_normal((12, 3))
     place = rng.uniform(-0.5, 0.5, (12, 2))  # row, column
     counts, flux = imaged(telescope, angle, truth, place, 300.0, rng)

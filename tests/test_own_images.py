@@ -111,9 +111,9 @@ def test_bright_stars_are_good_stars(sky):
 def test_levels_of_noise_follow_the_least_signal_to_noise():
     words = ("dataset=from_stars", "calibration_stars.snr_min=60")
     config = from_words(words)
-    assert config.calibration_stars.degraded() == [5, 10, 20, 30]
+    assert config.calibration_stars.list_degraded_snr() == [5, 10, 20, 30]
     lower = config.calibration_stars.model_copy(update={"snr_min": 8.0})
-    assert lower.degraded() == [4]
+    assert lower.list_degraded_snr() == [4]
 
 
 def test_lists_that_are_off_are_refused(sky):

@@ -413,7 +413,7 @@ def test_completed_stars_are_their_neighbours_scaled():
     assert repaired.stamps[7, 16, 17] == pytest.approx(light[7, 16, 17], rel=0.02)
     part = shape[7, 16, 17] / shape[7, 8:24, 8:24].sum()
     assert missing[7] == pytest.approx(part, rel=0.03) and missing.sum() == missing[7]
-    assert repaired.framed(20)[1].sum() == 20 * 400 - 1
+    assert repaired.cut_frames(20)[1].sum() == 20 * 400 - 1
 
 
 def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):

@@ -173,7 +173,7 @@ def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
 def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, request):
     model = request.getfixturevalue(name)
     clean = model.predict(medium.stamps)
-    assert len(medium.stamps) > Packing().together
+    assert len(medium.stamps) > Packing().batch_size
     assert same(model.predict(medium.stamps, threads=2), clean)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
     for rows in (slice(300, 301), order):

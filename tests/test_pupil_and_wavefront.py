@@ -9,9 +9,9 @@ from psfdae.optics.pupil import (
     SamplingError,
     annular_pupil,
     choose_samples,
+    count_samples,
     disc_coverage,
     pupil_axis,
-    required_samples,
 )
 from psfdae.optics.wavefronts import (
     monomial_coefficients,
@@ -75,10 +75,10 @@ def test_templates_need_131_samples():
     """The steepest template of scene 1, in the corner of the field."""
     corner = seidel_wavefronts(STATIC[None], np.array([[1.0, 1.0]]))
     small = np.array([[-1.0, 1.0], [-1.0, 1.0]])
-    assert required_samples(corner.slopes(), small)[0] == pytest.approx(131, abs=1)
+    assert count_samples(corner.slopes(), small)[0] == pytest.approx(131, abs=1)
     # Replicas must stay off a distant stamp.
     distant_stamp = np.array([[100.0, 116.0], [-8.0, 8.0]])
-    assert required_samples(np.zeros((1, 2, 2)), distant_stamp)[0] == 116
+    assert count_samples(np.zeros((1, 2, 2)), distant_stamp)[0] == 116
 
 
 def test_ladder_takes_the_first_rung_that_suffices():

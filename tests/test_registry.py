@@ -10,7 +10,7 @@ from image_training import few_draws
 from psfdae import load_model
 from psfdae.base.files import Column, write_product
 from psfdae.methods import fit_files as fits
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle, track
 from psfdae_paper.stages.evaluate import Models
@@ -39,8 +39,8 @@ def test_a_registered_model_restores_as_its_bundle_does(
     stars, kind, packed = tmp_path / "stars.h5", method("dae"), tmp_path / "tiny.psf.safetensors"
     scene = {"telescope": telescope, "framing": {"jitter_px": 1, "subpixel": True}}
     write_product(stars, "stars", columns, scene)
-    place = tmp_path / fits.named(kind, "fit")
-    fit(load_stage(groups_of("dae"), SIZES), "dae", stars, out=place)
+    place = tmp_path / fits.add_suffix(kind, "fit")
+    fit(load_stage(list_groups("dae"), SIZES), "dae", stars, out=place)
     config = load_stage(bundle.bundle.stage.settings.reads, SIZES)
     with few_draws():
         bundle.bundle(config, stars, Models(dae=place), out=packed)

@@ -21,7 +21,7 @@ from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson_information
 from psfdae.sensing.sampling import Chains, sample_around
 from psfdae.sensing.stars import SensingError, StarOptics
-from psfdae.telescope.field import telescope_model, terms_of
+from psfdae.telescope.field import build_terms, model_telescope
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load
@@ -52,7 +52,7 @@ def sensed(counts, telescope, angle, **options):
 
 def imaged(telescope, angle, coefficients, place, snr, rng=None):
     """Stamps in counts of gain 1, noise-free without a generator, and fluxes."""
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     waves = np.einsum("mk,mkj->mj", coefficients, terms.to_modes)
     operator = StarOptics(telescope, terms, 16).operator
     images = operator.stamps(np.concatenate([waves, place], axis=1)).astype(float)
@@ -134,7 +134,7 @@ def test_climb_reaches_maxima_and_stays_within_its_limit():
     peaks = climb(evaluate, np.zeros((2, 2)), np.inf, Steps())
     assert peaks.parameters == pytest.approx(centre, abs=1e-2)
     assert peaks.height == pytest.approx(0.0, abs=1e-2)
-    assert peaks.converged.all()
+    assert peaks.has_converged.all()
     limited = climb(evaluate, np.zeros((2, 2)), 3.0, Steps(min_gain=1e-9))
     assert limited.parameters[0] == pytest.approx(centre[0], abs=1e-4)
     # At the limit the other parameter is at its own maximum: 1 + 0.3 (5 − 3).
@@ -225,7 +225,7 @@ def test_even_part_has_no_sign(kind):
     telescope = example(kind)
     telescope = telescope.model_copy(update={"prior": Prior(waves=0.2)})
     rng = np.random.default_rng(3)
-    optics = StarOptics(telescope, terms_of(telescope, field_of(telescope, 5, rng)), 16)
+    optics = StarOptics(telescope, build_terms(telescope, field_of(telescope, 5, rng)), 16)
     star, z = np.arange(5), rng.standard_normal((5, optics.coefficient_count))
     place = np.zeros((5, 2))
     pair = (optics.coefficients(star, sign) for sign in (z, optics.twins(star, z)))
@@ -242,7 +242,7 @@ def test_coarse_pupils_err_far_below_the_noise(kind, monkeypatch):
     """A thousandth of the variance of a pixel of a star of S/N 200."""
     telescope, rng = example(kind), np.random.default_rng(12)
     angle = field_of(telescope, 10, rng)
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
     waves = np.einsum("mk,mkj->mj", truth, terms.to_modes)
     modes = np.concatenate([waves, rng.uniform(-0.5, 0.5, (10, 2))], axis=1)
@@ -261,7 +261,7 @@ def test_coarse_pupils_err_far_below_the_noise(kind, monkeypatch):
 def test_noise_free_stars_come_back():
     telescope, rng = three_terms(), np.random.default_rng(4)
     angle = field_of(telescope, 4, rng)
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     truth = terms.mean + 0.7 * terms.sd * rng.standard_normal(terms.mean.shape)
     place = rng.uniform(-0.5, 0.5, (4, 2))
     counts, flux = imaged(telescope, angle, truth, place, 2000.0)
@@ -283,7 +283,7 @@ def test_noise_free_stars_come_back():
 def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     telescope, rng = three_terms(), np.random.default_rng(5)
     angle = field_of(telescope, 20, rng)
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
     place = rng.uniform(-0.5, 0.5, (20, 2))
     counts, _ = imaged(telescope, angle, truth, place, 60.0, rng)
@@ -306,7 +306,7 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
 def test_bad_stars_stop_nobody_and_are_kept_as_rows():
     telescope, rng = three_terms(), np.random.default_rng(8)
     angle = field_of(telescope, 6, rng)
-    mean = terms_of(telescope, angle).mean
+    mean = build_terms(telescope, angle).mean
     counts, _ = imaged(telescope, angle, mean, np.zeros((6, 2)), 60.0, rng)
     counts[1] = np.nan
     counts[2, :3] = np.nan
@@ -348,7 +348,7 @@ def test_wrong_input_is_named(stars, options, message):
 def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     telescope, rng = example(kind), np.random.default_rng(9)
     angle = field_of(telescope, count, rng)
-    model = telescope_model(telescope, angle)
+    model = model_telescope(telescope, angle)
     truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
     place = rng.uniform(-0.5, 0.5, (count, 2))
     counts, _ = imaged(telescope, angle, model.coefficients(truth), place, 60.0, rng)
@@ -375,7 +375,7 @@ def test_seeing_is_found_with_the_telescope():
         return telescope.model_copy(update={"seeing": seeing, "prior": Prior(seeing=prior)})
 
     stated, true_telescope = example_of(1.5, 0.15), example_of(1.8, 0.0)
-    model = telescope_model(true_telescope, angle)
+    model = model_telescope(true_telescope, angle)
     truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
     place = rng.uniform(-0.5, 0.5, (12, 2))
     counts, _ = imaged(true_telescope, angle, model.coefficients(truth), place, 100.0, rng)
@@ -390,7 +390,7 @@ def test_seeing_is_found_with_the_telescope():
 
 def test_slopes_of_the_field_s_numbers_are_differences():
     telescope, angle = example("ritchey_chretien"), np.array([[0.1, -0.2], [0.0, 0.15]])
-    model = telescope_model(telescope, angle)
+    model = model_telescope(telescope, angle)
     slopes = model.jacobian(model.mean)
     step = np.where(np.array(model.names) == "decentre_x", 1e-4, 0.0)
     change = model.coefficients(model.mean + step) - model.coefficients(model.mean)
@@ -430,7 +430,7 @@ def test_command_finds_the_changed_coma(tmp_path):
 def test_python_lines_of_the_page_run(monkeypatch, capsys):
     telescope, rng = example("zernike"), np.random.default_rng(10)
     angle = field_of(telescope, 7, rng)
-    mean = terms_of(telescope, angle).mean
+    mean = build_terms(telescope, angle).mean
     counts, _ = imaged(telescope, angle, mean, np.zeros((7, 2)), 80.0, rng)
     (lines,) = blocks(read("docs/wavefront.md"), "python")
     monkeypatch.chdir(config_dir().parent)

@@ -10,7 +10,7 @@ import pytest
 from psfdae.base.files import Product
 from psfdae.base.rng import stream
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae.stars.noise import mixed_levels
+from psfdae.stars.noise import draw_levels
 from psfdae.stars.splits import (
     draw_jitter,
     draw_phase,
@@ -170,7 +170,7 @@ def test_noise_is_that_of_the_star_in_every_split_and_independent_between_sets(
 
 def test_every_level_of_a_band_is_drawn_as_often():
     levels = np.array([3e-4, 5e-4, 7e-4, 9e-4])
-    star_levels = mixed_levels(levels, 40000, stream(1, "levels"))
+    star_levels = draw_levels(levels, 40000, stream(1, "levels"))
     values, counts = np.unique(star_levels, return_counts=True)
     assert (values == levels).all()
     assert counts == pytest.approx(np.full(4, 10000), abs=5 * np.sqrt(10000))

@@ -12,7 +12,7 @@ from command_line import printed
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
-from psfdae.methods.field_errors import excess_scatter
+from psfdae.methods.field.errors import excess_scatter
 from psfdae.photometry.crowded import photometry, star_flags
 from psfdae.training.calibration import fit_model_errors
 from psfdae.training.fitting import described, fit_method

@@ -13,7 +13,7 @@ import yaml
 
 from psfdae.base.files import Column, write_product
 from psfdae.base.reading import read_json
-from psfdae.methods import groups_of
+from psfdae.methods import list_groups
 from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
@@ -79,7 +79,7 @@ def point(tmp_path, stars):
 def test_point_is_the_main_workflow_s_fit(point, stars, tmp_path, model):
     assert point.run(model=model)["status"] == "finished"
     main = tmp_path / ("main" if model == "dae" else "main/pca_som.h5")
-    fit(load_stage(groups_of(model), TINY), model, stars, out=main)
+    fit(load_stage(list_groups(model), TINY), model, stars, out=main)
     for name in FILES[model]:
         assert (tmp_path / "main" / name).read_bytes() == (point.folder / name).read_bytes()
 
@@ -232,7 +232,7 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     assert table.best.tolist() == ["no", "no", "no", "yes"]
     overrides = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
     assert overrides == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
-    load_stage(groups_of("dae"), ("preset=smoke", *shlex.split(overrides)))
+    load_stage(list_groups("dae"), ("preset=smoke", *shlex.split(overrides)))
     # Errors on the test stars choose nothing.
     results = [read_json(path) for path in write_points(tmp_path, OUTCOMES)]
     for number, result in enumerate(results):

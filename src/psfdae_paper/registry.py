@@ -85,7 +85,7 @@ def make_bundle(run: TrackedRun) -> Bundle:
     """
     assert run.fit is not None and run.data is not None
     method_class, path = run.fit
-    fit_config, product = method_class.described(path), read_stars(run.data, run.reference)
+    fit_config, product = method_class.read_config(path), read_stars(run.data, run.reference)
     # Groups of settings that decide which stars a fit was trained on, and with which noise.
     groups = ("seed", "noise", "parts")
     config = part(groups, {group: fit_config[group] for group in groups})

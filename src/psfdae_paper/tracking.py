@@ -19,7 +19,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from psfdae.base.belonging import STARS, require_origin
-from psfdae.base.files import ProductError, read_product, sha256_of
+from psfdae.base.files import ProductError, compute_sha256, read_product
 from psfdae.base.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.base.settings import leaves
 from psfdae.denoise.bundle import SUFFIX
@@ -134,7 +134,7 @@ class TrackedRun:
         """Hash of files and settings."""
         # 4 is a version: raise it when other metrics or settings are read from the files, and all
         # runs are imported again.
-        contents = {name: sha256_of(path) for name, path in self.files.items()}
+        contents = {name: compute_sha256(path) for name, path in self.files.items()}
         return compute_hash([4, self.config_hash, contents])
 
     @property
@@ -235,12 +235,12 @@ def _read_fit_run(
     """
     dataset, split, reference = key
     # The model must have been trained on the stars of the dataset.
-    model = results / fits.place_of(kind, *key)
+    model = results / fits.get_fit_path(kind, *key)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
     # The settings of the model are in a file of the fit, the settings of its stars in their
     # product.
-    settings = kind.described(model)
+    settings = kind.read_config(model)
     # The number of the start that succeeded is a result, not a setting.
     settings.pop("attempt", None)
     # Means over the noise levels, the first that MLflow compares, then value and standard error of
@@ -263,15 +263,15 @@ def _read_fit_run(
         if label is None or label[0] in (split, f"{split}-{reference}"):
             figures[f"figures/{name}"] = path
     # Methods that are trained in epochs have a history.
-    storage = fits.storage_of(kind)
+    storage = fits.get_storage(kind)
     history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
-    job = f"{fits.rule_of(kind)}/{fits.stem(kind, *key)}"
+    job = f"{fits.get_rule_name(kind)}/{fits.stem(kind, *key)}"
     return TrackedRun(
         kind=kind.name,
         dataset=dataset,
         split=split,
         reference=reference,
-        source=fits.place_of(kind, *key),
+        source=fits.get_fit_path(kind, *key),
         name=" ".join([kind.name, *key]),
         experiment=from_tree(stars, product.config, "scene", lambda scene: scene["experiment"]),
         files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
@@ -289,7 +289,7 @@ def _model_files(kind: type[Method], path: Path) -> dict[str, Path]:
     """List the files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"{TrackedRun.model_prefix}{file.name}": file for file in fits.own_files(kind, path)}
     # Course of the training and the like, which `load` does not need.
-    diagnostics = fits.storage_of(kind).diagnostics
+    diagnostics = fits.get_storage(kind).diagnostics
     return model | {name: fits.path_beside(kind, path, name) for name in diagnostics}
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from psfdae.methods.field_residuals import MARGIN_PX
-from psfdae.methods.field_search import fit_field, refit_field
+from psfdae.methods.field.residuals import MARGIN_PX
+from psfdae.methods.field.search import fit_field, refit_field
 from psfdae.stars.bright_stars import BrightStars
 from psfdae_paper.source import git_commit
 
@@ -81,7 +81,7 @@ def draw(number):
     conditions = list(zip(seeing, rng.normal(0, SHEAR, (3, 2)), strict=True))
     first, second = (fitted(exposure(rng, 250, at)) for at in conditions[:2])
     hundred = exposure(rng, 100, conditions[2])
-    ten = hundred.of(np.arange(10))
+    ten = hundred.select(np.arange(10))
     models = {"own_100": fitted(hundred), "own_10": fitted(ten, (0,))}
     for name, prior in (("first", first), ("second", second)):
         models[f"10_and_{name}"] = refit_field(prior, ten, *SIZES, SMOOTHNESS).model

@@ -23,7 +23,7 @@ from psfdae.base.files import read_product
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
-from psfdae.methods.metrics import clustered_mean, mse
+from psfdae.methods.metrics import cluster_mean, mse
 from psfdae.training.star_sets import field_positions, read_stars, training_set
 from psfdae_paper.bounds import mode_search
 from psfdae_paper.bounds.estimates import bounded_stars
@@ -61,14 +61,14 @@ def main(results: Path, out: Path, picture: Path) -> None:
             started = time.process_time()
             psf = estimator.estimate(noisy, LEVEL, position).psf
             seconds.append(time.process_time() - started)
-        error, stderr = clustered_mean(mse(psf, truth), stars.field)
+        error, stderr = cluster_mean(mse(psf, truth), stars.field)
         ms = 1000 * min(seconds) / len(noisy)
         rows.append({"method": kind.name, **effort, "mse": error, "stderr": stderr})
         rows[-1] |= {"ms_per_star": ms, "n": len(noisy)}
         print(rows[-1], flush=True)
 
     models = {
-        n: results / fits.place_of(method(n), DATASET, "random", REFERENCE)
+        n: results / fits.get_fit_path(method(n), DATASET, "random", REFERENCE)
         for n in config.methods
         if method(n).storage
     }

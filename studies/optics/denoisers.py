@@ -21,7 +21,7 @@ import pandas as pd
 
 from psfdae.base.threads import limit_threads
 from psfdae.methods.lmmse import LinearMmse
-from psfdae.methods.metrics import clustered_mean, mse
+from psfdae.methods.metrics import cluster_mean, mse
 from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.bounds.estimates import bounded_stars
 from psfdae_paper.configuration.compose import load
@@ -40,7 +40,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
     rows = []
 
     def add(name, level, reference, error, seconds):
-        mean, stderr = clustered_mean(error, stars.field)
+        mean, stderr = cluster_mean(error, stars.field)
         rows.append(
             {
                 "dataset": dataset,

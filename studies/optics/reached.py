@@ -20,7 +20,7 @@ import pandas as pd
 from psfdae.base.files import read_product
 from psfdae.base.threads import limit_threads
 from psfdae.methods import method
-from psfdae.methods.metrics import clustered_mean
+from psfdae.methods.metrics import cluster_mean
 from psfdae.training.star_sets import field_positions, training_set
 from psfdae_paper.bounds.estimates import bounded_stars, true_modes
 from psfdae_paper.bounds.mode_search import climb
@@ -52,7 +52,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
         )
         for (reference, level), pairs in joined.groupby(["reference", "noise_level"]):
             pair = pairs[np.isfinite(pairs.mse_bound)]
-            mse, stderr = clustered_mean(pair.mse.to_numpy(), pair.field.to_numpy())
+            mse, stderr = cluster_mean(pair.mse.to_numpy(), pair.field.to_numpy())
             gap = (pair.mse - pair.mse_bound).to_numpy()
             limit = pair.mse_bound.mean()
             tight = summary.query("method == @bound and reference == @reference")
@@ -60,7 +60,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
             row = {"dataset": dataset, "method": optics, "reference": reference}
             row |= {"noise_level": level, "mse": mse, "stderr": stderr, "bound": limit}
             row |= {"tight": tight, "ratio": mse / limit}
-            row |= {"ratio_stderr": clustered_mean(gap, pair.field.to_numpy())[1] / limit}
+            row |= {"ratio_stderr": cluster_mean(gap, pair.field.to_numpy())[1] / limit}
             row["flagged"] = int((pairs.explained == 0).sum())
             if reference == "realisation":
                 floor = floors[np.isclose(floors.noise_level, level)]

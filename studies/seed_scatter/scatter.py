@@ -98,7 +98,7 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: s
     for seed in map(int, seeds.split(",")):
         training = TrialTraining(trial, data, config.dae, config.train, seed)
         started = time.process_time()
-        while not training.finished():
+        while not training.is_finished():
             row = training.run_epoch()
             print(
                 name,

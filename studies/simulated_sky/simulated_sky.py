@@ -170,7 +170,7 @@ def errors(
     errors clustered by star; `flux_pull` is what 68.27 % of the errors of fluxes are below.
     """
     from psfdae.api import load_model
-    from psfdae.methods.metrics import clustered_mean
+    from psfdae.methods.metrics import cluster_mean
 
     model, npz, rows = load_model(bundle), np.load(truth), []
     listed, place = read_table(selection)[["x", "y"]].to_numpy(), npz["pixel"]
@@ -198,7 +198,7 @@ def errors(
         }
         row["flux_pull"] = np.quantile(off, 0.6827)
         for name, of in within_errors.items():
-            row[name], row[f"{name}_stderr"] = clustered_mean(of.astype(float), star)
+            row[name], row[f"{name}_stderr"] = cluster_mean(of.astype(float), star)
         rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
     pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
 

@@ -55,8 +55,8 @@ def with_sides(text):
 
 def with_half_precision(epochs):
     """Let all epochs of a training, or none, compute with half precision."""
-    half_precision, enabled = training.half_precision, {"all": True, "none": False}[epochs]
-    training.half_precision = lambda _: half_precision(enabled)
+    half_precision, enabled = training.use_half_precision, {"all": True, "none": False}[epochs]
+    training.use_half_precision = lambda _: half_precision(enabled)
 
 
 def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: str) -> None:
@@ -80,7 +80,7 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *settings: s
             with tempfile.TemporaryDirectory() as folder:
                 data = replace(data, seed=seed, checkpoint=Path(folder) / "checkpoint")
                 start = fitted = Dae.fit(data, config.dae, config.train)
-            history = fitted.diagnosed[HISTORY]
+            history = fitted.diagnostic_rows[HISTORY]
             lowest = np.nanmin([row["validation_mse"] for row in history])
             test = split_stars(product, "random", config).test
             rows = []

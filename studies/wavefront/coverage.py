@@ -25,7 +25,7 @@ import psfdae
 from psfdae.base.threads import limit_threads
 from psfdae.sensing import stars as engine
 from psfdae.sensing.joint import TelescopePosterior
-from psfdae.telescope.field import telescope_model, terms_of
+from psfdae.telescope.field import build_terms, model_telescope
 
 TELESCOPE = Path(__file__).parents[2] / "config" / "telescope" / "example_zernike.yaml"
 STAMP_PX, SKY = 16, 1000.0
@@ -99,7 +99,7 @@ def stars(out, count=500):
     """Coverage of the intervals, pooled and of every coefficient."""
     telescope, rng = psfdae.read_telescope(TELESCOPE), np.random.default_rng(29)
     angle = rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
-    terms = terms_of(telescope, angle)
+    terms = build_terms(telescope, angle)
     truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
     noll = [int(name[1:]) for name in terms.names]
     place, snr = rng.uniform(-0.5, 0.5, (count, 2)), np.exp(rng.uniform(*np.log(SNR), count))
@@ -127,10 +127,10 @@ def joint(out, fits=50, count=100, snr=50.0):
     for fit in range(fits):
         rng = np.random.default_rng([29, fit])
         angle = rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
-        model = telescope_model(telescope, angle)
+        model = model_telescope(telescope, angle)
         t = rng.standard_normal(model.sd.size)
         truth = model.mean + model.sd * t
-        terms = terms_of(telescope, angle)
+        terms = build_terms(telescope, angle)
         optics = engine.StarOptics(telescope, terms, STAMP_PX)
         place = rng.uniform(-0.5, 0.5, (count, 2))
         waves = np.einsum("mk,mkj->mj", model.coefficients(truth), terms.to_modes)

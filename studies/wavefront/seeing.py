@@ -19,7 +19,7 @@ import pandas as pd
 import psfdae
 from psfdae.base.threads import limit_threads
 from psfdae.sensing.stars import StarOptics
-from psfdae.telescope.field import telescope_model, terms_of
+from psfdae.telescope.field import build_terms, model_telescope
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
 
@@ -41,7 +41,7 @@ def main(out: Path) -> None:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(-1.0, 1.0, (STARS, 2)) * telescope.field_edge_deg
         true_telescope = example(TRUE_FWHM, 0.0)
-        model, terms = telescope_model(true_telescope, angle), terms_of(true_telescope, angle)
+        model, terms = model_telescope(true_telescope, angle), build_terms(true_telescope, angle)
         truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
         waves = np.einsum("mk,mkj->mj", model.coefficients(truth), terms.to_modes)
         place = rng.uniform(-0.5, 0.5, (STARS, 2))

@@ -17,7 +17,7 @@ import psutil
 from psfdae.base.files import write_csv
 from psfdae.base.options import File
 from psfdae.commands.cli import program
-from psfdae.methods.metrics import clustered_ratio
+from psfdae.methods.metrics import cluster_ratio
 from psfdae_paper.configuration.command import command
 
 TARGETS = (*(f"dataset{n}" for n in range(1, 9)), "scene3", "all")
@@ -67,7 +67,7 @@ def summary(table, old, new):
     lines = [f"{new} over {old}, targets: {', '.join(first.index)}"]
     for name, about in COSTS.items():
         seconds = [second[name].to_numpy(float), first[name].reindex(second.index).to_numpy(float)]
-        ratio, stderr = clustered_ratio(*seconds, np.arange(len(second)))
+        ratio, stderr = cluster_ratio(*seconds, np.arange(len(second)))
         scatter = f" ± {stderr:.3f}" if len(second) > 1 else ""
         lines.append(
             f"  {about} {seconds[1].sum():.0f} -> {seconds[0].sum():.0f} s: {ratio:.3f}{scatter}"

@@ -17,7 +17,7 @@ from psfdae.base.options import File
 from psfdae.base.reading import read_table
 from psfdae.base.settings import Group
 from psfdae.commands.cli import program
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import config_dir, load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -65,7 +65,7 @@ def method_class(name):
 
 def groups(name, **options):
     """Return the groups of the configuration that decide error and time of a method."""
-    of_fit = groups_of(name) if name != "denoisers" else ("noise", "parts")
+    of_fit = list_groups(name) if name != "denoisers" else ("noise", "parts")
     return tuple(dict.fromkeys((*SIMULATION, *of_fit, "bounds", "evaluation")))
 
 

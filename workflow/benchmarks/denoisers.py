@@ -50,7 +50,7 @@ class Denoisers(Method):
         Denoising function and strength by noise level λ.
     """
 
-    look = Look("denoisers", "#8c510a", "P", drawn=False)
+    look = Look("denoisers", "#8c510a", "P", is_drawn=False)
     needs = Needs(level=True, validation=True)
     storage = packing = None
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from costs import method_class
-from psfdae.base.figures import SERIES_COLORS, new_figure, styled, write_png
+from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure, write_png
 from psfdae.base.files import ProductError
 from psfdae.base.options import File
 from psfdae.base.reading import read_table
@@ -74,7 +74,7 @@ def draw(
         rows = rows[rows["scene"] == scene]
         if rows.empty:
             raise ProductError(f"{table}: no rows of scene {scene}")
-    write_png(styled(globals()[kind])(rows), out)
+    write_png(apply_style(globals()[kind])(rows), out)
 
 
 def labelled(axes, x, y, text, shift=3, **style):

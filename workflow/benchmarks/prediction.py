@@ -21,7 +21,7 @@ from psfdae.base.options import File
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
 from psfdae.commands.cli import program
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.stars.noise import NoiseModel, draw_levels
 from psfdae.stars.splits import draw_jitter
 from psfdae.training import star_sets
 from psfdae_paper.configuration.command import command
@@ -86,7 +86,7 @@ def make_cube(tree, stars, count, out):
     cube = np.empty((count, *images.shape[1:]), np.float32)
     for start in range(0, count, BARE_STAMPS):
         rows = np.arange(start, min(start + BARE_STAMPS, count))
-        flux = noise.flux(mixed_levels(np.asarray(tree["noise"]["levels"]), rows.size, rng))
+        flux = noise.flux(draw_levels(np.asarray(tree["noise"]["levels"]), rows.size, rng))
         light = flux[:, None, None] * images[rows % len(images)]
         cube[rows] = rng.poisson(light + noise.background)
     write_cube(out, cube, PIXSCALE=tree["telescope"]["pixel_scale_arcsec"], GAIN=1.0)
@@ -126,7 +126,7 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.base.threads import one_thread_each, side_by_side
+    from psfdae.base.threads import run_parallel, use_one_thread_each
     from psfdae.methods.networks.dae import run_network
 
     side, factor, network = model.stamp_px, model.info.image_scale, model.method.network
@@ -145,8 +145,8 @@ def bare_rate(model, stamps, threads, way):
         seconds = Timer(partial(apply, images)).timeit(rounds)
         torch.set_num_threads(threads_before)
     else:
-        with one_thread_each():
-            seconds = Timer(partial(side_by_side, apply, blocks, threads)).timeit(1)
+        with use_one_thread_each():
+            seconds = Timer(partial(run_parallel, apply, blocks, threads)).timeit(1)
     return rounds * len(images) / seconds
 
 

@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 
 from measure import isolated, pareto, time_in_rounds, use_threads, yes
-from psfdae.base.threads import side_by_side
+from psfdae.base.threads import run_parallel
 from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
 from psfdae.optics.pupil import SamplingError
 from psfdae_paper.stars.framing import normalise_flux
@@ -165,7 +165,7 @@ def ready(case, setting, batches):
     threads = setting.threads if (setting.method, setting.backend) == ("kernel", "numpy") else 1
 
     def run(count):
-        side_by_side(lambda _: propagate(), range(count), threads)
+        run_parallel(lambda _: propagate(), range(count), threads)
 
     run(threads)
     return partial(run, batches)

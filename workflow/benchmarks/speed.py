@@ -18,7 +18,7 @@ from psfdae.base.options import File
 from psfdae.base.rng import stream
 from psfdae.commands.cli import program
 from psfdae.methods import method
-from psfdae.methods.fit_files import rule_of
+from psfdae.methods.fit_files import get_rule_name
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.methods import all_groups
@@ -247,7 +247,7 @@ def measured(config, folder):
         models = ["--dataset", "measured"]
         for kind, place in places.items():
             checkpoint_option = ["--checkpoint", folder / "fit.pt"]
-            cost(rule_of(kind), ["fit", kind.name, *stars_option, *checkpoint_option], place)
+            cost(get_rule_name(kind), ["fit", kind.name, *stars_option, *checkpoint_option], place)
             models += [f"--{kind.name.replace('_', '-')}", place]
         models += ["--per-star", folder / "per_star.parquet", "--restored", folder / "shown.h5"]
         cost("evaluate", ["evaluate", *stars_option, *models], folder / "summary.csv")

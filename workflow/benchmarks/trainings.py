@@ -15,7 +15,7 @@ from psfdae.base.settings import Reference
 from psfdae.base.threads import limit_threads
 from psfdae.commands.cli import program
 from psfdae.methods import fit_files as fits
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae.training import star_sets
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
@@ -23,7 +23,7 @@ from psfdae_paper.configuration.schema import Config
 SEEDS = 5  # of each method: that of the configuration and the next ones
 
 
-@command("seeds", reads=lambda name, **options: (*groups_of(name), "evaluation"))
+@command("seeds", reads=lambda name, **options: (*list_groups(name), "evaluation"))
 def seeds(
     config: Config,
     name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
@@ -59,7 +59,7 @@ def own_fits(config, kind, dataset, references, product, results):
     by_reference = {}
     for reference in references:
         if kind.storage:
-            place = results / fits.place_of(kind, dataset, "random", reference)
+            place = results / fits.get_fit_path(kind, dataset, "random", reference)
             fits.require(kind, place, product, config, "random", reference)
             by_reference[reference] = kind.load(place, reference, config.evaluation)
         else:

@@ -1,7 +1,7 @@
 # A rule for each method whose fit can be packed: bundle (DAE), bundle_gmm, …; a method that is
 # plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage and m.packing):
-    _suffix = fit_files.suffix_of(_method)
+    _suffix = fit_files.get_bundle_suffix(_method)
     _stem = f"{{dataset}}-{{split}}-{{reference}}{_suffix}"
 
     rule:

@@ -320,7 +320,7 @@ def products_of_scene(experiment):
 
 def model_of(method, dataset, split, reference):
     """Folder or file of a fit."""
-    return f"{RESULTS}/{fit_files.place_of(method, dataset, split, reference)}"
+    return f"{RESULTS}/{fit_files.get_fit_path(method, dataset, split, reference)}"
 
 
 def names_of(dataset):
@@ -361,7 +361,7 @@ def model_options(dataset, split, reference):
 def bundles_of(dataset, networks):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
-        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{fit_files.suffix_of(m)}.psf.safetensors"
+        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{fit_files.get_bundle_suffix(m)}.psf.safetensors"
         for m in methods_of(dataset)
         if m.packing
         for split, reference in networks

@@ -1,7 +1,7 @@
 # A rule for each method that stores a fit: train (DAE), baseline (PCA+SOM), fit_gmm, fit_gmm_position,
 # … (`Storage.rule` of the method's class). A method that is plugged in gets its rule here, too.
 for _method in (m for m in registered() if m.storage):
-    _rule = fit_files.rule_of(_method)
+    _rule = fit_files.get_rule_name(_method)
     _stem = fit_files.stem(_method, "{dataset}", "{split}", "{reference}")
     _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
     _place = model_of(_method, "{dataset}", "{split}", "{reference}")

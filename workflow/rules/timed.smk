@@ -3,7 +3,7 @@
 # Programs are those of workflow/benchmarks, by file and function.
 TIMED_BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 TIMED_MIXTURE = TIMED_BUNDLE.replace(
-    "realisation", f"realisation{fit_files.suffix_of(method('gmm'))}"
+    "realisation", f"realisation{fit_files.get_bundle_suffix(method('gmm'))}"
 )
 OWN_MODEL = f"{RESULTS}/own_stars/example/model"
 

@@ -27,9 +27,9 @@ class ArgumentError(Error, TypeError, ValueError):
 
 
 def check_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function that checks its arguments (`check_values`) before it does anything.
+    """Decorate a function so that it checks its arguments (`check_values`) before it runs.
 
-    Its signature has each of the keywords that `**options: Unpack[…]` stands for.
+    Its signature shows each of the keywords that `**options: Unpack[…]` stands for.
     """
     signature = inspect.signature(function)
 
@@ -76,27 +76,27 @@ def expand_keywords(
 def check_values(function: Callable[..., Any], values: Mapping[str, Any], **names: Any) -> None:
     """Check values by the annotations of the arguments of a function.
 
-    Numbers may be numpy's. Values that numpy makes an array of are not checked here.
+    Numbers may be scalars of numpy. Arguments that are converted to arrays are not checked here.
 
     Parameters
     ----------
     function : callable
-        Its annotations are texts (`from __future__ import annotations`).
+        Function whose annotations are texts (`from __future__ import annotations`).
     values : mapping
-        Values by the names of its arguments; others are ignored.
+        Values by the names of its arguments; other names are ignored.
     **names
-        Types of names in the annotations, in place of those of the function's module.
+        Types of names in the annotations, which override the names of the function's module.
 
     Raises
     ------
     ArgumentError
-        Names the argument and what is expected.
+        For the first wrong argument; names it and the expected types.
     """
     plain = {n: v.item() if isinstance(v, np.generic) else v for n, v in values.items()}
     try:
         argument_model(function, **names).model_validate(plain)
     except ValidationError as error:
-        # All types that the first wrong argument may have.
+        # All types that are allowed for the first wrong argument.
         problems = error.errors(include_url=False)
         name = str(problems[0]["loc"][0])
         kinds = [p["msg"].removeprefix("Input should be ") for p in problems if p["loc"][0] == name]
@@ -106,13 +106,13 @@ def check_values(function: Callable[..., Any], values: Mapping[str, Any], **name
 
 @cache
 def argument_model(function: Callable[..., Any], **names: Any) -> type[BaseModel]:
-    """Return a model of pydantic whose fields are the arguments of a function."""
-    # Names that are imported for a type checker alone mean any type.
+    """Return a pydantic model whose fields are the arguments of a function."""
+    # Names that are imported only for a type checker stand for any type.
     scope: dict[str, Any] = defaultdict(lambda: Any, vars(builtins) | function.__globals__)
     scope |= {"ArrayLike": Any, "Numbers": Any} | names
     instance_of: Any = InstanceOf  # for mypy, which takes it for a type
     for name, kind in scope.items():
-        # Of an object of psfdae, only the class is checked.
+        # Only the class is checked for objects of psfdae.
         if isinstance(kind, type) and kind.__module__.startswith("psfdae"):
             scope[name] = instance_of[kind]
     signature = inspect.signature(function, globals={}, locals=scope, eval_str=True)
@@ -131,10 +131,10 @@ def real_numbers(name: str, values: ArrayLike, error: type[Error] = ArgumentErro
     Raises
     ------
     error
-        If the values, called `name` in the message, are no real numbers.
+        If the values, called `name` in the message, are not real numbers.
     """
     # Floats of up to 32 bits become float32, all other numbers float64.
-    # Texts, complex numbers, lists of different lengths and objects are refused.
+    # Texts, complex numbers, lists of different lengths and objects are rejected.
     array = np.asarray(None)
     with suppress(ValueError):
         array = np.asarray(values)

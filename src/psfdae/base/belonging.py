@@ -1,11 +1,11 @@
 """Checks that products belong together, by the settings that their files carry.
 
 A product carries the configuration that made it. A network or a fitted baseline has the
-configuration of its training stars in a file beside it. Settings that only one side states are
-not compared, nor are those that change no result (names, threads, batches).
+configuration of its training stars in a file next to it. Settings that only one side has are not
+compared, nor are settings that change no result (names, threads, batches).
 
-Two configurations and the keys to compare go in; nothing comes out, or a `ProductError` with the
-first key that differs.
+Inputs: two configurations and the keys to compare. A difference raises a `ProductError` that names
+the first key that differs.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def require(
     path: Path,
     config: Mapping[str, Any],
     keys: Sequence[str],
-    expected: Mapping[str, Any] | BaseModel,
+    expected_config: Mapping[str, Any] | BaseModel,
     expected_from: object = "the configuration",
 ) -> None:
-    """Refuse an input of other settings than those of a stage, or of another input.
+    """Raise an error if the settings of an input differ from a stage's or another input's.
 
     Parameters
     ----------
@@ -59,21 +59,21 @@ def require(
     config : mapping
         The configuration that it carries.
     keys : sequence of str
-        Dotted keys, and groups of them, that must agree where both sides state them.
-    expected : mapping or pydantic model
+        Dotted keys, or groups of keys, that must agree where both sides have them.
+    expected_config : mapping or pydantic model
         Configuration of the stage, or of another input.
     expected_from : object
-        The other side in the message: the path of another input.
+        Name of the other side in the message, such as the path of another input.
 
     Raises
     ------
     ProductError
         For the first key that differs, with both values.
     """
-    tree = expected if isinstance(expected, Mapping) else expected.model_dump()
+    tree = expected_config if isinstance(expected_config, Mapping) else expected_config.model_dump()
     # The first difference is the message: the others often follow from it.
     for key in keys:
-        difference = _difference(key, _at(config, key), _at(tree, key), is_partial=True)
+        difference = _difference(key, _look_up(config, key), _look_up(tree, key), is_partial=True)
         if difference is not None:
             name, value, expected_value = difference
             raise ProductError(
@@ -81,8 +81,9 @@ def require(
             )
 
 
-def _at(tree: Any, key: str) -> Any:
+def _look_up(tree: Any, key: str) -> Any:
     """Return the value of a dotted key of a tree; None if it is not there."""
+    # One level of the tree after the other.
     for name in key.split("."):
         tree = tree.get(name) if isinstance(tree, Mapping) else None
     return tree
@@ -102,7 +103,7 @@ def _difference(
     is_partial : bool
         Whether a side may leave out the value, or some of the keys of a group.
     """
-    # What a side does not state is not compared.
+    # A value that one side does not have is not compared.
     if is_partial and (first is None or second is None):
         return None
     if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
@@ -110,14 +111,14 @@ def _difference(
     # Two groups: a key that a side lacks is "nothing" there.
     keys, stated_parts = [*{**first, **second}], set()
     if is_partial:
-        # If both sides state one part of a group by itself, such as aberrations, they state all of
-        # its parts: then a part that one side lacks differs.
+        # If both sides have one part of a group, such as aberrations, they have all of its parts:
+        # then a part that one side lacks is a difference.
         parts = [{k for k, v in side.items() if isinstance(v, Mapping)} for side in (first, second)]
         stated_parts = parts[0] | parts[1] if parts[0] & parts[1] else set()
         keys = sorted({*first} & {*second} | stated_parts)
     for key in keys:
-        # Titles say nothing of the bytes. Static PSFs have no random aberrations, whose size is
-        # compared by its own key in `STARS`.
+        # Titles do not change the bytes. Static PSFs have no random aberrations; the size of these
+        # is compared by its own key in `STARS`.
         if key not in ("name", "jitter_waves"):
             absent = {} if key in stated_parts else "nothing"
             values = first.get(key, absent), second.get(key, absent)
@@ -128,29 +129,29 @@ def _difference(
 
 
 def write_origin(model: Path, stars: Product) -> None:
-    """Write a note on the product that a model, a folder or a file, was trained on."""
+    """Write the configuration of the stars on which a model (a folder or a file) was trained."""
     write_text(origin_path(model), as_yaml(stars.config))
 
 
 def origin_path(model: Path) -> Path:
-    """Return the path of the file that says what a model was trained on; see `write_origin`."""
+    """Return the path of the file that `write_origin` writes for a model."""
     return model / TRAINED_ON if model.is_dir() else model.with_name(f"{model.stem}.{TRAINED_ON}")
 
 
 def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[str, Any]:
-    """Refuse a model that was trained on other stars or states than those of a product.
+    """Raise an error if a model was not trained on the stars or states of a product.
 
     Returns
     -------
     dict
-        Configuration of the stars or states that it was trained on; empty if no file says it.
+        Configuration of the stars or states that it was trained on; empty without that file.
 
     Raises
     ------
     ProductError
         For the first of `keys` that differs, or if the file of the origin is damaged.
     """
-    # A model that was copied alone has no note: then nothing is compared.
+    # A model that was copied without this file has no origin to compare.
     path = origin_path(model)
     origin = read_yaml(path) if path.is_file() else {}
     require(path, origin, keys, product.config, product.path)
@@ -164,11 +165,11 @@ def require_training(
     config: Mapping[str, Any] | BaseModel,
     **options: str,
 ) -> None:
-    """Refuse a fit that must not be tested on a product of stars.
+    """Raise an error if a fit must not be tested on a product of stars.
 
-    It must be of stars of the same kind and have the same options. If they are the same stars,
-    those that test the random split must not have trained it: seed and number of training stars
-    must agree.
+    Training and test stars must be of the same kind, and the options must agree. If they are the
+    same stars, the test stars of the random split must not have been in the training: seed and
+    number of training stars must agree.
 
     Parameters
     ----------
@@ -192,8 +193,8 @@ def require_training(
     origin = require_origin(model, STARS, stars)
     path = model if model.is_file() else model / "config.yaml"
     require(path, fit_config, tuple(options), options, "the command")
-    # Stars of the same draw: the test stars must not have been among those of the training.
-    identities = [(_at(origin, key), _at(stars.config, key)) for key in SAME_STARS]
+    # Stars of the same draw: no test star may have been a training star.
+    identities = [(_look_up(origin, key), _look_up(stars.config, key)) for key in SAME_STARS]
     same_stars = all(first == second and first is not None for first, second in identities)
     if options["split"] == "random" and same_stars:
         require(path, fit_config, ("seed", "parts.train_stars"), config)

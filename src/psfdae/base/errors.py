@@ -1,6 +1,6 @@
-"""The class of all refusals, and the words in which they name settings and missing packages.
+"""Base class of all errors that a user can cause, and the wording of their messages.
 
-Everything that psfdae refuses is an `Error` with one line; a bug is any other exception. A line
+Bad input raises an `Error` whose message is one line; any other exception is a bug. A message
 names keywords (`snr_min=20`) in Python, and options (`--snr-min 20`) in a command.
 """
 
@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 
 
 class Error(Exception):
-    """Something that was given cannot be used; the message names it and says what is expected.
+    """Input that cannot be used; the message names it and the expected values.
 
     Examples
     --------
@@ -39,8 +39,9 @@ _in_command: ContextVar[bool] = ContextVar("in_command", default=False)
 
 
 @contextmanager
-def words_of_a_command() -> Iterator[None]:
-    """Make lines name options and commands meanwhile, in place of keywords and calls."""
+def use_command_words() -> Iterator[None]:
+    """Let messages name options and commands inside the block, not keywords and calls."""
+    # A context variable: other threads keep their own wording.
     token = _in_command.set(True)
     try:
         yield
@@ -55,23 +56,24 @@ def warn(lines: Iterable[str]) -> None:
 
 
 def keyword(name: str, value: object = None) -> str:
-    """Return what a user types to state something: a keyword of Python, or an option.
+    """Return the text with which a user sets a value: a keyword of Python, or an option.
 
     Parameters
     ----------
     name : str
         Name of the keyword.
     value : object, optional
-        What is to be stated; True is an option without a value.
+        Value to set; True is an option without a value, None leaves the value out.
 
     Examples
     --------
     >>> keyword("snr_min", 20), keyword("detect", True), keyword("mask")
     ('snr_min=20', 'detect=True', 'mask=')
-    >>> with words_of_a_command():
+    >>> with use_command_words():
     ...     keyword("snr_min", 20), keyword("detect", True), keyword("pixel_scale_arcsec")
     ('--snr-min 20', '--detect', '--pixel-scale')
     """
+    # Six digits are enough for a user to find the value.
     number = f"{value:.6g}" if isinstance(value, float) else None
     if not _in_command.get():
         return f"{name}=" if value is None else f"{name}={number or repr(value)}"
@@ -86,8 +88,13 @@ def call(python: str, command: str) -> str:
 
 
 @contextmanager
-def needed_by(what: str) -> Iterator[None]:
-    """Around code that may import what an extra brings; `what` begins the message.
+def require_extra(user: str) -> Iterator[None]:
+    """Name the extra to install if the code of the block imports a package of an extra.
+
+    Parameters
+    ----------
+    user : str
+        Beginning of the message: who needs the package, such as "this command".
 
     Raises
     ------
@@ -97,20 +104,21 @@ def needed_by(what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        line = missing(error, what)
+        line = missing(error, user)
         if line is None:
             raise
         raise MissingExtraError(line, name=error.name) from error
 
 
-def missing(error: ModuleNotFoundError, what: str) -> str | None:
-    """Return the line that says what to install for `what`; None if no extra brings the module.
+def missing(error: ModuleNotFoundError, user: str) -> str | None:
+    """Return the line that names the extra to install; None if no extra has the module.
 
     Parameters
     ----------
     error : ModuleNotFoundError
-    what : str
-        Beginning of the line, such as "this command".
+        Error of an import, with the name of the module.
+    user : str
+        Beginning of the line: who needs the module, such as "this command".
     """
     try:
         lines = requires("psfdae") or []
@@ -119,22 +127,22 @@ def missing(error: ModuleNotFoundError, what: str) -> str | None:
     # Packages and extras of lines of the metadata such as: hydra-core>=1.3; extra == "paper".
     matches = (re.match(r"([A-Za-z0-9._-]+).*extra == [\"']([^\"']+)", line) for line in lines)
     extras = {match[1]: match[2] for match in reversed([*matches]) if match}
-    # A package that is not installed does not say how its module is called: either as itself, or
-    # as the first word of its name, as hydra of hydra-core.
+    # The name of a package that is not installed need not be the name of its module. The module
+    # has the same name, or its first word, as hydra of hydra-core.
     module = error.name or ""
     names = [name for name in extras if name == module or name.startswith(f"{module}-")]
     if not names:
         return None
-    return f"{what} needs {min(names)}: {install_line(extras[min(names)])}"
+    return f"{user} needs {min(names)}: {install_line(extras[min(names)])}"
 
 
 def install_line(extra: str) -> str:
-    """Return the command that installs psfdae with an extra, from where it was installed.
+    """Return the command that installs psfdae with an extra from its present source.
 
-    psfdae is on no package index: pip needs the folder or wheel that it was installed from, which
-    it has noted in direct_url.json (PEP 610).
+    psfdae is on no package index: pip needs the folder or wheel from which it was installed. pip
+    has written it to direct_url.json (PEP 610).
     """
-    # pip leaves no note for a package from an index, or from a folder on the path of Python.
+    # The file is absent for a package from an index, or from a folder on the path of Python.
     try:
         note = json.loads(distribution("psfdae").read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
@@ -146,32 +154,34 @@ def install_line(extra: str) -> str:
 
 
 def did_you_mean(word: str, names: Iterable[str]) -> str:
-    """Return "; did you mean NAME?" with at most three names that are like a word, or "".
+    """Return "; did you mean NAME?" with at most three names that are similar to a word, or "".
 
-    Names whose last part is the word's are the likeliest: train.lr for lr. Others are alike in
-    their letters.
+    Names with the same last part come first: train.lr for lr. Otherwise the most similar spelling
+    is chosen.
     """
+    # Keys of settings are dotted; the last part is the name of the setting in its group.
     names = [str(name) for name in names if name != word]
     last_part = word.rpartition(".")[2]
-    alike = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
-    alike = sorted(alike, key=len) or get_close_matches(word, names, n=1)
-    return f"; did you mean {' or '.join(alike[:3])}?" if alike else ""
+    similar = [name for name in names if "." in name and name.rpartition(".")[2] == last_part]
+    similar = sorted(similar, key=len) or get_close_matches(word, names, n=1)
+    return f"; did you mean {' or '.join(similar[:3])}?" if similar else ""
 
 
 def require_file(path: Path) -> None:
-    """Raise Error for a pipe or a device, whose opening or reading might never end."""
-    # Readers have their own words for a path that is missing.
+    """Raise Error for a pipe or a device, because opening or reading it might never end."""
+    # Readers report a missing path themselves.
     with suppress(OSError):
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise Error(f"{path}: a pipe or a device, expected a file")
 
 
 def no_such_file(path: Path) -> str:
-    """Return the line that refuses a file which does not exist, with one of its folder like it."""
+    """Return the message for a missing file, with the most similar name in its folder."""
+    # The folder itself may be missing, or may not be readable.
     try:
         names = [neighbour.name for neighbour in path.parent.iterdir()]
     except OSError:
         return f"{path}: no such file, nor is there a folder {path.parent}"
-    # File names are alike in their letters: parts between dots have no meaning of their own.
-    alike = get_close_matches(path.name, names, n=1)
-    return f"{path}: no such file" + "".join(f"; did you mean {name}?" for name in alike)
+    # By their spelling: parts between dots have no meaning of their own in file names.
+    similar = get_close_matches(path.name, names, n=1)
+    return f"{path}: no such file" + "".join(f"; did you mean {name}?" for name in similar)

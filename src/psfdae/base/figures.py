@@ -1,6 +1,7 @@
 """Style of all figures, and the figure of restored stars.
 
-In: stamps of stars, or a function that draws. Out: figures of one width and style, and PNG files.
+Inputs: stamps of stars, or a function that draws a figure. Outputs: figures of one width and
+style, and PNG files.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ Inches = tuple[float, float]
 Drawing = Callable[..., "Figure"]
 
 
-def in_style() -> AbstractContextManager[None]:
-    """Return a context with the style of all figures, whatever matplotlibrc the user has."""
+def use_style() -> AbstractContextManager[None]:
+    """Return a context with the style of all figures, independent of the user's matplotlibrc."""
     import matplotlib.style
 
     # Sizes of text in points, for figures as wide as a page.
@@ -54,33 +55,34 @@ def in_style() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", style])
 
 
-def styled(draw: Drawing) -> Drawing:
+def apply_style(draw: Drawing) -> Drawing:
     """Decorate a function that draws a figure, so that it uses the style of all figures.
 
-    Its texts are drawn as they are: a name with dollars is not a formula.
+    Texts are not parsed as formulae: a name may contain dollar signs.
     """
 
     @wraps(draw)
-    def wrapped(*args: Any, **kwargs: Any) -> Figure:
+    def draw_in_style(*args: Any, **kwargs: Any) -> Figure:
         from matplotlib.text import Text
 
-        with in_style():
+        with use_style():
             figure = draw(*args, **kwargs)
-        # Formulae are numbers at ticks, such as 10⁻³, which matplotlib writes when it draws.
+        # Labels of ticks, such as 10⁻³, are formulae. matplotlib makes them later, when it draws,
+        # so that they are still empty here.
         for text in figure.findobj(Text):
             if text.get_text():
                 text.set_parse_math(False)
         return figure
 
-    return wrapped
+    return draw_in_style
 
 
 def new_figure(height_in: float, **kwargs: Any) -> Figure:
-    """Return an empty figure of the common width, outside pyplot's global state."""
+    """Return an empty figure of the common width, outside of pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # A canvas of its own draws it without a screen.
+    # The Agg canvas draws without a screen.
     figure = Figure(figsize=(WIDTH_IN, height_in), **kwargs)
     FigureCanvasAgg(figure)
     return figure
@@ -88,10 +90,11 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
 
 def as_png(figure: Figure, dpi: int = 150) -> bytes:
     """Return a figure as PNG; the same figure gives the same bytes."""
+    # In memory first, so that a file is written atomically.
     content = BytesIO()
     # The style is needed again, because matplotlib makes ticks only now. Its default metadata
-    # have its version.
-    with in_style():
+    # would contain its version.
+    with use_style():
         figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
 
@@ -135,11 +138,11 @@ class StripRow:
 
 
 def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
-    """Select stars that lie evenly over the field, the same for the same stars.
+    """Select stars that lie evenly over the field, without any random choice.
 
     The targets ((k + ½)/n, fraction of ½ + k/φ), with φ the golden ratio, are a
-    lattice that fills the square evenly; the first star nearest to each is
-    taken, so the result goes from left to right.
+    lattice that fills the unit square evenly. The star nearest to each target is
+    selected; the targets go from left to right.
 
     Parameters
     ----------
@@ -162,19 +165,19 @@ def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
     target = low + target * (high - low)
     # The nearest star to each target that is not yet selected.
     available = np.ones(len(position), dtype=bool)
-    selected = []
+    indices = []
     for point in target:
         distance = np.where(available, np.hypot(*(position - point).T), np.inf)
         # Rounding must not choose between equally near stars.
         nearest = int(np.argmax(distance <= distance.min() * (1.0 + 1e-9)))
         available[nearest] = False
-        selected.append(nearest)
-    return np.array(selected, dtype=int)
+        indices.append(nearest)
+    return np.array(indices, dtype=int)
 
 
-@styled
+@apply_style
 def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: str) -> Figure:
-    """Draw stars before and after restoration, as in the paper; the first row is the reference.
+    """Draw stars before and after restoration, as in the paper; the first row is the target.
 
     All stamps of a column share the colour scale 0 … maximum of the first row,
     on a square-root scale, except rows with `own_scale`.
@@ -196,7 +199,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
     # Cells of equal width from the labels to the right margin.
-    axes = in_inches(figure)
+    axes = add_axes_in(figure)
     step = (WIDTH_IN - margin_left - margin_right) / len(columns)
     # Stamps fill 97 % of their cells.
     middle = margin_left + step * (np.arange(len(columns)) + 0.5 * 0.97)
@@ -224,8 +227,9 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     return figure
 
 
-def in_inches(figure: Figure) -> Axes:
+def add_axes_in(figure: Figure) -> Axes:
     """Return empty axes over a whole figure, in inches from its lower left corner."""
+    # One unit of the axes is an inch on the page.
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     axes.set(xlim=(0.0, figure.get_figwidth()), ylim=(0.0, figure.get_figheight()))

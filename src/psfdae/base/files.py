@@ -1,8 +1,8 @@
-"""Files that are either whole or absent, and data products that describe themselves.
+"""Files that are either complete or absent, and data products that describe themselves.
 
-Tables, texts and images go in, and files come out: `write_text`, `write_csv`, `write_fits` and
-others. A product is an HDF5 file with arrays, their units and the configuration that made them:
-`write_product` and `stream_product` write it, `read_product` reads it.
+`write_text`, `write_csv`, `write_fits` and others write tables, texts and images. A product is an
+HDF5 file with arrays, their units and the configuration that made them: `write_product` and
+`stream_product` write it, `read_product` reads it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class ProductError(Error, RuntimeError):
-    """Error of a data product that is missing, damaged, or not what the stage expects."""
+    """Error of a data product that is missing, damaged, or not the product that is expected."""
 
 
 class OutputError(Error, ValueError):
@@ -78,8 +78,8 @@ def resolve_output(path: Path) -> Path:
     Raises
     ------
     OutputError
-        If there is something else than a regular file: a device, a pipe, a folder, or a symbolic
-        link in a circle.
+        If `path` exists and is not a regular file: a device, a pipe, a folder, or a symbolic link
+        in a circle.
     """
     path = Path(os.path.realpath(path))
     if os.path.lexists(path) and not path.is_file():
@@ -96,9 +96,9 @@ _pending_renames: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("pendi
 def rename_together(main: Path) -> Iterator[None]:
     """Give the files of a block their names at its end, `main` last; if it fails, write none.
 
-    A command with several outputs is inside it. If `main` exists, all outputs are whole. If the
-    process is killed between two renames, the temporary file of `main` is left, which `is_cut_off`
-    finds, so that the same command may replace the other outputs.
+    A command writes several outputs inside it. If `main` exists, all outputs are complete. If the
+    process is killed between two renames, the temporary file of `main` is left. `is_cut_off` finds
+    it, so that the same command may replace the other outputs.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def rename_together(main: Path) -> Iterator[None]:
     token = _pending_renames.set(renames)
     try:
         yield
-        # Each file is on the disk already: the renames need no space.
+        # The content of each file is on the disk already: renames need no space.
         for temporary, path in sorted(renames, key=lambda pair: pair[1] == main):
             temporary.replace(path)
     finally:
@@ -119,17 +119,18 @@ def rename_together(main: Path) -> Iterator[None]:
 
 
 def is_cut_off(main: Path) -> bool:
-    """Return whether a command was killed before its output `main`, and so all, had its name."""
+    """Return whether a command was killed before its outputs had their names, `main` the last."""
+    # Names as `temporary_name` makes them, of any process.
     main = resolve_output(main)
     return not main.exists() and any(main.parent.glob(f".{escape(main.name[:40])}.*.tmp"))
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a new, empty file beside `path`; rename it onto `path` if the block succeeds.
+    """Yield a new, empty file next to `path`; rename it to `path` if the block succeeds.
 
-    A reader therefore never sees a half-written file, and an interrupted stage leaves nothing
-    that looks finished. A file that is replaced keeps its permissions, and a symbolic link to it
+    A reader therefore never sees an incomplete file, and an interrupted stage leaves no file that
+    looks complete. A file that is replaced keeps its permissions, and a symbolic link to it
     stays. A writer that is killed leaves its temporary file, which the next writer of `path`
     removes.
 
@@ -155,7 +156,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     for left_over in find_left_over(path.parent, path.name):
         left_over.unlink(missing_ok=True)
     temporary = path.with_name(temporary_name(path.name))
-    # Permissions of the file that is replaced; a new one has those of the user's mask.
+    # Permissions of the file that is replaced; a new one follows the user's mask.
     mode = path.stat().st_mode if path.exists() else None
     try:
         # Nobody else reads the content before it has its permissions.
@@ -164,7 +165,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         # Some file systems have the same permissions for all files, and refuse a change.
         if mode not in (None, temporary.stat().st_mode):
             temporary.chmod(mode)
-        # The content is on the disk before it has its name, in case that the power fails between.
+        # The content is on the disk before the rename, in case the power fails in between.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         if (renames := _pending_renames.get()) is None:
@@ -172,7 +173,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         else:
             renames.append((temporary, path))
     except OSError as error:
-        # Libraries leave out which file a full disk has no space for, or name the temporary one.
+        # If the disk is full, libraries name the temporary file, or none.
         if error.errno is not None and error.filename in (None, temporary, str(temporary)):
             error.filename = str(path)
         raise
@@ -196,7 +197,7 @@ def no_formula(cell: Any) -> Any:
     """Return a text with an apostrophe before it if a spreadsheet would execute it.
 
     Spreadsheets execute cells that begin with = + - @, a tab or a carriage return. Numbers such as
-    -1.5, in texts or not, stay as they are. A carriage return, with which a row ends, is a blank.
+    -1.5, also as texts, are unchanged. A carriage return, which would end the row, becomes a blank.
     """
     if not isinstance(cell, str):
         return cell
@@ -211,7 +212,7 @@ def no_formula(cell: Any) -> Any:
 
 
 def strip_apostrophe(cell: Any) -> Any:
-    """Return the cell that `no_formula` has changed; any other one stays."""
+    """Undo `no_formula`: return its argument; cells without such an apostrophe are unchanged."""
     is_changed = isinstance(cell, str) and cell[:1] == "'" and no_formula(cell[1:]) == cell
     return cell[1:] if is_changed else cell
 
@@ -222,16 +223,16 @@ def map_texts(table: DataFrame, change: Callable[[Any], Any]) -> DataFrame:
     for name in [name for name in table if table[name].dtype.kind == "O"]:
         values = table[name].tolist()
         new_values = [*map(change, values)]
-        # A column of which nothing changes keeps its type.
+        # A column without changes keeps its type.
         if any(new is not old for new, old in zip(new_values, values, strict=True)):
             table[name] = new_values
     return table.rename(columns=change)
 
 
 def write_csv(path: str | Path, table: DataFrame, digits: int = 8) -> None:
-    """Write a DataFrame as CSV with so many significant digits of a number, atomically.
+    """Write a DataFrame as CSV, atomically; numbers have `digits` significant digits.
 
-    No text is a formula to a spreadsheet; `psfdae.base.reading.read_table` undoes this.
+    No text is a formula for a spreadsheet; `psfdae.base.reading.read_table` undoes this.
     """
     table = map_texts(table, no_formula)
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
@@ -245,6 +246,7 @@ def write_columns(
     Parameters
     ----------
     path : path-like
+        The file to write; replaced atomically.
     columns : mapping of str to iterable
         Values by the name of the column.
     digits : int
@@ -269,7 +271,8 @@ def write_parquet(path: str | Path, table: DataFrame) -> None:
 
 
 def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows with equal keys as CSV, the numbers with all digits, no text a formula."""
+    """Return rows with equal keys as CSV, numbers with all digits, texts by `no_formula`."""
+    # The first row gives the names and the order of the columns.
     names = [*rows[0]] if rows else []
     return _csv_text([names, *([row[name] for name in names] for row in rows)])
 
@@ -292,7 +295,7 @@ def write_fits(path: str | Path, hdus: HDUList) -> None:
     """Write an astropy `HDUList` atomically."""
     content = io.BytesIO()
     hdus.writeto(content, output_verify="exception")
-    # Not by astropy, which hides the error of a full disk.
+    # astropy itself would hide the error of a full disk.
     write_bytes(path, content.getvalue())
 
 
@@ -347,13 +350,13 @@ def stream_product(
     """Write a product piece by piece, so that it never has to fit into memory.
 
     The block fills the arrays of the `Empty` columns, best in the order of their rows:
-    `data["psf"][start:stop] = …`. The file is that of `write_product` but for the shape of the
-    chunks, and appears under its name only when the block has succeeded.
+    `data["psf"][start:stop] = …`. The file differs from one by `write_product` only in the shape
+    of its chunks, and appears under its name only when the block has succeeded.
 
     Parameters
     ----------
     path, kind, columns, config
-        As for `write_product`. An `Empty` that is the very object of an earlier one is a link.
+        As for `write_product`. An `Empty` that is the same object as an earlier one is a link.
 
     Yields
     ------
@@ -370,13 +373,13 @@ def stream_product(
     import h5py
 
     with atomic_path(path) as temporary, _SafeFile(temporary) as disk, h5py.File(disk, "w") as file:
-        # What the file is: no time of writing, so that equal products are equal bytes.
+        # Description of the file, without the time of writing: equal products are equal bytes.
         file.attrs["kind"] = kind
         file.attrs["psfdae_version"] = __version__
         file.attrs["config"] = json.dumps(config, sort_keys=True)
         names = _create_datasets(file, columns)
         yield {name: file[name] for name in columns}
-        # An error of the disk is raised here, before the file gets its name.
+        # An error of the disk is raised here, before the file is renamed.
         file.flush()
         # HDF5 creates the chunks of an array when they are written.
         for name in names:
@@ -389,8 +392,8 @@ def stream_product(
 class _SafeFile(io.FileIO):
     """File for HDF5 to write to, which raises an error of the disk when it is closed.
 
-    HDF5 2.0 ends the process by a segmentation fault if it cannot write what it has in memory. So
-    it never learns of an error: what follows is thrown away.
+    HDF5 2.0 ends the process by a segmentation fault if it cannot write its buffers. Therefore
+    the error is hidden from HDF5, and everything that it writes afterwards is dropped.
     """
 
     def __init__(self, path: Path) -> None:
@@ -401,7 +404,7 @@ class _SafeFile(io.FileIO):
         """Write all bytes, or none after an error."""
         unwritten = memoryview(content).cast("B")
         size = len(unwritten)
-        # The system may write fewer bytes than it is given, the last time before an error.
+        # The system may write fewer bytes than requested, for example just before an error.
         while self.error is None and unwritten:
             unwritten = unwritten[self._call(super().write, unwritten) :]
         return size
@@ -411,7 +414,7 @@ class _SafeFile(io.FileIO):
         return self._call(super().truncate, size)
 
     def _call(self, change: Callable[[Any], int], value: Any) -> int:
-        """Return what a method of the file returns, 0 after an error, which is kept."""
+        """Call a method of the file and return its result; keep an error, and return 0 then."""
         try:
             return change(value) if self.error is None else 0
         except OSError as error:
@@ -419,7 +422,7 @@ class _SafeFile(io.FileIO):
             return 0
 
     def __exit__(self, *details: object) -> None:
-        """Close the file; raise the first error in place of those of HDF5 that follow from it."""
+        """Close the file; raise its first error in place of HDF5's, which follow from it."""
         super().__exit__(*details)  # type: ignore[arg-type]
         if self.error is not None:
             raise self.error
@@ -431,11 +434,11 @@ def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[
     Returns
     -------
     list of str
-        Names of the columns that are no links to others.
+        Names of the columns that are not links to others.
     """
     import h5py
 
-    # The first name of each array; further names of the same array are links to that.
+    # The first name of each array; further names of the same array become links to it.
     names: dict[int, str] = {}
     for name, column in columns.items():
         array = column.values if isinstance(column, Column) else column
@@ -461,18 +464,18 @@ def _create_datasets(file: File, columns: Mapping[str, Column | Empty]) -> list[
 
 @dataclass(frozen=True)
 class Product:
-    """Data product: its configuration, and its arrays, each read when it is first used.
+    """Data product: its configuration and its arrays, each read when it is first used.
 
     Attributes
     ----------
     path : Path
-        The file, or only a name for messages if the product is in memory as a whole.
+        The file; for a product that is entirely in memory, only a name for messages.
     config : dict
         Resolved configuration of the stage that wrote it.
     arrays : dict of str to ndarray
         Arrays that have been read.
     kind : str
-        Product type, as for `read_product`; "" for a product that is in memory as a whole.
+        Product type, as for `read_product`; "" for a product that is entirely in memory.
     """
 
     path: Path
@@ -481,7 +484,8 @@ class Product:
     kind: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        # A large product is read piece by piece, when its arrays are used.
+        """Return the array of a name, which is read from the file if it is not in memory."""
+        # A large product is read array by array, when they are used.
         if name not in self.arrays and self.kind:
             self.arrays.update(read_product(self.path, self.kind, (name,)).arrays)
         return self.arrays[name]
@@ -493,6 +497,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
     Parameters
     ----------
     path : path-like
+        The HDF5 file.
     kind : str
         Product type that the file must have.
     names : tuple of str, optional
@@ -511,7 +516,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
     require_file(path)
     try:
         with h5py.File(path, "r") as file:
-            # A file of another stage is refused by its kind, before anything of it is used.
+            # The kind is checked before any array is read.
             file_kind = file.attrs.get("kind")
             if file_kind != kind:
                 raise ProductError(f"{path}: a product of kind {file_kind!r}, expected {kind!r}")
@@ -527,28 +532,29 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
 
 
-def sha256_of(path: Path) -> str:
+def compute_sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits."""
+    # The file is read in blocks: products may be larger than the memory.
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
-    """Refuse outputs that are inputs, too, or no regular files.
+    """Raise an error if an output is also an input, or exists and is not a regular file.
 
     Parameters
     ----------
     outputs : iterable of Path or None
-        Files to write; None is passed over.
+        Files to write; None is skipped.
     inputs : iterable
-        Files to read; inputs that are no paths, such as arrays, are passed over.
+        Files to read; inputs that are not paths, such as arrays, are skipped.
 
     Raises
     ------
     OutputError
         For the first output that is an input, a device, a pipe or a folder.
     """
-    # Links and relative names are followed, because they may be the same file.
+    # Links and relative names are resolved, because two names may be the same file.
     input_paths = {Path(os.path.realpath(name)) for name in inputs if isinstance(name, str | Path)}
     for out in outputs:
         if out is not None and resolve_output(out) in input_paths:

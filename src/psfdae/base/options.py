@@ -23,7 +23,7 @@ class NameOrNumber(click.ParamType):  # type: ignore[type-arg]  # click below 8.
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> str | int:
-        """Return a number for up to six digits, and any other text as it is."""
+        """Return a number for up to six digits, and any other text unchanged."""
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
 
 

@@ -1,10 +1,10 @@
-"""How far a long calculation is: what it reports, and what shows it.
+"""Progress of long calculations: tasks report their steps, and a display shows them.
 
-A calculation that may take more than some seconds goes through its pieces by `steps`, or reports
-them to a `task`. A task within a step of another one is a part of it: the bar or line of the outer
-one goes on by as much. Nothing is shown before `show_with` says what shows it, as the package does
-for terminals and the command line for logs (`psfdae.commands.terminal`). Of tasks in other threads
-nothing is shown.
+A calculation that may take more than some seconds iterates over its pieces by `steps`, or reports
+them to a `task`. A task inside a step of another task is a part of it: the bar or line of the outer
+task advances by the corresponding fraction. Nothing is shown until `show_with` sets a display; the
+package does so for terminals, and the command line for logs (`psfdae.commands.terminal`). Tasks in
+other threads are not shown.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import TypeAlias, TypeVar
 Item = TypeVar("Item")
 
 Advance: TypeAlias = Callable[..., object]
-"""Is called with the number of steps done since its last call, and perhaps a text on them."""
+"""Function of the number of steps done since its last call, and optionally a text on them."""
 
 Show: TypeAlias = Callable[[float, str], object]
-"""Is called with the part of a task that is done, from 0 to 1, and a text on its last step."""
+"""Function of the fraction of a task that is done, 0 … 1, and a text on its last step."""
 
 Display: TypeAlias = Callable[[str], AbstractContextManager[Show]]
-"""Shows a task of this name."""
+"""Function that shows a task of the given name while its context is open."""
 
 _display: ContextVar[Display | None] = ContextVar("display", default=None)
 
 
 def show_with(display: Display | None) -> None:
-    """Show tasks from now on by this display; None shows nothing.
+    """Show tasks by this display from now on; None shows nothing.
 
     Examples
     --------
@@ -42,9 +42,9 @@ def show_with(display: Display | None) -> None:
 
 
 @contextmanager
-def displayed_by(display: Display | None) -> Iterator[None]:
-    """Show tasks by this display meanwhile; None shows nothing."""
-    # The value is that of this thread: others go on showing their tasks.
+def use_display(display: Display | None) -> Iterator[None]:
+    """Show tasks by this display inside the block; None shows nothing."""
+    # A context variable: other threads keep their own display.
     token = _display.set(display)
     try:
         yield
@@ -54,19 +54,21 @@ def displayed_by(display: Display | None) -> Iterator[None]:
 
 @contextmanager
 def task(name: str, count: int) -> Iterator[Advance]:
-    """Show how far a task is that has at most so many steps.
+    """Show the progress of a task.
 
     Parameters
     ----------
     name : str
-        What is done, in a few words.
+        Name of the task, in a few words.
     count : int
+        Largest number of steps; the task may end earlier.
 
     Yields
     ------
     callable
-        Takes the number of steps that have been done since its last call, and perhaps a text.
+        Takes the number of steps done since its last call, and optionally a text on them.
     """
+    # Without a display, steps are counted by nobody.
     display, completed_steps = _display.get(), 0
     if display is None:
         yield lambda steps, text="": None
@@ -81,18 +83,19 @@ def task(name: str, count: int) -> Iterator[Advance]:
 
         @contextmanager
         def part(part_name: str) -> Iterator[Show]:
-            """Show a task within a step of this one."""
+            """Show a task inside a step of this one, as a fraction of the step."""
             yield lambda fraction, text: show(
                 (completed_steps + fraction) / max(count, 1), text or part_name
             )
 
-        with displayed_by(part):
+        with use_display(part):
             yield advance
         show(1.0, "")  # a task may need fewer steps
 
 
 def steps(name: str, items: Iterable[Item]) -> Iterator[Item]:
-    """Go through items as a task of this name, each of which is a step."""
+    """Iterate over items as a task of this name; each item is a step."""
+    # A list, because the number of steps is needed at the beginning.
     pieces = list(items)
     with task(name, len(pieces)) as advance:
         for item in pieces:

@@ -1,7 +1,7 @@
-"""Readers of YAML, JSON and CSV; of a wrong or damaged file, one line says what is wrong.
+"""Readers of YAML, JSON and CSV files, with messages of one line for wrong or damaged files.
 
-The path of a file goes in, and plain values or a table come out. What is wrong is a `ProductError`
-that names the file and, if it is known, line and column.
+Inputs: the path of a file. Outputs: plain values or a table. A wrong or damaged file raises a
+`ProductError` that names the file and, where known, line and column.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises
     ------
     ProductError
-        If the file is missing or has something else; names file, line and column.
+        If the file is missing or its content is not a mapping; names file, line and column.
     """
     tree = parse_yaml(path)
     if not isinstance(tree, dict):
@@ -35,14 +35,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(path: Path) -> Any:
-    """Return the content of a YAML file, which is of any type: no code of a file is run.
+    """Return the content of a YAML file, of any plain type; a file cannot run code.
 
     Raises
     ------
     ProductError
         If the file is missing or wrong, or has a key twice; names file, line and column.
     """
-    # Errors of PyYAML take several lines; the place and the problem are in them.
+    # Errors of PyYAML have several lines, which contain the position and the problem.
     try:
         return yaml.load(_text(path), UniqueKeyLoader)
     except yaml.MarkedYAMLError as error:
@@ -52,15 +52,16 @@ def parse_yaml(path: Path) -> Any:
         raise ProductError(f"{path}{place}: {problem or 'no YAML'}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
-    except (yaml.YAMLError, ValueError) as error:  # such as a character, or a date, that is none
+    except (yaml.YAMLError, ValueError) as error:  # a character or a date that is invalid
         raise ProductError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
 
 
 class UniqueKeyLoader(yaml.SafeLoader):
-    """Loader of plain values that refuses a mapping with a key twice; YAML takes the last."""
+    """Loader of plain values that rejects repeated keys of a mapping; PyYAML takes the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the mapping of a node; ConstructorError with the place of a repeated key."""
+        """Return the mapping of a node; raise ConstructorError at a repeated key."""
+        # Keys of this mapping that have been seen.
         keys = set()
         for key, _ in node.value:
             # The merge key << may be there several times.
@@ -74,7 +75,7 @@ class UniqueKeyLoader(yaml.SafeLoader):
 
 def _text(path: Path) -> str:
     """Return the content of a file in UTF-8; raise ProductError if it cannot be read."""
-    # The whole file at once: the files that people write are small.
+    # At once: files that people write are small.
     require_file(path)
     try:
         data = path.read_bytes()
@@ -95,7 +96,7 @@ def _text(path: Path) -> str:
 def from_tree(
     path: Path, tree: Any, key: str, make: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return the value of a key in the content of a file, or what `make` makes of it.
+    """Return the value of a key in the content of a file, converted by `make`.
 
     Parameters
     ----------
@@ -104,17 +105,18 @@ def from_tree(
     tree : object
         Its content.
     key : str
+        Key of the mapping at the top of the file.
     make : callable, optional
-        Makes the result from the value.
+        Function that converts the value to the result; by default the value is returned.
 
     Raises
     ------
     ProductError
-        If the key is missing, or `make` refuses its value.
+        If the key is missing, or `make` raises an error.
     """
     if not isinstance(tree, dict) or key not in tree:
         raise ProductError(f"{path}: key {key!r} is missing")
-    # What `make` raises gets the names of file and key.
+    # Errors of `make` are raised with the names of file and key.
     try:
         return make(tree[key])
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -127,8 +129,9 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises
     ------
     ProductError
-        If the file is missing or damaged, or has something else.
+        If the file is missing or damaged, or its content is not an object.
     """
+    # A damaged file may also be nested too deeply.
     try:
         tree = json.loads(_text(path))
     except (ValueError, RecursionError) as error:
@@ -139,11 +142,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
-    """Read a CSV or Parquet file as a DataFrame; texts are as they were before `no_formula`.
+    """Read a CSV or Parquet file as a DataFrame; apostrophes of `no_formula` are removed.
 
     Parameters
     ----------
     path : Path
+        The file; a name that ends in .parquet is read as Parquet, any other as CSV.
     *columns : str
         Names of columns that it must have.
     **options
@@ -156,11 +160,11 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     """
     import pandas as pd
 
-    # pandas raises ValueError for cells that are not of the type that is asked for.
+    # pandas raises ValueError for cells that are not of the requested type.
     require_file(path)
     try:
         if path.suffix == ".parquet":
-            # pyarrow verifies the checksums of pages only if it is asked to.
+            # pyarrow verifies the checksums of pages only on request.
             table = pd.read_parquet(path, page_checksum_verification=True, **options)
         else:
             table = map_texts(pd.read_csv(path, **options), strip_apostrophe)
@@ -169,7 +173,7 @@ def read_table(path: Path, *columns: str, **options: Any) -> DataFrame:
     except (OSError, ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
-    # Columns beyond those that are asked for are allowed.
+    # Further columns are allowed.
     if missing := [name for name in columns if name not in table]:
         raise ProductError(f"{path}: column {missing[0]!r} is missing")
     return table

@@ -1,10 +1,10 @@
-"""Settings with their types, units, ranges, meanings and defaults, and how they are checked.
+"""Settings with their types, units, ranges, meanings and defaults, and their check.
 
 A group of settings is a class. Its keys are read from keywords, from words `group.key=value` of
-a command line or from YAML; each wrong one is named with its value and the allowed range.
+a command line or from YAML. An error names each wrong key with its value and the allowed range.
 
-Plain mappings go into `parse_settings`, and checked, immutable groups come out. `deciding`,
-`leaves` and `as_overrides` turn groups into mappings and texts again.
+`parse_settings` converts plain mappings to checked, immutable groups. `dump_deciding`, `leaves`
+and `as_overrides` convert groups to mappings and texts.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ SplitKind = Literal["random", "held_out"]
 
 
 NEUTRAL = "cannot change a result"
-"""Marks a setting of which no byte of a result depends: another value repeats no job."""
+"""Marks a setting that does not change any byte of a result: a new value repeats no job."""
 
 CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
 
 
 class Group(BaseModel):
-    """Group of settings: immutable, and without keys beyond those that it declares."""
+    """Group of settings: immutable, and without other keys than it declares."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 Config = Any
-"""Configuration whose attributes are groups. The methods decide which groups there are; therefore
-the class is made when it is needed."""
+"""Configuration whose attributes are groups. Methods add groups; therefore the class is made when
+it is needed."""
 
 
 class ConfigError(Error, ValueError):
-    """Wrong settings; every line names a key, its value and the range."""
+    """Wrong settings; each line of the message names a key, its value and the allowed range."""
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -57,42 +57,44 @@ def parse_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
     Parameters
     ----------
     model : type of pydantic model
+        Class that declares the keys, their types and their ranges.
     tree : mapping
         Values by key; groups are mappings.
 
     Returns
     -------
     pydantic model
-        The settings, with defaults for keys that are not stated.
+        The settings, with defaults for keys that are not given.
 
     Raises
     ------
     ConfigError
-        With a line for each wrong value: key = value: what is allowed.
+        With a line for each wrong value: key = value: allowed range.
     """
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        keys = list(keys_of(model))
+        # All keys of the model, for suggestions in place of an unknown one.
+        keys = list(list_keys(model))
         raise ConfigError("\n".join(_line(e, keys) for e in error.errors())) from None
 
 
-def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    """Yield the dotted keys of a pydantic model, those of its groups after each group's name."""
+def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a pydantic model; keys of a group follow the group's name."""
     for name, field in model.model_fields.items():
         yield prefix + name
         # A group may be one of several classes.
         for group in (field.annotation, *get_args(field.annotation)):
             if isinstance(group, type) and issubclass(group, Group):
-                yield from keys_of(group, f"{prefix}{name}.")
+                yield from list_keys(group, f"{prefix}{name}.")
 
 
 def _line(error: Mapping[str, Any], keys: Iterable[str]) -> str:
-    """Return an error of pydantic's as a line with the key, its value and what is allowed.
+    """Return an error of pydantic as a line with the key, its value and the allowed range.
 
-    `keys` are those that there are: one that is like an unknown key is named.
+    `keys` are all keys that exist: the message names one that is similar to an unknown key.
     """
-    # Some of pydantic's messages say enough, or name the input already.
+    # Some messages of pydantic are complete, or name the input already.
     key = ".".join(str(part) for part in error["loc"])
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
@@ -101,31 +103,31 @@ def _line(error: Mapping[str, Any], keys: Iterable[str]) -> str:
         return f"{key}: missing"
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message
-    # All others get the value, cut to a line or two of a terminal.
+    # All others get the value, cut to one or two lines of a terminal.
     value = repr(error["input"])
     value = value if len(value) <= 200 else f"{value[:200]}…"
     return f"{key} = {value}: {message[0].lower()}{message[1:]}"
 
 
-def deciding(group: Group) -> dict[str, Any]:
-    """Return the settings of a group and its groups, without those that change no result."""
+def dump_deciding(group: Group) -> dict[str, Any]:
+    """Return the settings of a group and its groups, except settings that change no result."""
+    # Neutral settings are removed, group by group.
     tree = group.model_dump()
     for name, field in type(group).model_fields.items():
-        # Groups within the group have such settings of their own.
+        # Groups inside the group may have neutral settings as well.
         value = getattr(group, name)
         if NEUTRAL in field.metadata:
             del tree[name]
         elif isinstance(value, Group):
-            tree[name] = deciding(value)
+            tree[name] = dump_deciding(value)
     return tree
 
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:
-    """Return Hydra overrides that pin every leaf of a tree, in a fixed order.
+    """Return Hydra overrides that set every leaf of a tree, in a fixed order.
 
-    The list is at once a command line, the trigger of a rerun (the same
-    configuration gives the same text, comments and number formats do not count)
-    and something that a person can paste.
+    The list can be pasted as a command line. A rule of the workflow runs again when it changes:
+    the same configuration gives the same text, whatever its comments and number formats.
     """
 
     # Lists without spaces and quotes, as Hydra reads them.
@@ -139,6 +141,7 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     """Return the dotted key and the value of each leaf of a tree, in the order of the tree."""
+    # Keys of a group follow the prefix of the group.
     pairs: list[tuple[str, Any]] = []
     for key, value in tree.items():
         is_group = isinstance(value, Mapping)
@@ -184,24 +187,28 @@ class Parts(Group):
     """Part of the training stars that selects the best state."""
 
 
-# Settings that a function needs, by what of them it uses: the class of all settings is made when
-# it is needed (`Config`), and differs between the library and the paper.
+# Protocols name the settings that a function uses: the class of all settings is made when it is
+# needed (`Config`), and differs between the library and the reproduction of the paper.
 
 
 class WithNoise(Protocol):
-    """Settings with a noise model, which methods use."""
+    """Configuration with a noise model, which methods use."""
 
     @property
-    def noise(self) -> Noise: ...
+    def noise(self) -> Noise:
+        """Noise band of the stars."""
 
 
 class OfFit(WithNoise, Protocol):
-    """Settings that every fit depends on."""
+    """Configuration on which every fit depends."""
 
     @property
-    def seed(self) -> int: ...
+    def seed(self) -> int:
+        """Seed of all random streams."""
+
     @property
-    def parts(self) -> Parts: ...
+    def parts(self) -> Parts:
+        """Sizes of the training, validation and test parts."""
 
 
 class Evaluation(Group):
@@ -214,58 +221,64 @@ class Evaluation(Group):
 
 
 class OfTest(OfFit, Protocol):
-    """Settings that every fit and its test depend on."""
+    """Configuration on which every fit and its test depend."""
 
     @property
-    def evaluation(self) -> Evaluation: ...
+    def evaluation(self) -> Evaluation:
+        """Settings of the metrics of test stars."""
 
 
 class CalibrationStars(Group):
     """Choice of the stars of an image as training data, and the noise that they get."""
 
     snr_min: Positive | None = None
-    """Least S/N of a star that is learnt from; null: 100, and lower, down to 10, where fewer than
-    20 stars have that."""
+    """Minimum S/N of training stars; null: 100, or lower, down to 10, where fewer than 20 stars
+    reach it."""
     isolation_px: Positive = 12.0
     """Distance within which a neighbour is too close."""
     neighbour_ratio: Positive = 0.02
-    """Brightness of such a neighbour, in that of the star, from which it disturbs."""
+    """Smallest brightness of a disturbing neighbour, as a fraction of the star's."""
     misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 2.5
-    """Difference of a misfit from the nearest stars, in that of the median star."""
+    """Difference of a misfit from its nearest stars, in units of the median star's."""
     search_px: Annotated[int, Field(ge=1, le=16)] = 3
     """The brightest pixel is searched within ± this of the catalogue's position."""
     margin_px: Annotated[int, Field(ge=0, le=64)] = 8
     """Pixels around a stamp, in which the sky is measured."""
     stars_min: Annotated[int, Field(ge=1)] = 1
-    """Fewest stars to learn from."""
+    """Minimum number of training stars."""
     light_min: Annotated[float, Field(ge=0, lt=1)] = 0.95
-    """Part of a star's light that stamps hold at least: where those of framing.stamp_px hold less,
-    they are as wide as 98 % take. A stamp_px that is stated is taken as it is; so it is with 0."""
+    """Minimum fraction of a star's light in its stamp. Where stamps of framing.stamp_px hold less,
+    they become wide enough for 98 %. A stamp_px that is given is not changed; 0: never changed."""
     centring_px: Annotated[float, Field(ge=0, le=64)] | None = None
-    """FWHM of the Gaussian that smooths a star before its brightest pixel is searched; null: that
-    of the stars, where their brightest pixels are off their middle."""
+    """FWHM of the Gaussian that smooths a star before its brightest pixel is searched; null: FWHM
+    of the stars where their brightest pixels are off their middle."""
     bins: Annotated[int, Field(ge=1, le=64)] = 4
     """Parts of the field along a side; stars of a part are stacked."""
     snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field([5.0, 10.0, 20.0, 50.0])
-    """S/N to which bright stars are degraded, ascending; those above snr_min / 2, where the stars'
-    own noise would count, are that."""
+    """S/N to which bright stars are degraded, ascending. Values above snr_min / 2, where the noise
+    of the stars themselves would matter, are replaced by snr_min / 2."""
 
     @model_validator(mode="after")
     def _levels(self) -> CalibrationStars:
-        """Refuse S/N that are not ascending."""
+        """Raise ValueError if the S/N are not ascending."""
         if sorted(set(self.snr_levels)) != self.snr_levels:
             raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
         return self
 
     @property
-    def least_snr(self) -> float:
-        """Least S/N of a star that is learnt from, where there are enough stars."""
+    def effective_snr_min(self) -> float:
+        """Minimum S/N of training stars, where there are enough stars."""
         return 100.0 if self.snr_min is None else self.snr_min
 
-    def lower_snr(self) -> list[float]:
-        """Return the least S/N to try in turn if too few stars have more; none if one is stated."""
+    def list_lower_snr(self) -> list[float]:
+        """Return lower limits of the S/N to try in turn where stars are too few.
+
+        The list is empty if `snr_min` is given.
+        """
+        # From the default limit down to 10, where stars still determine a PSF.
         return [70.0, 50.0, 35.0, 25.0, 20.0, 14.0, 10.0] if self.snr_min is None else []
 
-    def degraded(self) -> list[float]:
-        """Return the S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
-        return sorted({min(level, 0.5 * self.least_snr) for level in self.snr_levels})
+    def list_degraded_snr(self) -> list[float]:
+        """Return the S/N to which bright stars are degraded, ascending, at most snr_min / 2."""
+        # Above half of the limit, the noise of the stars themselves would matter.
+        return sorted({min(level, 0.5 * self.effective_snr_min) for level in self.snr_levels})

@@ -36,9 +36,9 @@ from typing import (
 
 import click
 
-from psfdae.base.errors import Error, did_you_mean, install_line, missing, words_of_a_command
-from psfdae.base.joined import joined
-from psfdae.base.progress import displayed_by
+from psfdae.base.entry_points import find_entry_points
+from psfdae.base.errors import Error, did_you_mean, install_line, missing, use_command_words
+from psfdae.base.progress import use_display
 from psfdae.base.version import __version__
 from psfdae.commands import FORMER_NAMES
 from psfdae.commands.terminal import bar_or_lines
@@ -211,17 +211,17 @@ class SettingsCommand(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; `--quiet` is no parameter of its function."""
-        with words_of_a_command():
+        with use_command_words():
             return self.invoke_displayed(ctx)
 
     def invoke_displayed(self, ctx: click.Context) -> Any:
         """Run the command with its progress and summary, or without them if it is quiet."""
         if not ctx.params.pop("quiet"):
-            with displayed_by(bar_or_lines):
+            with use_display(bar_or_lines):
                 return super().invoke(ctx)
         # Errors are written to the other stream.
         with (
-            displayed_by(None),
+            use_display(None),
             Path(os.devnull).open("w", encoding="utf-8") as null,
             redirect_stdout(null),
         ):
@@ -270,7 +270,7 @@ def command_modules() -> dict[str, tuple[str, str]]:
 
 def _packages() -> list[str]:
     """Return the packages with commands: our own, and those that join by entry points."""
-    return ["psfdae.commands", *(point.value for point in joined("commands"))]
+    return ["psfdae.commands", *(point.value for point in find_entry_points("commands"))]
 
 
 def sections(words: Sequence[str]) -> dict[str, list[str]]:

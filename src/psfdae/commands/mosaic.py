@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from psfdae.base.errors import Error, words_of_a_command
+from psfdae.base.errors import Error, use_command_words
 from psfdae.base.threads import available_cores
 from psfdae.commands.cli import refusal
 from psfdae.image.catalogue import require_sky
@@ -105,7 +105,7 @@ def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool
     """
     with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:
-            with words_of_a_command():
+            with use_command_words():
                 return True, work(**job)
         except Exception as error:
             message = refusal(error)

@@ -89,7 +89,7 @@ class ModelFiles:
 
     def fit(self, method_class: type[Method]) -> Path:
         """Return the path of the fit of a method."""
-        return self.path / fits.named(method_class, method_class.name)
+        return self.path / fits.add_suffix(method_class, method_class.name)
 
     @property
     def bundle(self) -> Path:

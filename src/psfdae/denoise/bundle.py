@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from psfdae.base.errors import Error, needed_by, no_such_file
+from psfdae.base.errors import Error, no_such_file, require_extra
 from psfdae.base.files import ProductError, atomic_path
 from psfdae.base.version import __version__
 from psfdae.denoise.error_model import ErrorModel
@@ -39,7 +39,7 @@ from psfdae.image.fits_file import name_other_format, open_hdus, unpack_file
 from psfdae.methods import method
 from psfdae.methods.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.methods.interface import Method
-from psfdae.methods.networks.weights import digest_of
+from psfdae.methods.networks.weights import compute_digest
 from psfdae.psf.wings import Wings
 
 SUFFIX = ".psf.safetensors"
@@ -105,12 +105,12 @@ def estimator(bundle: Bundle) -> Method:
     method_class = method(info.method)
     if info.dae:
         # A network is checked by torch when its weights are loaded.
-        with needed_by(f"the model {info.name!r}"):
-            return method_class.unpack(bundle.weights, info)
+        with require_extra(f"the model {info.name!r}"):
+            return method_class.from_bundle(bundle.weights, info)
     # The method knows which arrays it can work with: it gives conditions, and denoises a stamp.
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
-        fitted = method_class.unpack(bundle.weights, info)
+        fitted = method_class.from_bundle(bundle.weights, info)
         for name, expected_shapes, is_fulfilled in fitted.conditions():
             if not np.all(is_fulfilled):
                 raise ValueError(f"array {name!r} must have {expected_shapes}")
@@ -191,7 +191,7 @@ def _digest(tree: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     # The same model has the same checksum whenever it was made.
     dateless = {key: value for key, value in tree.items() if key != "created"}
     # Keys in one order: the same description has the same text.
-    text = json.dumps(dateless, sort_keys=True) + digest_of(arrays)
+    text = json.dumps(dateless, sort_keys=True) + compute_digest(arrays)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

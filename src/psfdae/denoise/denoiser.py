@@ -185,9 +185,9 @@ class Denoiser(ABC):
         packing = method.packing or Packing()
         # Stamps of more than 32 px come in smaller blocks.
         pixels = bundle.info.stamp_px**2
-        self.block_size = min(packing.together, max(1, packing.together * 32**2 // pixels))
+        self.block_size = min(packing.batch_size, max(1, packing.batch_size * 32**2 // pixels))
         # A network rounds otherwise if it computes another number of stars together.
-        self._padded_count = self.block_size if packing.padded else 1
+        self._padded_count = self.block_size if packing.is_padded else 1
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
         self.wings: Wings | None = bundle.wings
         calibration = bundle.info.config.get("stars", {}).get("calibration_stars", {})
@@ -508,7 +508,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
         gain=stars.gain,
     )
     # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
-    star_fit = estimate.measured
+    star_fit = estimate.measurements
     assert star_fit is not None and estimate.sigma is not None
     covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, place[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
@@ -521,7 +521,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
     is_measured = ~has_flux & ~has_no_flux
     raise_flag(flags, StarFlag.FAINT, is_measured & is_faint(flux, flux_error))
-    raise_flag(flags, StarFlag.BEYOND, method.is_out_of_range(place) & ~has_no_flux)
+    raise_flag(flags, StarFlag.BEYOND, method.is_outside_range(place) & ~has_no_flux)
     # The same photometry with the method's fluxes and skies: images are (x − b) / F.
     unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
     images = (data - star_fit.background[:, None, None]) / unit

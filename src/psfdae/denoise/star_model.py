@@ -19,7 +19,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import call, keyword
 from psfdae.base.progress import task
-from psfdae.base.threads import available_cores, in_order, one_thread_each, side_by_side
+from psfdae.base.threads import available_cores, run_ordered, run_parallel, use_one_thread_each
 from psfdae.denoise.bundle import Bundle, estimator, read_bundle, write_bundle
 from psfdae.denoise.denoiser import make_denoiser
 from psfdae.denoise.description import error_table, model_facts
@@ -31,7 +31,7 @@ from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.image.tables import html_table
 from psfdae.methods.bundle_info import BundleInfo
-from psfdae.methods.field_law import FieldLaw
+from psfdae.methods.field.prior import FieldPrior
 from psfdae.methods.interface import Method
 from psfdae.psf.interface import FieldPsfs, PredictionError
 from psfdae.psf.wings import Wings
@@ -207,8 +207,8 @@ class StarModel(FieldPsfs):
         # Blocks of stars, side by side; each is denoised as if it were alone.
         blocks = self.denoiser.blocks(stars) or [stars]
         threads = min(threads or available_cores(), len(blocks))
-        with one_thread_each():
-            parts = side_by_side(lambda block: self.denoiser.denoise(block, fixed), blocks, threads)
+        with use_one_thread_each():
+            parts = run_parallel(lambda block: self.denoiser.denoise(block, fixed), blocks, threads)
         return replace(Prediction.joined(parts), unit=unit)
 
     def stream(
@@ -229,8 +229,10 @@ class StarModel(FieldPsfs):
 
         chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))
         list_columns, start = observation.list_columns, 0
-        with one_thread_each(), task("stars", observation.count) as advance:
-            for stamps, prediction in in_order(predict_chunk, chunks, threads or available_cores()):
+        with use_one_thread_each(), task("stars", observation.count) as advance:
+            for stamps, prediction in run_ordered(
+                predict_chunk, chunks, threads or available_cores()
+            ):
                 # Columns of the star list go along with the stars' rows.
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
@@ -305,7 +307,7 @@ class StarModel(FieldPsfs):
         return field
 
     def residual_variance(self, side_px: int) -> float:
-        if not isinstance(self.method, FieldLaw):
+        if not isinstance(self.method, FieldPrior):
             return np.nan
         # Residuals of stars in the middle of their pixel (eq. 6): squares of modes, and diagonal.
         _, modes, diagonal = self.method.residuals_at(np.zeros(2))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psfdae.base.errors import needed_by
+from psfdae.base.errors import require_extra
 from psfdae.base.types import Table
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.fits_file import (
@@ -135,7 +135,7 @@ def parquet_table(file: PlainFile) -> Table:
     """
     from astropy.table import Table
 
-    with needed_by(f"the star list {file.name}"), reading(file.name):
+    with require_extra(f"the star list {file.name}"), reading(file.name):
         from pyarrow import parquet
 
         # Rows that are equal take no space in the file.

@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.image.detection import Sky
 from psfdae.image.stamps import central_pixel, cut_image
-from psfdae.stars.moments import robust_scatter, windowed_centres
+from psfdae.stars.moments import find_centroids, robust_scatter
 
 TOLERANCE_PX = 0.1
 """Largest difference, per axis, of the median offset from 0 (origin 0) or −1 (origin 1); standard
@@ -60,7 +60,7 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     # 10 iterations, at most 2 px away along each axis; stars that end at that limit found no
     # centre.
     start, window_px = np.zeros((len(star), 2)), np.full(len(star), 1.5)
-    centre = windowed_centres(stamps[star], start, window_px, rounds=10, reach_px=2.0)[:, ::-1]
+    centre = find_centroids(stamps[star], start, window_px, rounds=10, reach_px=2.0)[:, ::-1]
     offset = central_pixel(listed[star] - 0.5) + centre - listed[star]
     offset = offset[(np.abs(centre) < 1.9).all(axis=1)]
     if len(offset) < fewest:

@@ -31,7 +31,7 @@ from psfdae.image.star_criteria import (
     wider_than_stars,
 )
 from psfdae.stars.bright_stars import BrightStars
-from psfdae.stars.moments import FWHM_OF_SIGMA, shift_stamps, windowed_centres
+from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, shift_stamps
 
 
 class CalibrationStarsError(Error, ValueError):
@@ -103,7 +103,7 @@ class Candidates:
         bright = [replace(b, row=b.row + n) for b, n in zip(bright, starts, strict=False)]
         names = [field.name for field in fields(cls) if field.name != "bright"]
         columns = {name: np.concatenate([getattr(c, name) for c in several]) for name in names}
-        return cls(**columns, bright=BrightStars.joined(bright))
+        return cls(**columns, bright=BrightStars.concatenate(bright))
 
     def require(self, path: Path, stars_min: int, remarks: Sequence[str] = ()) -> None:
         """Refuse an image with fewer good stars, by CalibrationStarsError.
@@ -175,7 +175,7 @@ def collect(
             parts.append(measure_stamps(stamps, settings, framing, observation))
             advance(len(stamps.data))
     measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
-    bright = BrightStars.joined([stars for _, stars in parts])
+    bright = BrightStars.concatenate([stars for _, stars in parts])
     # Stars that no criterion of a single star refuses, with their rows in the list.
     verdict, position = measured["verdict"], measured["position"]
     bright = replace(bright, row=np.flatnonzero(verdict == Verdict.GOOD))
@@ -194,12 +194,12 @@ def collect(
     verdict[observation.without_position()] = Verdict.NO_POSITION
     verdict[bright.row[bright.flux <= 0]] = Verdict.MISFIT
     centring = settings.centring_px or 0.0
-    bright = _centred(bright.of(verdict[bright.row] == Verdict.GOOD), centring)
+    bright = _centred(bright.select(verdict[bright.row] == Verdict.GOOD), centring)
 
     def refuse(stars: BrightStars, refused: np.ndarray, reason: Verdict) -> BrightStars:
         """Return the other stars, and note the reason against these."""
         verdict[stars.row[refused]] = reason
-        return stars.of(~refused)
+        return stars.select(~refused)
 
     # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
     bright = refuse(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
@@ -213,7 +213,7 @@ def collect(
     is_extended = wider_than_stars(bright.area(), bright.position, size_error)
     bright = refuse(bright, is_extended, Verdict.EXTENDED)
     # Stars that are unlike their neighbours.
-    aligned = cut(bright.aligned(), framing.stamp_px)
+    aligned = cut(bright.align(), framing.stamp_px)
     score = misfit(aligned, bright.position, bright.noise / bright.flux)
     bright = refuse(bright, ~(score <= settings.misfit), Verdict.MISFIT)
     candidates = Candidates(**measured, bright=bright)
@@ -276,7 +276,7 @@ def measure_stamps(
     verdict = np.full(len(stamps), Verdict.GOOD, dtype="<U16")
     for reason, stars in (
         (Verdict.OFF_CENTRE, ~is_centred),
-        (Verdict.FAINT, snr < settings.least_snr),
+        (Verdict.FAINT, snr < settings.effective_snr_min),
         (Verdict.BLENDED, is_flagged(StarFlag.BLENDED)),
         (Verdict.SATURATED, saturated | is_flagged(StarFlag.SATURATED)),
         (Verdict.INCOMPLETE, incomplete | is_flagged(StarFlag.TRUNCATED)),
@@ -321,7 +321,7 @@ def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     # σ of the window from the area of each star.
     sigma = np.maximum(np.sqrt(stars.area() / (4.0 * np.pi)), 0.7)
     window_px = np.maximum(sigma, centring_px / FWHM_OF_SIGMA)
-    centre = windowed_centres(stars.stamps, stars.peak, window_px, rounds=10, reach_px=1.5)
+    centre = find_centroids(stars.stamps, stars.peak, window_px, rounds=10, reach_px=1.5)
     return replace(stars, centre=centre)
 
 
@@ -364,7 +364,7 @@ def completed(
     stamp = np.s_[start : start + stamp_px, start : start + stamp_px]
     # The second time, neighbours that have bad pixels are complete, too.
     for _ in range(2):
-        aligned, filled = stars.aligned(), stars.stamps.copy()
+        aligned, filled = stars.align(), stars.stamps.copy()
         for star, neighbours in zip(incomplete, nearest, strict=True):
             # Median of the neighbours, moved to the star's centre; its flux by least squares over
             # the good pixels of the stamp, F = Σ x p / Σ p².
@@ -383,8 +383,8 @@ def completed(
         snr = stamp_snr(cut(light, stamp_px), stars.noise[incomplete])
         usable = (flux > 0) & (snr > 0)
         missing[incomplete[~usable]] = 1.0
-        new = replace(stars.of(incomplete), stamps=light, peak=peak, flux=flux, snr=snr).of(usable)
-        new = _centred(new, centring_px)
+        new = replace(stars.select(incomplete), stamps=light, peak=peak, flux=flux, snr=snr)
+        new = _centred(new.select(usable), centring_px)
         columns = {name: getattr(stars, name).copy() for name in ("peak", "flux", "snr", "centre")}
         for name, column in columns.items():
             column[incomplete[usable]] = getattr(new, name)

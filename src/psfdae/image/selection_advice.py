@@ -79,7 +79,7 @@ def stamp_advice(
         None if the stamps are about right.
     """
     # Light of the median star in squares of 8 px, the smallest stamps of a model, and more.
-    typical = np.median(candidates.bright.aligned(), axis=0)[None]
+    typical = np.median(candidates.bright.align(), axis=0)[None]
     sides = np.arange(8, typical.shape[-1] + 1, 2)
     light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
     # The first side that holds enough light.

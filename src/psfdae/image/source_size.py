@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from psfdae.image.stamps import cut_image
-from psfdae.stars.moments import FWHM_OF_SIGMA, robust_scatter, windowed_centres
+from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, robust_scatter
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def measure_size(
         # A ring has no light in its middle: a window narrower than its radius would leave it.
         sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
         visible = np.where(measured, windows, 0.0)
-        centre = windowed_centres(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
+        centre = find_centroids(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
     return size_of_windows(windows, measured, centre)
 
 

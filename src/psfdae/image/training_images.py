@@ -112,8 +112,8 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     """
     # Stars that are held out get the stack of the training stars around them.
     part = bins_of(stars.position, bins)
-    training = stars.of(~held_out)
-    return np.asarray(stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part])
+    training = stars.select(~held_out)
+    return np.asarray(stacks(training.align(), training.snr, part[~held_out], bins**2)[part])
 
 
 def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Description of a bundle: the text beside its arrays."""
+"""Description of a bundle: the metadata of its arrays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 FORMAT_VERSION = 2
-"""Version of the format, raised when an older psfdae could not read what a newer one writes."""
+"""Version of the format, raised when an older psfdae could not read the files of a newer one."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -36,7 +36,7 @@ class Architecture(_Described):
 
     @model_validator(mode="after")
     def _shape(self) -> Architecture:
-        """Refuse even kernels, and widths that do not fit between kernels."""
+        """Raise ValueError for even kernels, or a wrong number of widths."""
         if any(kernel % 2 == 0 for kernel in self.kernels):
             raise ValueError(f"kernels {self.kernels}: must be odd")
         if len(self.widths) != len(self.kernels) - 1:
@@ -54,12 +54,12 @@ class Architecture(_Described):
 
 
 class BundleInfo(_Described):
-    """Description of a bundle: what its model was trained on, and how well it restores stars.
+    """Description of a bundle: training data, range of validity, and errors of test stars.
 
-    Noise is the RMS of the sky noise in a pixel divided by the flux of the star
-    inside its stamp, κλ in the words of the simulation. The S/N, for flux 1, is that
-    of a filter matched to the star, 1 / (noise · √A), with the noise-equivalent area
-    A (King 1983, PASP 95, 163) of the typical star of the training.
+    Noise is the RMS of the sky noise in a pixel divided by the flux of the star inside its stamp,
+    κλ in the notation of the simulation. The S/N for flux 1 is the S/N of a filter matched to the
+    star, 1 / (noise · √A), with the noise-equivalent area A (King 1983, PASP 95, 163) of the
+    typical star of the training.
     """
 
     psfdae_version: str
@@ -79,18 +79,18 @@ class BundleInfo(_Described):
     kappa: Positive
     """Noise at the noise level λ = 1 of the training."""
     noise_min: Positive
-    """Least noise of the training."""
+    """Minimum noise of the training."""
     noise_max: Positive
-    """Greatest noise of the training."""
+    """Maximum noise of the training."""
     snr_min: Positive
-    """S/N of the typical star at the greatest noise."""
+    """S/N of the typical star at the maximum noise."""
     snr_max: Positive
-    """S/N of the typical star at the least noise."""
+    """S/N of the typical star at the minimum noise."""
     noise_equivalent_px: Positive
     """A = 1 / ΣPSF² of the typical star."""
     components: Annotated[int, Field(ge=1, le=1024)]
-    """Number of leading eigenvectors of the training stars that are stored, and in which the
-    distance of a star from them is measured."""
+    """Number of stored leading eigenvectors of the training stars, in which the distance of a star
+    from the training stars is measured."""
     training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     training_stars: Count
     source: Literal["simulated", "stars"]
@@ -100,19 +100,20 @@ class BundleInfo(_Described):
     reference: Literal["realisation", "template"]
     """Image that is restored."""
     config: dict[str, Any]
-    """Resolved configuration of all stages, and the wings as Wings.plain gives them."""
+    """Resolved configuration of all stages, and the wings in the form of Wings.plain."""
     metrics: list[dict[str, float]]
     """Errors of the test stars by noise level."""
 
     def __repr_args__(self) -> Iterator[tuple[str, Any]]:
-        """Yield what tells one model from another, with which a description is shown."""
+        """Yield the fields that distinguish models, for the text form of a description."""
+        # pydantic shows the fields that are yielded here.
         for name in ("name", "method", "stamp_px", "pixel_scale_arcsec", "training_stars"):
             yield name, getattr(self, name)
 
     @model_validator(mode="after")
     def _is_network_or_not(self) -> BundleInfo:
-        """Refuse a network without its shape and scale, and another method with one of them."""
-        # Both are there for a network, and neither for another method.
+        """Raise ValueError if a network lacks shape or scale, or another method has one of them."""
+        # A network has both, and another method neither.
         is_network = self.method == "dae"
         if {self.dae is not None, self.image_scale is not None} != {is_network}:
             raise ValueError("a network, and no other method, has dae and image_scale")
@@ -120,9 +121,9 @@ class BundleInfo(_Described):
 
     @property
     def adapted(self) -> str | None:
-        """Text: the exposure to which the model was adapted, and by how many stars.
+        """Text with the exposure to which the model was adapted, and the number of stars.
 
-        None if it was not.
+        None for a model that was not adapted.
         """
         try:
             stars = self.config["stars"]
@@ -132,7 +133,7 @@ class BundleInfo(_Described):
 
     @property
     def scale_assumed(self) -> bool:
-        """True if the pixel scale was assumed, because the training image did not state it."""
+        """True if the pixel scale was assumed, because the training image does not give it."""
         try:
             return bool(self.config["stars"]["telescope"]["assumed"])
         except (LookupError, TypeError):

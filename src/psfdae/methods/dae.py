@@ -1,4 +1,4 @@
-"""The denoising autoencoder: a network that learns from noisy stars to give noise-free ones."""
+"""The denoising autoencoder: a network that is trained to remove the noise of stars."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import from_tree, read_yaml
-from psfdae.base.settings import Config, deciding
+from psfdae.base.settings import Config, dump_deciding
 from psfdae.methods.interface import (
     CONFIG,
     HISTORY,
@@ -34,15 +34,16 @@ WEIGHTS = "dae.safetensors"
 
 
 class Dae(Method):
-    """A network, the factor of its images, and how it was trained.
+    """Network, scale of its images, and history of its training.
 
     Parameters
     ----------
     network : DaeNetwork
+        Trained network.
     scale : "mean", "none" or float
-        Of images for the network: as the setting, or the factor itself.
+        Scale of images for the network: the setting, or the factor itself.
     attempt : int
-        Starts of the training before the one that succeeded.
+        Number of failed starts of the training.
     history : list of dict
         Course of the training.
     """
@@ -66,7 +67,7 @@ class Dae(Method):
         history: list[dict[str, Any]] | None = None,
     ) -> None:
         self.network, self.scale, self.attempt = network, scale, attempt
-        self.diagnosed = {HISTORY: history or []}
+        self.diagnostic_rows = {HISTORY: history or []}
 
     @classmethod
     def continues(cls, config: Config) -> bool:
@@ -75,25 +76,25 @@ class Dae(Method):
 
     @classmethod
     def fit(cls, data: TrainingSet, dae: DaeSettings, train: Train) -> Dae:
-        """Train, and keep the state with the least validation error; resumes if interrupted.
+        """Train, and keep the state with the smallest validation error; resumes if interrupted.
 
         Raises
         ------
         TrainingError
             As `psfdae.methods.networks.training.train`.
         FitError
-            If it is to go on from a network of another shape or scale of images.
+            If the network at which it should begin has another shape or scale of images.
         """
         from psfdae.methods.networks import training as loop
         from psfdae.methods.networks.dae import DaeNetwork, DaeTraining
         from psfdae.methods.networks.weights import channels_last
 
-        # All that decides the result: settings, seed, noise, and the stars themselves.
-        described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
-        described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
-        # Positions are not among them: a network sees the images alone.
+        # Everything that determines the result: settings, seed, noise, and the stars themselves.
+        decisions = {"dae": dump_deciding(dae), "train": dump_deciding(train), "seed": data.seed}
+        decisions["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        # Positions are not included: a network uses only the images.
         arrays = [data.images, data.references, data.fit, data.validation]
-        # Warm start: the network begins with the weights of one of the same layers.
+        # Warm start: the network begins with the weights of a network with the same layers.
         if isinstance(data.start, Dae):
             first = data.start.network
             first_layers = (first.kernels, first.widths, data.start.scale)
@@ -103,19 +104,19 @@ class Dae(Method):
                     f"dae.kernels, dae.widths, dae.scale = {layers}: the network to go on from "
                     f"has {first_layers}"
                 )
-            # Its training is a part or a multiple of the first one.
+            # The number of epochs is relative to the first training.
             epochs = max(1, round(train.continued_epochs * train.epochs))
             train = train.model_copy(update={"epochs": epochs})
             arrays += [value.numpy() for value in first.state_dict().values()]
         # A checkpoint of other settings or other data is not resumed.
-        digest = loop.fingerprint(described, *arrays)
+        digest = loop.fingerprint(decisions, *arrays)
         # The checkpoint is of an interrupted training; the caller removes it after the fit.
         with loop.progress(train.epochs) as report:
             assert data.checkpoint is not None
-            # A training whose network dies starts anew, with the number of the attempt.
+            # If the network dies, a new training begins, with the number of the attempt.
             begin = partial(DaeTraining, data, dae, train, data.seed)
             training = loop.train(begin, data.checkpoint, digest, report, train.restarts)
-        # A network of its own with the best weights; that of the training has the last ones.
+        # A new network with the best weights; the network of the training has the last ones.
         network = DaeNetwork(dae.kernels, dae.widths)
         network.load_state_dict(training.result)
         return cls(
@@ -126,24 +127,24 @@ class Dae(Method):
         )
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
-        """PSFs, neither clipped nor renormalised, float32."""
+        """Return the PSFs, neither clipped nor renormalised, float32."""
         from psfdae.methods.networks.dae import run_network
 
         return run_network(self.network, noisy, self.factor(noisy.shape[-1]))
 
     def factor(self, stamp_px: int) -> float:
-        """Return the factor from images of sum 1 to those that the network sees."""
+        """Return the factor from images of sum 1 to inputs of the network."""
         from psfdae.methods.networks.dae import image_scale
 
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
-    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+    def save(self, place: Path, config: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
         from psfdae.methods.networks.weights import save_weights
 
         # The configuration is part of the weights' file, too, as metadata.
-        save_weights(place / WEIGHTS, self.network.state_dict(), described)
-        write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
+        save_weights(place / WEIGHTS, self.network.state_dict(), config)
+        write_text(place / CONFIG, as_yaml({**config, "attempt": self.attempt}))
 
     @classmethod
     def load(
@@ -154,27 +155,27 @@ class Dae(Method):
 
         from psfdae.base.settings import parse_settings
         from psfdae.methods.networks.dae import DaeNetwork
-        from psfdae.methods.networks.weights import with_weights
+        from psfdae.methods.networks.weights import load_network
 
-        described = cls.described(place)
-        # The shape of the network is in its configuration, its weights are beside it.
+        config = cls.read_config(place)
+        # The shape of the network is in its configuration, its weights are in another file.
         settings = from_tree(
             place / CONFIG,
-            described,
+            config,
             "dae",
             make=lambda tree: parse_settings(DaeSettings, tree),
         )
-        # Threads change the speed alone.
+        # Threads only change the speed.
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)
-        network = with_weights(
+        network = load_network(
             lambda: DaeNetwork(settings.kernels, settings.widths), place / WEIGHTS
         )
         return cls(network, settings.scale)
 
-    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Weights, and the network's shape."""
-        # Contiguous, because networks keep weights in an order of their own (`channels_last`).
+    def export(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return the weights, and the shape of the network."""
+        # Contiguous, because networks keep weights in another order (`channels_last`).
         state = self.network.state_dict()
         shape = {"kernels": self.network.kernels, "widths": self.network.widths}
         arrays = {name: value.contiguous().numpy() for name, value in state.items()}
@@ -182,12 +183,12 @@ class Dae(Method):
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """Shapes of the weights, by the architecture that the bundle states."""
+        """Return the shapes of the weights for the architecture of the bundle."""
         return info.dae.shapes() if info.dae else {}
 
     @classmethod
-    def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Dae:
-        """The network of a bundle."""
+    def from_bundle(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Dae:
+        """Return the network of a bundle."""
         import torch
 
         from psfdae.methods.networks.dae import DaeNetwork
@@ -200,6 +201,6 @@ class Dae(Method):
         return cls(channels_last(network).eval(), float(info.image_scale))
 
     @classmethod
-    def described(cls, place: Path) -> dict[str, Any]:
-        """The resolved configuration of the training."""
+    def read_config(cls, place: Path) -> dict[str, Any]:
+        """Return the resolved configuration of the training."""
         return read_yaml(place / CONFIG)

@@ -1,8 +1,7 @@
-"""Files of fitted methods: their names, further files beside them, and checks of their origin.
+"""Files of fitted methods: their names, additional files, and checks of their origin.
 
-This is about fits of methods to stars; FITS images are in `psfdae.image`.
-
-Functions take the class of a method, whose part `Storage` says what a fit leaves.
+The fits are fits of methods to stars; FITS images are in `psfdae.image`. Functions take the class
+of a method, whose `Storage` lists the files of a fit.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-def storage_of(method: type[Method]) -> Storage:
-    """Return how the fits of a method are stored; the method must leave files."""
+def get_storage(method: type[Method]) -> Storage:
+    """Return the storage of the fits of a method, which must have files."""
     assert method.storage is not None, f"{method.name} leaves no file"
     return method.storage
 
 
-def rule_of(method: type[Method]) -> str:
+def get_rule_name(method: type[Method]) -> str:
     """Return the name of the rule that fits a method."""
-    return storage_of(method).rule or f"fit_{method.name}"
+    return get_storage(method).rule or f"fit_{method.name}"
 
 
-def suffix_of(method: type[Method]) -> str:
+def get_bundle_suffix(method: type[Method]) -> str:
     """Return the ending of the names of a method's bundles."""
     assert method.packing is not None, f"{method.name} is part of no bundle"
     return f"-{method.name}" if method.packing.suffix is None else method.packing.suffix
@@ -38,58 +37,58 @@ def suffix_of(method: type[Method]) -> str:
 
 def stem(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the part of a path that distinguishes the fits of a method."""
-    return f"{dataset}/{split}" + (f"-{reference}" if storage_of(method).per_reference else "")
+    return f"{dataset}/{split}" + (f"-{reference}" if get_storage(method).per_reference else "")
 
 
-def place_of(method: type[Method], dataset: str, split: str, reference: str) -> str:
+def get_fit_path(method: type[Method], dataset: str, split: str, reference: str) -> str:
     """Return the folder or file of a fit, below the folder of results."""
-    return f"{method.name}/{named(method, stem(method, dataset, split, reference))}"
+    return f"{method.name}/{add_suffix(method, stem(method, dataset, split, reference))}"
 
 
-def named(method: type[Method], text: str) -> str:
-    """Return the name of a fit: as it is for a folder, with the ending ".h5" for a file."""
-    return text if storage_of(method).files else f"{text}.h5"
+def add_suffix(method: type[Method], text: str) -> str:
+    """Return the name of a fit: unchanged for a folder, with the ending ".h5" for a file."""
+    return text if get_storage(method).files else f"{text}.h5"
 
 
 def own_files(method: type[Method], place: str | Path) -> list[Path]:
     """Return the files of a fit that the method itself reads."""
-    return [Path(place, name) for name in storage_of(method).files] or [Path(place)]
+    return [Path(place, name) for name in get_storage(method).files] or [Path(place)]
 
 
 def path_beside(method: type[Method], place: str | Path, name: str) -> Path:
-    """Return the path of a further file of a fit: in its folder, or beside its product."""
+    """Return the path of an additional file of a fit: in its folder, or next to its product."""
     place = Path(place)
-    return place / name if storage_of(method).files else place.with_name(f"{place.stem}.{name}")
+    return place / name if get_storage(method).files else place.with_name(f"{place.stem}.{name}")
 
 
 def outputs(method: type[Method], place: str | Path) -> list[Path]:
     """Return the paths of all files of a fit."""
-    further_names = (TRAINED_ON, *storage_of(method).diagnostics)
+    further_names = (TRAINED_ON, *get_storage(method).diagnostics)
     return own_files(method, place) + [path_beside(method, place, name) for name in further_names]
 
 
-def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Product) -> None:
+def store(fit: Method, place: Path, config: Mapping[str, Any], stars: Product) -> None:
     """Write all files of a fit to stars, with its resolved configuration."""
-    fitted.save(place, described)
+    fit.save(place, config)
     write_origin(place, stars)
-    for name in storage_of(type(fitted)).diagnostics:
-        write_text(path_beside(type(fitted), place, name), as_csv(fitted.diagnosed[name]))
+    for name in get_storage(type(fit)).diagnostics:
+        write_text(path_beside(type(fit), place, name), as_csv(fit.diagnostic_rows[name]))
 
 
-def described_by(
+def describe_fit(
     method: type[Method], tree: Mapping[str, Any], split: str, reference: str
 ) -> dict[str, Any]:
     """Return the configuration that is written with a fit.
 
-    It has the settings `tree`, the split of the stars, and the reference, if the method is fitted
-    to each reference by itself.
+    It has the settings `tree`, the split of the stars, and the reference, if the method has a fit
+    for each reference.
     """
-    has_reference = storage_of(method).per_reference
+    has_reference = get_storage(method).per_reference
     return {**tree, "split": split, **({"reference": reference} if has_reference else {})}
 
 
-def learnt(method: type[Method], reference: str) -> str:
-    """Return the reference to which a method is fitted that is to restore `reference`.
+def get_training_reference(method: type[Method], reference: str) -> str:
+    """Return the reference to which a method is fitted in order to restore `reference`.
 
     A method with one fit for both references is fitted to templates.
     """
@@ -100,7 +99,7 @@ def learnt(method: type[Method], reference: str) -> str:
 def require_fit(
     method: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
-    """Refuse a fit that does not belong to test stars.
+    """Raise an error if a fit does not belong to test stars.
 
     Parameters
     ----------
@@ -113,14 +112,14 @@ def require_fit(
     config : pydantic model
         Configuration of the test, with seed and parts.
     split : "random" or "held_out"
-        How stars are split into training and test.
+        Kind of the split into training and test stars.
     reference : "realisation" or "template"
-        Images that the method is fitted to.
+        Images to which the method is fitted.
 
     Raises
     ------
     ProductError
         For the first setting that differs, with both values.
     """
-    options = described_by(method, {}, split, reference)
-    require_training(place, method.described(place), stars, config, **options)
+    options = describe_fit(method, {}, split, reference)
+    require_training(place, method.read_config(place), stars, config, **options)

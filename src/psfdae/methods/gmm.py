@@ -1,7 +1,7 @@
 """Method `gmm`: a Gaussian mixture of noise-free stars, whose posterior mean restores the PSF.
 
-The mixture is in `psfdae.methods.mixture_law`; here it is chosen by validation stars, applied and
-stored. Equations are numbered as on the page docs/mixture.md.
+The mixture is in `psfdae.methods.mixture.prior`. The class of this module chooses it by
+validation stars, applies it and stores it. Equations are numbered as on the page docs/mixture.md.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from psfdae.methods.interface import (
     TrainingSet,
 )
 from psfdae.methods.mixing import FLUX_SIGMA
-from psfdae.methods.mixture_densities import cluster_weights, star_batches
-from psfdae.methods.mixture_fit import best_on_validation, k_means, mixture_arrays
-from psfdae.methods.mixture_law import MixtureLaw
-from psfdae.methods.mixture_posterior import flux_factor, posterior_mean
+from psfdae.methods.mixture.densities import cluster_weights, star_batches
+from psfdae.methods.mixture.fit import best_on_validation, k_means, mixture_arrays
+from psfdae.methods.mixture.posterior import flux_factor, posterior_mean
+from psfdae.methods.mixture.prior import MixturePrior
 from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:
@@ -37,34 +37,34 @@ if TYPE_CHECKING:
 
 
 class Gmm(Group):
-    """Mixture of Gaussians; of several values the validation stars choose."""
+    """Mixture of Gaussians; validation stars choose where several values are given."""
 
     stars: Count | None = None
-    """Training stars that are learnt from; null: all."""
+    """Number of training stars; null: all."""
     components: Annotated[list[Count], Field(min_length=1)] = Field([16, 1, 4, 64, 128])
-    """Clusters K among which a search goes, from the first one, as long as it pays; more than stars
-    are not."""
+    """Numbers of clusters K; the search begins at the first one and continues while it pays.
+    Numbers above the number of stars are skipped."""
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field([10.0, 3.0, 30.0, 100.0])
-    """Stars ν that the covariance of all clusters counts for in each; searched from the first one,
-    too."""
+    """Weight ν of the common covariance in each cluster, in stars; the search begins at the first
+    one, too."""
     principal: Count = 40
     """Principal components in which stars are clustered."""
     place: Positive = 1.0
-    """RMS of the field position beside that of the principal components, for methods that are given
-    it."""
+    """RMS of the field position over the RMS of the principal components, for methods with the
+    position as input."""
     threads: Count = 1
     """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GaussianMixture(MixtureLaw, Method):
+class GaussianMixture(MixturePrior, Method):
     """Fitted Gaussian mixture.
 
     Attributes
     ----------
     outlier_coordinates : int
-        Number of leading coordinates that enter the outlier score. More of them detect more
-        outliers that are bright, and fewer that are faint.
+        Number of leading coordinates in the outlier score. More coordinates detect more bright
+        outliers and fewer faint ones.
     """
 
     outlier_coordinates: int = 40
@@ -92,25 +92,25 @@ class GaussianMixture(MixtureLaw, Method):
         },
         per_reference=True,
     )
-    packing: ClassVar[Packing | None] = Packing(together=8192, padded=False)
+    packing: ClassVar[Packing | None] = Packing(batch_size=8192, is_padded=False)
     groups: ClassVar = {"gmm": Gmm}
     finds_flux = True
 
     @classmethod
     def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:
-        """Choose K, then ν, on the validation stars, and fit all training stars.
+        """Choose K, then ν, by the validation stars, and fit all training stars.
 
         Raises
         ------
         FitError
             If every K exceeds the number of stars.
         """
-        # One value of each number leaves no choice, and all stars are learnt from.
-        searched = len(gmm.components) * len(gmm.shrinkage) > 1
-        learn, judge = (data.fit, data.validation) if searched else (data.train, data.train[:0])
+        # With a single value of each number, all stars are used for the fit.
+        is_search = len(gmm.components) * len(gmm.shrinkage) > 1
+        learn, judge = (data.fit, data.validation) if is_search else (data.train, data.train[:0])
         learn = learn[: gmm.stars]
-        if searched and not judge.size:
-            # Without validation stars, every tenth training star serves as one.
+        if is_search and not judge.size:
+            # Without validation stars, every tenth training star is one.
             judge, learn = learn[::10], np.delete(learn, np.s_[::10])
         # A cluster has at least one star.
         sizes = [k for k in gmm.components if k <= learn.size]
@@ -118,13 +118,13 @@ class GaussianMixture(MixtureLaw, Method):
             raise FitError(
                 f"{next(iter(cls.groups))}.components = {gmm.components}: "
                 f"must be at most {learn.size}, the number of training stars"
-                f"{' without those that choose' if searched else ''}"
+                f"{' without those that choose' if is_search else ''}"
             )
-        # The final mixture learns from the stars that have chosen, too.
+        # The final mixture is fitted to the validation stars, too.
         k, nu, uses_position = sizes[0], gmm.shrinkage[0], cls.needs.position
-        if searched:
+        if is_search:
             k, nu, uses_position = best_on_validation(
-                lambda k, uses_position: cls.clustered(
+                lambda k, uses_position: cls.fit_clusters(
                     data, learn, k, gmm.shrinkage[0], uses_position, gmm
                 ),
                 data,
@@ -133,17 +133,18 @@ class GaussianMixture(MixtureLaw, Method):
                 gmm.shrinkage,
                 cls,
             )
-        return cls.clustered(data, data.train[: gmm.stars], k, nu, uses_position, gmm)
+        return cls.fit_clusters(data, data.train[: gmm.stars], k, nu, uses_position, gmm)
 
     @classmethod
-    def clustered(
+    def fit_clusters(
         cls, data: TrainingSet, stars: np.ndarray, k: int, nu: float, uses_position: bool, gmm: Gmm
     ) -> Self:
-        """Return the mixture of some stars, whose clusters follow the position if that is wanted.
+        """Return the mixture of some stars, with or without the position.
 
         Parameters
         ----------
         data : TrainingSet
+            Images, references and positions of the stars.
         stars : ndarray of int
             Indices of the stars.
         k : int
@@ -151,42 +152,43 @@ class GaussianMixture(MixtureLaw, Method):
         nu : float
             ν, the weight of the common covariance, as a number of stars.
         uses_position : bool
-            The position counts; otherwise all stars stand in one place.
+            Use the position; otherwise all stars have the same position.
         gmm : Gmm
+            Settings of the clustering.
         """
-        # Positions that are not used keep their places in the arrays, but are all 0.
+        # Positions that are not used are 0, so that the arrays have the same shapes.
         p = np.empty((len(stars), 0))
         if cls.needs.position:
             p = data.positions[stars].astype(np.float64) * uses_position
         x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
         cluster = k_means(x, p, k, gmm.principal, gmm.place, data.seed)
         del x  # memory: it is needed again in another order
-        # The distributions of the clusters, and ν, by which they are shrunk when they are used.
+        # The distributions of the clusters, and ν, which shrinks their covariances in use.
         arrays: dict[str, Any] = mixture_arrays(data, stars, p, cluster)
         return cls(**arrays, shrinkage=np.array([nu]), noise=data.noise)
 
     @classmethod
-    def restored(
+    def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """Return a fit from its arrays; the noise is that of the configuration."""
+        """Return a fit from its arrays, with the noise of the configuration."""
         # A bundle may have the deviations in half precision.
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
-        named: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
-        return cls(**named, noise=noise)
+        fields: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
+        return cls(**fields, noise=noise)
 
-    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def export(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return the arrays for a bundle, and fields of its `BundleInfo`.
 
-        Where the references are the images, the residuals of a cluster are its main axes: those
-        with a variance of at least `flat_variance` times that of the noise.
+        Where the references are the images, the residuals of a cluster are replaced by its main
+        axes, with a variance of at least `flat_variance` times the noise variance.
         """
-        arrays, info_fields = super().pack(stamp_px, noise)
-        # Residuals of references and positions belong to those of the images star by star.
+        arrays, info_fields = super().export(stamp_px, noise)
+        # Residuals of references and positions refer to single stars and cannot be replaced.
         if len(self.cross) or self.whitening.size:
             return arrays, info_fields
-        # Coordinates that the least noise of the bundle hides are left out.
-        main_axes, width = [], self.free_flux().distinct_count(noise**2)
+        # Coordinates below the minimum noise of the bundle are left out.
+        main_axes, width = [], self.free_flux().count_distinct(noise**2)
         for cluster in self.clusters:
             # X = U a Vᵀ: the rows a Vᵀ have the same products as X.
             _, size, axis = np.linalg.svd(cluster.residuals[:, :width], full_matrices=False)
@@ -200,33 +202,35 @@ class GaussianMixture(MixtureLaw, Method):
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """Return the arrays of a bundle with their shapes, None where any shape will do."""
+        """Return the arrays of a bundle with their shapes; None for any shape."""
         # The other arrays depend on the number of clusters and of their main axes.
         pixels = info.stamp_px**2
-        return dict.fromkeys(cls.stored()) | {"axes": (pixels, pixels), "variance": (pixels,)}
+        return dict.fromkeys(cls.list_arrays()) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
     @cached_property
-    def outlier_law(self) -> Self:
+    def outlier_mixture(self) -> Self:
         """The mixture in the leading `outlier_coordinates` alone (eq. 12)."""
-        return self.in_leading(self.outlier_coordinates)
+        return self.keep_leading(self.outlier_coordinates)
 
     def outlier_score(
         self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
     ) -> np.ndarray:
         """Return the score by the leading `outlier_coordinates` (eq. 12 of docs/mixture.md).
 
-        The others hold noise, which is an estimate: their χ² would say that it is wrong.
+        The others contain mostly noise, whose level is an estimate: an error of it would dominate
+        their χ².
         """
-        law = self.outlier_law
+        mixture = self.outlier_mixture
         # s of each image, as for the weights of the clusters (eq. 1).
         s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
-        # ln of the density is less where noise is larger: relative to that of the common variances.
-        common = np.log(2 * np.pi * (law.total_variance + s[:, None])).sum(axis=1)
+        # The normalisation of the density depends on the noise: −2 ln of the normalisation with the
+        # common variances is subtracted.
+        common = np.log(2 * np.pi * (mixture.total_variance + s[:, None])).sum(axis=1)
         # −2 ln Σ_k π_k N(z; μ_k, G_k), of batches of about the same noise.
         evidence = np.empty(len(noisy))
-        for part, batch in star_batches(law, noisy, level):
+        for part, batch in star_batches(mixture, noisy, level):
             is_near = None if near_clusters is None else near_clusters[part]
-            _, evidence[part] = cluster_weights(law, batch, is_near)
+            _, evidence[part] = cluster_weights(mixture, batch, is_near)
         return np.asarray(-2.0 * evidence - common)
 
     def free_flux(self) -> Self:
@@ -236,12 +240,12 @@ class GaussianMixture(MixtureLaw, Method):
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the flux factor a of each image, and which clusters are near, (n, K) (eq. 11).
 
-        The factor is the flux over that by which the image was divided; 1 if fluxes are known.
+        The factor is the flux over the flux by which the image was divided; 1 for known fluxes.
         """
         flux = np.empty(len(noisy))
         is_near = np.zeros((len(noisy), len(self.count)), bool)
         for part, batch in star_batches(self, noisy, level):
-            # Clusters without weight need not be looked at again by `estimate` or `outlier_score`.
+            # `estimate` and `outlier_score` may skip clusters without weight.
             weight, _ = cluster_weights(self, batch)
             is_near[part] = weight > 0
             flux[part] = flux_factor(self, batch, weight)
@@ -257,8 +261,8 @@ class GaussianMixture(MixtureLaw, Method):
     ) -> Estimate:
         """Return PSFs, float32, their standard deviation, and the evidence of every image.
 
-        Only `near_clusters` of an image are looked at, shape (n, K) of bool, by default those that
-        are nearest by the common covariance.
+        Only `near_clusters` of an image are used, shape (n, K) of bool, by default the nearest
+        clusters by the common covariance.
 
         Raises
         ------
@@ -274,10 +278,10 @@ class GaussianMixture(MixtureLaw, Method):
             mean, mean_sigma = posterior_mean(self, batch, weight, with_sigma)
             if self.flux_sigma:
                 flux[part] = flux_factor(self, batch, weight)
-                # The image is a x + (1 − a)/P: its sky (1 − a)/P is no part of the star.
+                # The image is a x + (1 − a)/P: its sky (1 − a)/P is not part of the star.
                 if self.restores_images:
                     mean += ((flux[part] - 1.0) / mean.shape[1])[:, None]
             psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (mean, mean_sigma))
-        # Fluxes that are known are not stated again.
+        # Known fluxes are not returned.
         flux_or_none = flux if self.flux_sigma else None
         return Estimate(psf, sigma if with_sigma else None, evidence, flux_or_none)

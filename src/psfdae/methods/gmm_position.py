@@ -1,4 +1,4 @@
-"""The Gaussian mixture that is given where in the field a star stands, as an observer knows."""
+"""Gaussian mixture with the position of a star in the field as an additional input."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from psfdae.methods.interface import Look, Needs
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlacedMixture(GaussianMixture):
-    """A mixture of images, references and positions."""
+    """Mixture of images, references and positions."""
 
-    look = Look("GMM", "#882255", "X", drawn=False)
+    look = Look("GMM", "#882255", "X", is_drawn=False)
     needs = Needs(level=True, position=True, memory_mb=1200)
     packing = None

@@ -1,18 +1,18 @@
 """Base class of methods, which restore the PSF of a star from its noisy image.
 
-Each is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its settings;
-where files give others, these are in `config/<group>/default.yaml`. The list `methods` of
-`config/config.yaml` names those that the reproduction runs. Rules, tables, figures, sweeps, runs
-of MLflow, bundles and `from-stars` ask the classes for all that they must know: how a method
-looks, what it needs, how a fit is stored, how it is packed.
+Each method is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its
+settings; files with other values are `config/<group>/default.yaml`. The list `methods` of
+`config/config.yaml` names the methods of the reproduction. Rules, tables, figures, sweeps, runs of
+MLflow, bundles and `from-stars` get all information from the classes: label and colour, inputs,
+files of a fit, and form in a bundle.
 
-A method has at least `look`, `fit` and `predict`. All else has a default in the base class: a
-method with a product names its arrays in `storage`. All ask a method by `estimate`; one that knows
-more than the PSF, such as uncertainties, has it in place of `predict`. Two capabilities tell what
-only some methods can do, `knows_field` and `finds_flux`.
+A method has at least `look`, `fit` and `predict`; the base class has defaults for the rest. A
+method with a product lists its arrays in `storage`. All methods are called by `estimate`; a method
+that computes more than the PSF, such as uncertainties, overrides it and has no `predict`. Two class
+attributes mark capabilities of some methods, `knows_field` and `finds_flux`.
 
-Modules of methods load neither torch nor scipy when they are imported: options of
-commands follow from them.
+Modules of methods must not load torch or scipy when they are imported, because commands derive
+their options from them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 from psfdae.base.errors import Error
 from psfdae.base.files import Column, read_product, write_product
 from psfdae.base.settings import Config, Group
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.stars.noise import NoiseModel, draw_levels
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -41,46 +41,47 @@ CONFIG, HISTORY = "config.yaml", "history.csv"
 
 
 class FitError(Error, RuntimeError):
-    """A method cannot be fitted; the message says why and what to change."""
+    """A method cannot be fitted; the message gives the reason and a remedy."""
 
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """Stars and facts that a method may learn from.
+    """Stars and other inputs for the training of a method.
 
     Attributes
     ----------
     images : ndarray, shape (n, d, d), float32
         Noise-free stars of sum 1, the reference "realisation".
     references : ndarray, shape (n, d, d), float32
-        What is to be restored: the product's array `reference`, but for one fit that
-        serves both references the templates.
+        Targets of the training: the product's array `reference`, but templates for a
+        method with one fit for both references.
     fit, validation : ndarray of int
-        Star indices.
+        Indices of the stars of these parts.
     levels : ndarray, shape (L,)
-        Noise levels λ that are mixed.
+        Noise levels λ of the training, with equal probability.
     noise : NoiseModel
+        Noise of the images at a level.
     seed : int
         Seed of the method's random streams.
     reference : str
         "realisation" or "template".
     positions : ndarray, shape (n, 2) or (n, 4)
-        Positions of the stars in the field, in any unit, and for stars of an image their magnitudes
+        Positions of the stars in the field, in any unit, and for stars of an image also magnitudes
         and colours; empty where unknown.
     own_noise : callable or None
         Noise of images that are not noise-free: a function of star indices (m,) and their mean
-        image (P,) that returns what noise adds to their scatter about it, (P, P).
+        image (P,) that returns the contribution of noise to their scatter about it, (P, P).
     bright : BrightStars or None
         The bright stars of an image from which the images were made, in counts.
     star : ndarray of int, shape (n,)
         Bright star of every image; empty if there are none.
     simulation : mapping
-        Configuration of the simulation that made the stars; empty for those of an image.
+        Configuration of the simulation of the stars; empty for stars of an image.
     start : Method or None
-        Fit of the method to the realisations of the same stars, from which that to their
-        templates goes on.
+        Fit of the method to the realisations of the same stars, at which the fit to their templates
+        begins.
     checkpoint : Path or None
-        File in which a long fit may keep its state; the caller removes it after the fit.
+        File for the state of a long fit; the caller removes it after the fit.
     """
 
     images: np.ndarray
@@ -106,21 +107,22 @@ class TrainingSet:
 
     def draw(self, stars: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw noisy images of `stars`, each at a random level, and return these levels, too."""
-        level = mixed_levels(self.levels, stars.size, rng)
+        level = draw_levels(self.levels, stars.size, rng)
         return self.noise.draw(self.images[stars], level, rng), level
 
-    def without_validation(self) -> TrainingSet:
+    def drop_validation(self) -> TrainingSet:
         """Return this set without its validation stars."""
         return replace(self, validation=self.validation[:0])
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurements:
     """Photometry and astrometry of stars by a method, in the unit of their stamps.
 
     Attributes
     ----------
     flux, background : ndarray, shape (n,)
+        Flux inside the stamp, and sky per pixel.
     centre : ndarray, shape (n, 2)
         (row, column) from pixel (d//2, d//2).
     covariance : ndarray, shape (n, 4, 4)
@@ -135,34 +137,35 @@ class Measured:
 
 @dataclass(frozen=True)
 class Estimate:
-    """PSFs that a method restored, with their uncertainty and what else it measured.
+    """PSFs that a method has restored, with their uncertainty and other measurements.
 
     Attributes
     ----------
     psf : ndarray, shape (n, d, d)
+        Restored PSFs.
     sigma : ndarray, shape (n, d, d), or None
-        Standard deviation of each pixel of the PSF; for a method that measures stars, that of the
-        star over its flux, the error of the flux included.
+        Standard deviation of each pixel of the PSF; for a method that measures stars, the standard
+        deviation of the star over its flux, with the error of the flux.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
     flux : ndarray, shape (n,), or None
-        Flux of the star over that by which its image was divided, if the method measures it; the
-        PSF has this sum.
+        Flux of the star over the flux by which its image was divided, if the method measures it;
+        the sum of the PSF is this ratio.
     measured : Measured or None
         Measurements of a method that measures stars itself; its PSFs have the sum 1.
     outlier_score : ndarray, shape (n,), or None
         See `Method.outlier_score`, if the method computes it together with the PSFs.
-    explained : ndarray of bool, shape (n,), or None
-        True if the method's own model explains the star; otherwise its PSF is another method's.
+    is_explained : ndarray of bool, shape (n,), or None
+        True if the method's own model explains the star; otherwise another method gave its PSF.
     """
 
     psf: np.ndarray
     sigma: np.ndarray | None = None
     evidence: np.ndarray | None = None
     flux: np.ndarray | None = None
-    measured: Measured | None = None
+    measurements: Measurements | None = None
     outlier_score: np.ndarray | None = None
-    explained: np.ndarray | None = None
+    is_explained: np.ndarray | None = None
 
 
 # The parts of a method's class.
@@ -175,41 +178,42 @@ class Look:
     Attributes
     ----------
     label, color, marker : str
-        What the method is given besides the image (`Needs`) is added to the label.
+        Additional inputs of the method (`Needs`) are appended to the label.
     paper : (str, str) or None
-        Its row in the paper's tables as data, and as printed.
-    drawn : bool
-        Shown among restored stars.
+        Name of its row in the paper's tables, in the data and as printed.
+    is_drawn : bool
+        True if the figures of restored stars show it.
     restores : bool
         False for the noisy image itself, which is drawn on its own scale.
     title : str
-        Name in messages and reports on stars of an image, in full words; by default the label.
+        Name in messages and reports on stars of an image, without abbreviations; by default the
+        label.
     """
 
     label: str
     color: str
     marker: str = "o"
     paper: tuple[str, str] | None = None
-    drawn: bool = True
+    is_drawn: bool = True
     restores: bool = True
     title: str = ""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Inputs of a method besides the image, and resources of a fit.
+    """Inputs of a method in addition to the image, and resources of a fit.
 
     Attributes
     ----------
     level : bool
-        `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
+        `predict` also gets the noise level λ of all images, or of each, shape (n,).
     position : bool
-        `predict` gets the positions in the field as well, shape (n, 2); of an image with
-        magnitudes and colours (n, 4), NaN where unknown.
+        `predict` also gets the positions in the field, shape (n, 2); for an image with magnitudes
+        and colours (n, 4), NaN where unknown.
     validation : bool
-        The fit leaves out the validation stars, or only chooses by them.
+        The fit uses the validation stars only to choose the best state, or not at all.
     memory_mb, minutes : int
-        Memory and time of a fit at most.
+        Upper limits of the memory and the time of a fit.
     """
 
     level: bool = False
@@ -231,15 +235,15 @@ class Storage:
     Attributes
     ----------
     arrays : mapping
-        Attributes that are the HDF5 product, and of each its unit and what it is.
+        Names of the arrays of the HDF5 product, with their units and meanings.
     files : tuple of str
-        Files of the folder that a fit leaves in place of a product.
+        Files in the folder of a fit that is not a product.
     diagnostics : tuple of str
         Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
     per_reference : bool
-        Fitted for each reference, or once for both.
+        True for a fit to each reference, False for one fit for both.
     rule : str
-        Name of its rule; by default it follows from the method's name.
+        Name of its rule; by default it is derived from the method's name.
     """
 
     arrays: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -251,43 +255,45 @@ class Storage:
 
 @dataclass(frozen=True)
 class Packing:
-    """How a fit is part of a model bundle.
+    """Form of a fit in a model bundle.
 
     Attributes
     ----------
     suffix : str or None
-        Ends the names of its bundles; by default "-" and the method's name.
-    together : int
-        Small images that `psfdae predict` has restored at once.
-    padded : bool
-        Fewer are made up to as many: other numbers of them round otherwise.
+        End of the names of its bundles; by default "-" and the method's name.
+    batch_size : int
+        Number of small images that `psfdae predict` restores at once.
+    is_padded : bool
+        True if smaller batches are padded to this size, because rounding depends on the size.
     """
 
     suffix: str | None = None
-    together: int = 256
-    padded: bool = True
+    batch_size: int = 256
+    is_padded: bool = True
 
 
 class Method:
-    """Base of all methods; its name is that of its module.
+    """Base class of all methods; the name of a method is the name of its module.
 
     Attributes
     ----------
     look : Look
+        Label, colour and marker.
     needs : Needs
+        Inputs in addition to the image, and resources of a fit.
     storage : Storage or None
-        None if it is fitted where it is applied, in a moment, and leaves no file.
+        Files of a fit; None if the fit takes no time and is repeated where it is applied.
     packing : Packing or None
-        None if no bundle holds it.
+        Form in a bundle; None if bundles cannot contain it.
     groups : mapping
-        Groups of the configuration that are its settings; `fit` gets them by name.
+        Groups of the configuration with its settings; `fit` gets them by name.
     knows_field : bool
-        It has a model of the PSF at every place of the field, by which it measures flux, sky and
-        centre of a star together with its PSF: it has `measure`, `psf_at`, `order` and
-        `draw_stars`. `TrainingSet.bright` is for it.
+        True if it has a model of the PSF at every position in the field, with which it measures
+        flux, sky and centre of a star together with its PSF. It has `measure`, `psf_at`, `order`
+        and `draw_stars`, and is trained on `TrainingSet.bright`.
     finds_flux : bool
-        Its form `free_flux` measures the flux of an image, of which only an estimate was known: it
-        has `flux`.
+        True if its form `free_flux` measures the flux of an image for which only an estimate is
+        known. It has `flux`.
     """
 
     name: ClassVar[str] = ""
@@ -300,33 +306,35 @@ class Method:
     finds_flux: ClassVar[bool] = False
 
     def __repr__(self) -> str:
+        """Return the class with the title of the method."""
         return f"{type(self).__name__}({self.look.title or self.look.label})"
 
-    diagnosed: Mapping[str, list[dict[str, Any]]]
+    diagnostic_rows: Mapping[str, list[dict[str, Any]]]
 
     if TYPE_CHECKING:
         # Class method: from a `TrainingSet` and the groups of settings to a fitted method.
         fit: Callable[..., Self]
         # PSFs of flux-normalised noisy images, both of shape (n, d, d); see `estimate`.
         predict: Callable[..., np.ndarray]
-        # `finds_flux`: fluxes of images over those by which they were divided, (n,), and which
-        # clusters are near an image, (n, K): `estimate` and `outlier_score` look at no others.
+        # `finds_flux`: fluxes of images over the fluxes by which they were divided, (n,), and the
+        # clusters near an image, (n, K), to which `estimate` and `outlier_score` are limited.
         flux: Callable[..., tuple[np.ndarray, np.ndarray]]
         # `knows_field`, explained in `psfdae.methods.field.FieldMixture`: PSFs at positions (n, 2),
         # or with magnitudes and colours (n, 4); the posterior of stars on stamps in any unit;
-        # images, positions and centres of stars drawn from their distribution; the error of a flux
-        # on a known sky; and stars of a magnitude or colour outside of the training range.
+        # images, positions and centres of stars drawn from their prior; the error of a flux on a
+        # known sky; and stars with a magnitude or colour outside of the training range.
         psf_at: Callable[..., np.ndarray]
         measure: Callable[..., Estimate]
         draw_stars: Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
-        fitted_flux_error: Callable[..., tuple[float, np.ndarray, np.ndarray]]
-        is_out_of_range: Callable[..., np.ndarray]
+        estimate_flux_error: Callable[..., tuple[float, np.ndarray, np.ndarray]]
+        is_outside_range: Callable[..., np.ndarray]
 
         @property
         def order(self) -> int:
-            """Order of the polynomial by which the PSF changes over the field."""
+            """Order of the polynomial of the PSF over the field."""
 
     def __init_subclass__(cls) -> None:
+        """Set the name of a method, and complete its label and title."""
         cls.name = cls.__module__.rpartition(".")[2]
         if "look" in vars(cls):
             label, title = cls.look.label, cls.look.title or cls.look.label
@@ -334,7 +342,7 @@ class Method:
 
     @classmethod
     def settings(cls, config: Config) -> dict[str, Group]:
-        """Return its groups of a configuration, as `fit` takes them."""
+        """Return its groups of a configuration, the keyword arguments of `fit`."""
         return {name: getattr(config, name) for name in cls.groups}
 
     @classmethod
@@ -352,20 +360,20 @@ class Method:
         """Return True if training on templates starts from a fit to the realisations."""
         return False
 
-    # What a fitted method knows besides the PSF of a star; most know nothing of it.
+    # Results of a fitted method in addition to the PSF of a star; most methods have none.
 
     def free_flux(self) -> Self:
-        """Return the form for images whose flux and sky are estimates, and their sum is 1."""
+        """Return the form for images of sum 1 whose flux and sky are only estimates."""
         return self
 
     def facts(self) -> Mapping[str, str]:
-        """Return facts that a user should know, by their titles; no full stop ends them."""
+        """Return facts for the user by their titles, without full stops at the end."""
         return {}
 
     def conditions(self) -> Iterable[tuple[str, str, ArrayLike]]:
         """Return conditions that the arrays of any fit fulfil, to detect damaged files.
 
-        Each is the name of an array, what it must have in words, and whether it has it.
+        Each has the name of an array, the condition in words, and whether it is fulfilled.
         """
         return ()
 
@@ -376,9 +384,9 @@ class Method:
         position: np.ndarray | None = None,
         with_sigma: bool = True,
     ) -> Estimate:
-        """Return the PSFs of noisy images (n, d, d), and what else the method knows of them.
+        """Return the PSFs of noisy images (n, d, d), with other results of the method.
 
-        By default those of `predict`, which gets what the method needs besides the image.
+        By default it calls `predict` with the inputs that the method needs.
 
         Parameters
         ----------
@@ -389,7 +397,7 @@ class Method:
         position : ndarray, shape (n, 2) or (n, 4), optional
             See `Needs.position`.
         with_sigma : bool
-            False if the standard deviations are not needed, without which some methods are faster.
+            False if standard deviations are not needed; some methods are faster without them.
         """
         inputs = (level,) * self.needs.level + (position,) * self.needs.position
         return Estimate(self.predict(noisy, *inputs))
@@ -397,21 +405,23 @@ class Method:
     def outlier_score(
         self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
     ) -> np.ndarray | None:
-        """Return how unlike all training stars images (n, d, d) are, shape (n,).
+        """Return the dissimilarity of images (n, d, d) from all training stars, shape (n,).
 
-        −2 ln of the probability density; for a normal law the square of Mahalanobis' distance. None
-        if the method does not know the distribution of the training stars, or has the score in its
-        `estimate`. `near_clusters` is what `flux` returned of these images.
+        It is −2 ln of the probability density; for a normal distribution the squared Mahalanobis
+        distance. The result is None if the method does not know the distribution of the training
+        stars, or has the score in its `estimate`. `near_clusters` is the second result of `flux`
+        for these images.
         """
         return None
 
     # A fit as files, and as part of a bundle.
 
-    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+    def save(self, place: Path, config: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
-        arrays, facts = self.stored_arrays(), self.stored()
+        # The unit and the meaning of each array are part of the product.
+        arrays, facts = self.to_arrays(), self.list_arrays()
         columns = {name: Column(array, *facts[name]) for name, array in arrays.items()}
-        write_product(place, self.name, columns, described)
+        write_product(place, self.name, columns, config)
 
     @classmethod
     def load(
@@ -422,53 +432,54 @@ class Method:
         Parameters
         ----------
         place : Path
+            File or folder of the fit.
         reference : str
-            Counts for one fit that serves both.
+            "realisation" or "template"; used by methods with one fit for both.
         evaluation : config group
-            Threads, and images at a time.
+            Number of threads; by default it is not changed.
 
         Raises
         ------
         ProductError
             If a file is missing or damaged.
         """
-        product = read_product(place, cls.name, tuple(cls.stored()))
-        return cls.restored(product.arrays, product.config, reference)
+        product = read_product(place, cls.name, tuple(cls.list_arrays()))
+        return cls.from_arrays(product.arrays, product.config, reference)
 
     @classmethod
-    def stored(cls) -> Mapping[str, tuple[str, str]]:
-        """Return unit and meaning of each array of a fit; none if the method leaves no file."""
+    def list_arrays(cls) -> Mapping[str, tuple[str, str]]:
+        """Return unit and meaning of each array of a fit; empty if the method has no files."""
         return cls.storage.arrays if cls.storage else {}
 
-    def stored_arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of a fit by their names in files: those of its attributes."""
-        return {name: getattr(self, name) for name in self.stored()}
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of a fit by their names in files; by default names of attributes."""
+        return {name: getattr(self, name) for name in self.list_arrays()}
 
     @classmethod
-    def described(cls, place: Path) -> dict[str, Any]:
+    def read_config(cls, place: Path) -> dict[str, Any]:
         """Return the resolved configuration of a fit."""
         return read_product(place, cls.name, ()).config
 
     @classmethod
-    def restored(
+    def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Return a fit from its arrays and the configuration that was saved with them."""
         return cls(**arrays)
 
-    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def export(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return the arrays for a bundle, and fields of its `BundleInfo` that describe them.
 
-        `noise` is the least RMS per pixel, over the flux, that they are for.
+        `noise` is the minimum RMS per pixel, over the flux, for which they are used.
         """
-        return {name: np.asarray(array) for name, array in self.stored_arrays().items()}, {}
+        return {name: np.asarray(array) for name, array in self.to_arrays().items()}, {}
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """Return the arrays that a bundle must have, with their shapes; None: any."""
-        return dict.fromkeys(cls.stored())
+        """Return the arrays that a bundle must have, with their shapes; None for any shape."""
+        return dict.fromkeys(cls.list_arrays())
 
     @classmethod
-    def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
+    def from_bundle(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """Return a fit from a bundle."""
-        return cls.restored(arrays, info.config["train"], info.reference or "realisation")
+        return cls.from_arrays(arrays, info.config["train"], info.reference or "realisation")

@@ -1,13 +1,14 @@
 """Linear minimum-mean-square-error estimator with known noise level: an oracle.
 
 ŷ = ȳ + C_yx (C_xx + N)⁻¹ (x − x̄) with the mean and the (cross-)covariance of the
-noise-free training stars and their references, and the noise variance of the
-star's own λ on the diagonal of N, which it is given.
+noise-free training stars and their references, and the noise variance for the given
+λ of the star on the diagonal of N.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -28,9 +29,10 @@ class LinearMmse(Method):
     cov_yx : ndarray, shape (P, P)
         Cross-covariance of references and images.
     noise : NoiseModel
+        Noise of the images at a level λ.
     """
 
-    look = Look("linear MMSE", "#009e73", "^", drawn=False)
+    look = Look("linear MMSE", "#009e73", "^", is_drawn=False)
     needs = Needs(level=True)
     storage = None
 
@@ -42,12 +44,12 @@ class LinearMmse(Method):
 
     @classmethod
     def fit(cls, data: TrainingSet) -> LinearMmse:
-        """Moments of the training stars."""
-        return cls.of(data.images[data.train], data.references[data.train], data.noise)
+        """Compute the moments of the training stars."""
+        return cls.from_images(data.images[data.train], data.references[data.train], data.noise)
 
     @classmethod
-    def of(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> LinearMmse:
-        """Moments of noise-free training images and references, both of shape (n, d, d)."""
+    def from_images(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> Self:
+        """Compute the moments of noise-free images and references, both of shape (n, d, d)."""
         # Deviations from the mean image and the mean reference, in double precision.
         x = images.reshape(len(images), -1).astype(np.float64)
         y = references.reshape(len(references), -1).astype(np.float64)
@@ -58,9 +60,9 @@ class LinearMmse(Method):
         return cls(mean_x, mean_y, x.T @ x / len(x), y.T @ x / len(x), noise)
 
     def predict(self, noisy: np.ndarray, level: float) -> np.ndarray:
-        """Estimates for noisy images of one noise level λ, shape (n, d, d)."""
-        # N: the noise that the mean star would have; then the gain C_yx (C_xx + N)⁻¹, of which the
-        # transposed is solved for, as C_xx + N is symmetric.
+        """Return estimates for noisy images of one noise level λ, shape (n, d, d)."""
+        # N: the noise of the mean star; then the gain C_yx (C_xx + N)⁻¹, whose transpose is the
+        # solution of a linear system, as C_xx + N is symmetric.
         variance = self.noise.variance(self.mean_x, level)
         system = self.cov_xx + np.diag(variance)
         gain = np.linalg.solve(system, self.cov_yx.T).T

@@ -1,7 +1,7 @@
 """Image metrics per star, and their means with clustered standard errors.
 
-In: restored PSFs and noise-free references, (n, d, d). Out: one value of each metric for each
-star, and rows of tables.
+Inputs: restored PSFs and noise-free references, (n, d, d). Outputs: one value of each metric for
+each star, and rows of tables.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ def ssim(
 ) -> np.ndarray:
     """Return the structural similarity of every stamp, as scikit-image does by default.
 
-    The mean over all places of the window inside the stamp of Wang et al. 2004 (IEEE Trans.
-    Image Process. 13, 600), eq. 13, with sample covariances. Several dynamic ranges share
+    It is the mean of eq. 13 of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with sample
+    covariances, over all positions of the window inside the stamp. Several dynamic ranges share
     the moving sums, which take most of the time.
 
     Parameters
     ----------
     estimates, references : ndarray, shape (n, d, d)
+        Stamps to compare, in the same unit.
     *data_ranges : float or ndarray, shape (n,)
         Dynamic ranges; one value or one per star.
     window_px : int
-        Side of the uniform window, by default that of scikit-image.
+        Side of the uniform window, by default as in scikit-image.
 
     Returns
     -------
-    ndarray, shape (n,), or (number of ranges, n) of several
-        NaN for a stamp with a pixel that is not finite.
+    ndarray, shape (n,), or (number of ranges, n) for several ranges
+        Similarity, at most 1; NaN for a stamp with a pixel that is not finite.
 
     Raises
     ------
@@ -60,12 +61,12 @@ def ssim(
     if not (ranges > 0).all():
         raise ValueError(f"SSIM data_range must be positive, got {ranges.min()}")
     # Matrix that averages the pixels of an axis over the window: column j is 1/window at the pixels
-    # of the window at place j, of which there are side − window + 1.
+    # of the window at position j; there are side − window + 1 positions.
     place = np.arange(side)[:, None] - np.arange(side - window_px + 1)
     window_mean = ((place >= 0) & (place < window_px)) / window_px
 
     def mean(images: np.ndarray) -> np.ndarray:
-        """Return the mean of every window, transposed: only its sum over all places is used."""
+        """Return the mean of every window, transposed: only the sum over all windows is used."""
         rows = (images.reshape(-1, side) @ window_mean).reshape(len(images), side, -1)
         columns = np.ascontiguousarray(rows.swapaxes(1, 2)).reshape(-1, side)
         return np.asarray((columns @ window_mean).reshape(len(images), *window_mean.shape[1:], -1))
@@ -74,7 +75,7 @@ def ssim(
     # The moving sums of 256 stars fit into a processor's cache.
     for first in range(0, count, 256):
         block = slice(first, first + 256)
-        # SSIM does not change if both images and the range are scaled alike.
+        # SSIM does not change if images and range are multiplied by the same factor.
         unit = ranges[0, block, None, None]
         x, y = (a[block].astype(np.float64) / unit for a in (estimates, references))
         with np.errstate(invalid="ignore", over="ignore"):
@@ -112,40 +113,40 @@ def all_metrics(
 
 
 def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[str, np.ndarray]:
-    """Return metrics of every star (n,), of its PSF and of the stated uncertainty.
+    """Return metrics of every star (n,), for its PSF and its estimated uncertainty.
 
-    Beside those of `all_metrics`: `coverage68`, the part of the pixels within ± σ, `evidence`, and
-    whether the star is `explained`, 1 or 0.
+    In addition to `all_metrics`, these are `coverage68`, the fraction of the pixels within ± σ,
+    `evidence`, and `explained`, 1 or 0, where the estimate has them.
     """
     metrics = all_metrics(estimate.psf, truth, data_range)
-    # Part of the pixels whose error is within the stated σ; 68 % if it is right.
+    # Fraction of the pixels with an error below the estimated σ; 68 % if σ is right.
     if estimate.sigma is not None:
         inside = np.abs(estimate.psf - truth) <= estimate.sigma
         metrics["coverage68"] = inside.mean(axis=(1, 2))
     if estimate.evidence is not None:
         metrics["evidence"] = estimate.evidence
-    if estimate.explained is not None:
-        metrics["explained"] = estimate.explained.astype(float)
+    if estimate.is_explained is not None:
+        metrics["explained"] = estimate.is_explained.astype(float)
     return metrics
 
 
-def summarised(
+def summarise_metrics(
     row: Mapping[str, object], metrics: Mapping[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
     """Return the mean of each metric with its standard error, clustered by field, as table rows.
 
-    Each is added to a copy of `row`.
+    Each row is a copy of `row` with additional columns.
     """
     # A row for each metric.
     rows = []
     for metric, values in metrics.items():
-        mean, stderr = clustered_mean(values, field)
+        mean, stderr = cluster_mean(values, field)
         rows.append({**row, "metric": metric, "value": mean, "stderr": stderr, "n": values.size})
     return rows
 
 
-def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """Return a mean and its standard error when stars of a field are not independent.
+def cluster_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
+    """Return a mean and its standard error if stars of a field are not independent.
 
     SE² = G/(G − 1) Σ_g (Σ_{i∈g} (v_i − v̄))² / n², the cluster-robust variance of a
     mean (Liang & Zeger 1986) with G clusters.
@@ -153,33 +154,34 @@ def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, floa
     Parameters
     ----------
     values : ndarray, shape (n,)
+        Values v, one for each star.
     cluster : ndarray of int, shape (n,)
         Field of every star.
 
     Returns
     -------
     mean, standard_error : float
-        The error is NaN if there is one cluster only.
+        Mean v̄ and its error, which is NaN for a single cluster.
     """
     # Sum of the deviations in each cluster.
     mean = float(values.mean())
     _, member = np.unique(cluster, return_inverse=True)
     sums = np.bincount(member, weights=values - mean)
     groups = sums.size
-    # One cluster says nothing of the scatter between clusters.
+    # A single cluster does not determine the scatter between clusters.
     if groups < 2:
         return mean, float("nan")
     variance = groups / (groups - 1) * float((sums**2).sum()) / values.size**2
     return mean, float(np.sqrt(variance))
 
 
-def clustered_ratio(
+def cluster_ratio(
     values: np.ndarray, denominators: np.ndarray, cluster: np.ndarray
 ) -> tuple[float, float]:
     """Return the ratio R = v̄/w̄ of two means over the same stars, and its standard error.
 
-    The error is that of the linearised ratio, the mean of (v − R w)/w̄ (Cochran 1977, Sampling
-    Techniques, sect. 6.4), clustered as in `clustered_mean`.
+    The error of the linearised ratio is the error of the mean of (v − R w)/w̄ (Cochran 1977,
+    Sampling Techniques, sect. 6.4), clustered as in `cluster_mean`.
 
     Parameters
     ----------
@@ -188,8 +190,8 @@ def clustered_ratio(
     cluster : ndarray of int, shape (n,)
         Field of every star.
     """
-    # The mean of (v − R w)/w̄ is 0; its error is that of the ratio.
+    # The mean of (v − R w)/w̄ is 0, and its error is the error of the ratio.
     ratio = float(values.mean() / denominators.mean())
     residuals = (values - ratio * denominators) / denominators.mean()
-    _, stderr = clustered_mean(residuals, cluster)
+    _, stderr = cluster_mean(residuals, cluster)
     return ratio, stderr

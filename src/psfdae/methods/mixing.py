@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 LEAST_WEIGHT = 1e-3
-"""Least weight of a part that counts in the sum over a mixture."""
+"""Minimum weight of a part in the sum over a mixture."""
 
 FLUX_SIGMA = 0.2
-"""Standard deviation of a star's flux over its first estimate."""
+"""Relative standard deviation of a star's flux about its first estimate."""
 
 
 def mixing_weights(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,7 +26,7 @@ def mixing_weights(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     evidence : ndarray, shape (n,)
         ln of the sum of prior times likelihood over all parts.
     """
-    # Relative to the largest one, so that no exponential overflows.
+    # Relative to the largest one, so that exponentials do not overflow.
     peak = log.max(axis=1)
     weight = np.exp(log - peak[:, None])
     total = weight.sum(axis=1)

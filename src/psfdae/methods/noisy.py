@@ -1,4 +1,4 @@
-"""No method at all: the noisy image itself, which all others have to beat."""
+"""The noisy image itself, as a baseline for all methods."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from psfdae.methods.interface import Look, Method, TrainingSet
 
 
 class Noisy(Method):
-    """The image as it is."""
+    """The unchanged image."""
 
     look = Look("noisy", "#4d4d4d", paper=("original_noise", "original-noise"), restores=False)
     storage = None
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Noisy:
-        """There is nothing to learn."""
+        """Return the method; nothing is fitted."""
         return cls()
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
-        """The images."""
+        """Return the images unchanged."""
         return noisy

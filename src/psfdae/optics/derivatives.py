@@ -1,21 +1,21 @@
 """Stamps and their derivatives with respect to coefficients of pupil modes.
 
-The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is that of
+The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is, as in
 `psfdae.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
 space of coefficients changes it by dE = Σ 2πi (Σ v_j M_j) A exp(2πiW) exp(−πiu·x),
-another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact.
+another sum of this form, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact.
 Modes are polynomials of the pupil's coordinates, sums of products P_a(x) P_b(y) of Legendre
-polynomials. The field of such a product is two matrix products with weighted matrices, and those
-along x serve all b: all directions together cost a few stamps. Where directions are few and modes
-many, a field for each direction costs less.
+polynomials. The field of such a product is two matrix products with weighted matrices; the products
+along x are shared by all b, so that all directions together take the time of a few stamps. Where
+directions are few and modes many, a field for each direction takes less time.
 
-Three ways lead from the pupil to the pixels, a `Sampling` each:
+There are three ways from the pupil to the pixels, each of them a `Sampling`:
 
 - `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
   narrower than the image's period;
 - `PeriodSampling`: the whole period of the image by a Fourier transform. The
   intensity is a trigonometric polynomial, which its samples determine, so pixels
-  are integrated exactly. It is the faster one for stamps nearly as wide as it;
+  are integrated exactly. It is faster for stamps nearly as wide as the period;
 - `psfdae.optics.seeing.BlurredSampling`: the same period, blurred by the atmosphere.
 """
 
@@ -27,8 +27,8 @@ from typing import Protocol
 
 import numpy as np
 
-from psfdae.optics.propagation import Precision, complex_field, image_points, in_batches, real_dtype
-from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
+from psfdae.optics.propagation import Precision, complex_field, image_points, real_dtype, run_grids
+from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, count_samples
 from psfdae.optics.seeing import WholePeriod
 from psfdae.optics.wavefronts import (
     PupilModes,
@@ -49,7 +49,7 @@ class Sampling(Protocol):
     """float32 or float64, of the pixels."""
 
     product_cost: float
-    """Time of a product of polynomials over that of a direction by itself, as measured."""
+    """Measured time for a product of polynomials, over the time for a single direction."""
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
@@ -57,18 +57,20 @@ class Sampling(Protocol):
         Parameters
         ----------
         pupil_fields : ndarray, shape (B, M, M)
+            Complex fields in the pupil, indexed [wavefront, y, x].
         degrees : sequence of A int
             Degrees of Legendre polynomials.
 
         Returns
         -------
         ndarray, shape (A, B, M, m)
+            Field over pupil y and the points along x.
         """
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """Propagate columns of those, (B, M, m), times P_b(y) for all degrees b, to points.
+        """Propagate columns of such fields (B, M, m), times P_b(y) for all degrees b, to points.
 
-        The result, (A, B, m, m), is the field at the points, up to a common phase of each.
+        The result (A, B, m, m) is the field at the points, up to a common phase of each point.
         """
 
     def to_pixels(self, values: np.ndarray) -> np.ndarray:
@@ -76,7 +78,7 @@ class Sampling(Protocol):
 
 
 class SeparableSampling:
-    """Points from which one matrix P (d, m) makes pixels, P I Pᵀ."""
+    """Sampling in which one matrix P (d, m) converts intensities I to pixels, P I Pᵀ."""
 
     pixel_weights: np.ndarray
     dtype: np.dtype
@@ -90,14 +92,14 @@ class PointSampling(SeparableSampling):
     """Points of `image_points` on both sides of the chief ray, with its parameters.
 
     Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
-    meet cosines or sines, so that products are real and a quarter as large.
+    are multiplied by cosines or sines, so that products are real and a quarter as large.
     """
 
     product_cost = 0.1
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         self.dtype = real_dtype(precision)
-        # Points on one side of the chief ray; those of the other side mirror them.
+        # Points on one side of the chief ray; the points on the other side mirror them.
         half, even_weights, odd_weights = image_points(pupil, stamp_px, pixel)
         # Cosines and sines over half of the pupil. The middle sample of an odd grid is its own
         # mirror image and counts once.
@@ -106,10 +108,10 @@ class PointSampling(SeparableSampling):
         multiplicity = np.where(self._axis == 0.0, 0.5, 1.0)[:, None]
         angle = np.pi * np.outer(self._axis, half)
         self._waves = np.stack([np.cos(angle), np.sin(angle)]) * multiplicity
-        # Weights of the pixels above the chief ray, and mirrored ones of those below; the middle
-        # pixel of an odd stamp is its own mirror image.
-        mirrored = (even_weights - odd_weights)[::-1]
-        above = 0.5 * np.hstack([mirrored.T, (even_weights + odd_weights).T])
+        # Weights of the pixels above the chief ray, and mirrored ones for the pixels below; the
+        # middle pixel of an odd stamp is its own mirror image.
+        mirror_weights = (even_weights - odd_weights)[::-1]
+        above = 0.5 * np.hstack([mirror_weights.T, (even_weights + odd_weights).T])
         below = above[::-1, ::-1][: stamp_px // 2]
         self.pixel_weights = np.vstack([below, above]).astype(self.dtype)
         # Waves times P_a(x), by the degree a.
@@ -118,21 +120,21 @@ class PointSampling(SeparableSampling):
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate along x as `Sampling` does, to all points."""
         # Even and odd parts of the field; real and imaginary parts as rows of one matrix.
-        mirrored = pupil_fields[..., self._samples - 1 :: -1]
-        upper = pupil_fields[..., -self._samples :]
+        mirror_fields = pupil_fields[..., self._samples - 1 :: -1]
+        upper_fields = pupil_fields[..., -self._samples :]
         parts = [
             np.stack([part.real, part.imag]).reshape(-1, self._samples)
-            for part in (upper + mirrored, upper - mirrored)
+            for part in (upper_fields + mirror_fields, upper_fields - mirror_fields)
         ]
         shape = (2, *pupil_fields.shape[:-1], -1)
         fields = []
         # Waves times P_a are made once for each degree, and kept.
         for degree in degrees:
-            # An even polynomial leaves the parity, an odd one changes it: the even part of the
-            # product meets the cosines, the odd part the sines.
+            # An even polynomial keeps the parity, an odd one changes it: the even part of the
+            # product is multiplied by cosines, the odd part by sines.
             if degree not in self._weighted_waves:
-                weighted = legendre([degree], self._axis)[0][:, None] * self._waves
-                self._weighted_waves[degree] = weighted.astype(self.dtype)
+                weighted_waves = legendre([degree], self._axis)[0][:, None] * self._waves
+                self._weighted_waves[degree] = weighted_waves.astype(self.dtype)
             # Sums over half of the pupil: C of the product's even part, S of its odd part.
             cosine_waves, sine_waves = self._weighted_waves[degree]
             cos_re, cos_im = (parts[degree % 2] @ cosine_waves).reshape(shape)
@@ -149,7 +151,7 @@ class PointSampling(SeparableSampling):
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate along y as `Sampling` does."""
-        # Transposed, so that both ways are the same products.
+        # Transposed, so that both directions use the same products.
         return self.along_x(rows.swapaxes(-1, -2), degrees).swapaxes(-1, -2)
 
 
@@ -158,8 +160,8 @@ class PeriodSampling(SeparableSampling, WholePeriod):
 
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
     integral over a pixel multiplies c_l by the pixel's width and a sinc. Twice as
-    many points as samples determine all c_l. Pixels beyond the period repeat those
-    inside.
+    many points as samples determine all c_l. Pixels outside of the period repeat the
+    pixels inside.
     """
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
@@ -173,7 +175,7 @@ class PeriodSampling(SeparableSampling, WholePeriod):
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
         waves = np.exp(-2j * np.pi * np.outer(centres, frequency))
         to_pixels = pixel * np.sinc(frequency * pixel) * waves
-        # Moving the image by a pixel's width multiplies c_l by a phase; this is its derivative.
+        # A shift of the image by a pixel's width multiplies c_l by a phase; this is its derivative.
         to_slopes = to_pixels * (2j * np.pi * pixel * frequency)
         self.pixel_weights, self._slope_weights = (
             ((matrix @ from_points).real / self.points).astype(self.dtype)
@@ -181,12 +183,11 @@ class PeriodSampling(SeparableSampling, WholePeriod):
         )
 
     def position_slopes(self, values: np.ndarray) -> np.ndarray:
-        """Return derivatives by the image's position along x and y, per pixel, (B, 2, d, d).
+        """Return derivatives with respect to the position along x and y, per pixel, (B, 2, d, d).
 
         `values` (B, m, m) are the intensities at the points.
         """
-        # The slope of the light on a pixel is that of a product: along one axis the derivative,
-        # along the other the pixel itself.
+        # Product rule: along one axis the derivative, along the other the pixel itself.
         along_x = self.pixel_weights @ (values @ self._slope_weights.T)
         along_y = self._slope_weights @ (values @ self.pixel_weights.T)
         return np.stack([along_x, along_y], axis=1)
@@ -200,8 +201,9 @@ class ModalStamps:
     pupil : Pupil
         Transmission on an M × M grid.
     modes : PupilModes
+        Function that returns the J modes at pupil points.
     sampling : Sampling
-        Made for the same pupil.
+        Points of the image, made for the same pupil.
     pixel : float
         Pixel width in λ/D; the unit of offsets.
     """
@@ -212,7 +214,7 @@ class ModalStamps:
         self._sampling = sampling
         self._pixel = pixel
         self._axis = pupil.axis.astype(dtype)
-        # Images of the modes as rows of a matrix, and the transmission for a whole light of 1.
+        # Images of the modes as rows of a matrix, and the transmission for a total light of 1.
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
@@ -221,7 +223,7 @@ class ModalStamps:
         self._coefficients = coefficients.astype(dtype)
         # Degrees (a, b) of the Legendre products in the modes.
         self._products = [*map(tuple, degrees)]
-        # Degrees along y that go with each degree along x; the constant first, it is the field.
+        # Degrees along y for each degree along x; the constant comes first, it is the field itself.
         self._degrees = {0: [0]}
         for a, b in sorted(self._products):
             self._degrees.setdefault(a, []).append(b)
@@ -232,6 +234,7 @@ class ModalStamps:
         Parameters
         ----------
         coefficients : ndarray, shape (B, J)
+            Coefficients of the modes in waves.
         offset_px : ndarray, shape (B, 2), optional
             Position (row, column) of the stamp's centre from the chief ray, in pixels.
 
@@ -258,13 +261,14 @@ class ModalStamps:
         Parameters
         ----------
         coefficients : ndarray, shape (B, J)
+            Coefficients of the modes in waves.
         directions : ndarray, shape (B, K, J), or (1, K, J) for all stamps
             Changes of the coefficients per unit parameter, the Jacobian's transpose.
         offset_px : ndarray, shape (B, 2), optional
             As in `stamps`; kept fixed.
         by_position : bool
-            Add two derivatives, by the position of the image along x and y, in pixels. They follow
-            from the image and cost little; the sampling must be `PeriodSampling`.
+            Add two derivatives, with respect to the position of the image along x and y in pixels.
+            They follow from the image and take little time; needs a `PeriodSampling`.
 
         Returns
         -------
@@ -276,19 +280,19 @@ class ModalStamps:
         pupil_fields = self._pupil_fields(coefficients, offset_px)
         # The cheaper way: a field for each direction, or for each product of polynomials.
         if directions.shape[1] < self._sampling.product_cost * len(self._products):
-            intensity, slopes = self._by_direction(pupil_fields, directions)
+            intensity, slopes = self._use_directions(pupil_fields, directions)
         else:
-            intensity, slopes = self._by_product(pupil_fields, directions)
-        # Moving the image is a tilt of the wavefront, but needs no field of its own.
+            intensity, slopes = self._use_products(pupil_fields, directions)
+        # A shift of the image is a tilt of the wavefront, but needs no additional field.
         if by_position:
             assert isinstance(self._sampling, PeriodSampling)
             slopes = np.concatenate([slopes, self._sampling.position_slopes(intensity)], axis=1)
         return self._sampling.to_pixels(intensity), slopes
 
-    def _by_direction(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
-        """Return intensities at the points and slopes of the pixels, by a field per direction."""
+    def _use_directions(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
+        """Return intensities at the points, and slopes of the pixels by a field per direction."""
         sampling, (count, *shape) = self._sampling, pupil_fields.shape
-        # Pupil fields, and those times the OPD of each direction: E and G with dE = 2πi G.
+        # Pupil fields, and their products with the OPD of each direction: E and G, dE = 2πi G.
         fields = np.empty((count, 1 + directions.shape[1], *shape), pupil_fields.dtype)
         fields[:, 0] = pupil_fields
         opd = (directions @ self._modes).reshape(*directions.shape[:2], *shape)
@@ -304,21 +308,21 @@ class ModalStamps:
             slopes[:, k] = image.imag * change.real - image.real * change.imag
         return image.real**2 + image.imag**2, (4.0 * np.pi) * sampling.to_pixels(slopes)
 
-    def _by_product(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
+    def _use_products(self, pupil_fields: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
         """Return intensities and slopes as above, by a field per product of polynomials."""
         sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
         rows_of_degrees = sampling.along_x(pupil_fields, [*self._degrees])
         for (a, y_degrees), rows in zip(self._degrees.items(), rows_of_degrees, strict=True):
-            # P_a(x) along x serves all P_b(y) that go with it; P_0 P_0 is the field itself.
+            # P_a(x) along x is shared by all P_b(y) of its products; P_0 P_0 is the field itself.
             changes = sampling.along_y(rows, y_degrees)
             if a == 0:
                 image = changes[0]
             for b, change in zip(y_degrees, changes, strict=True):
-                # Im E Re G − Re E Im G, as by direction; kept as pixels, which are fewer.
+                # Im E Re G − Re E Im G, as by direction; stored as pixels, which are fewer.
                 slope = image.imag * change.real - image.real * change.imag
                 slopes[a, b] = sampling.to_pixels(slope)
-        # Slopes along a direction are those of the products times their coefficients in it.
+        # Slopes along a direction are sums of the products' slopes times their coefficients in it.
         weights = directions @ self._coefficients
         by_product = [slopes[degrees] for degrees in self._products]
         product_slopes = (4.0 * np.pi) * np.stack(by_product, axis=1)
@@ -336,7 +340,7 @@ class ModalStamps:
         """Return A exp(2πiW) of a batch, with the tilt that shows the image at an offset."""
         phase = self.opd(coefficients) * (2.0 * np.pi)
         if offset_px is not None:
-            # Looking at a stamp moved by +u is the tilt that moves the image by −u.
+            # A shift of the stamp by +u is a tilt that moves the image by −u.
             tilt = (np.pi * self._pixel * np.asarray(offset_px, float)).astype(phase.dtype)
             phase -= tilt[:, 0, None, None] * self._axis[:, None]
             phase -= tilt[:, 1, None, None] * self._axis
@@ -346,13 +350,14 @@ class ModalStamps:
 class SampledStamps:
     """Stamps of sums of modes, each on the smallest pupil grid that its slopes allow.
 
-    Batches run side by side in threads; results do not depend on their number.
+    Batches run in parallel threads; results do not depend on the number of threads.
 
     Parameters
     ----------
     obscuration : float
         Linear central obscuration of the pupil.
     modes : PupilModes
+        Function that returns the J modes at pupil points.
     sampling : callable
         Function of pupil, stamp_px, pixel and the keyword precision that returns a `Sampling`.
     stamp_px : int
@@ -360,12 +365,13 @@ class SampledStamps:
     pixel : float
         Pixel width in λ/D.
     precision : "complex64" or "complex128"
+        Precision of the fields.
     sizes : sequence of int
         Pupil samples N to choose from, ascending.
     reach : float
-        Distance in λ/D around a stamp from which light is spread into it.
+        Distance in λ/D around a stamp from which blur brings light into it.
     batch, threads : int
-        Stamps or derivatives that are propagated together, and batches at once.
+        Number of stamps or derivatives in a batch, and of batches at once.
     """
 
     def __init__(
@@ -385,12 +391,12 @@ class SampledStamps:
         self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
         self._precision, self._batch, self._threads = precision, batch, threads
         self._dtype = real_dtype(precision)
-        # Slopes of the modes decide how fine a grid a wavefront needs.
+        # Slopes of the modes determine the grid that a wavefront needs.
         self._slopes = mode_slopes(modes)
         self._operators: dict[int, ModalStamps] = {}
 
     def operator(self, samples: int) -> ModalStamps:
-        """Return the operator on a pupil grid with N samples across; made once, then kept."""
+        """Return the operator on a pupil grid with N samples across; it is cached."""
         if samples not in self._operators:
             # The grid, the points of its image, and the modes on it.
             pupil = annular_pupil(samples, self._obscuration)
@@ -401,21 +407,21 @@ class SampledStamps:
     def samples(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return the pupil samples N of each wavefront, (B,), for coefficients (B, J).
 
-        Offsets are those of `ModalStamps.stamps`.
+        For the offsets see `ModalStamps.stamps`.
 
         Raises
         ------
         SamplingError
-            If the largest grid size is below what a wavefront needs.
+            If a wavefront needs more samples than the largest grid has.
         """
         offset_px = np.zeros((len(coefficients), 2)) if offset_px is None else offset_px
-        # Edges of the stamp along x and y, in λ/D, and the region that sheds light on it.
+        # Edges of the stamp along x and y in λ/D, extended by the reach of the blur.
         half = np.array([-0.5, 0.5]) * self.stamp_px
         edges = (offset_px[:, ::-1, None] + half) * self.pixel
         edges = edges + np.array([-self.reach, self.reach])
-        # The sampling guard chooses by the slopes of each wavefront.
-        needed = required_samples(slope_ranges(self._slopes, coefficients), edges)
-        return choose_samples(needed, self.sizes)
+        # The slopes of each wavefront determine its grid.
+        min_samples = count_samples(slope_ranges(self._slopes, coefficients), edges)
+        return choose_samples(min_samples, self.sizes)
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Return stamps as `ModalStamps.stamps` does; raises as `samples`."""
@@ -438,8 +444,8 @@ class SampledStamps:
     ) -> StampsAndSlopes:
         """Return stamps and derivatives along directions (B, K, J), as `ModalStamps` does.
 
-        `samples` (B,) are pupil samples, by default as many as the stamps need; raises as
-        `samples` does.
+        The argument `samples` (B,) sets the pupil samples, by default as many as the stamps need.
+        Raises as the method `samples`.
         """
         side = self.stamp_px
         count = directions.shape[1] + 2 * by_position
@@ -451,14 +457,14 @@ class SampledStamps:
             wavefronts = coefficients[batch], directions[batch], offset
             stamps[batch], slopes[batch] = operator.derivatives(*wavefronts, by_position)
 
-        # A wavefront with K derivatives counts for K in the size of a batch.
+        # A wavefront with K derivatives counts as K stamps in the size of a batch.
         samples = self.samples(coefficients, offset_px) if samples is None else samples
         self._run(differentiate, samples, max(1, self._batch // count))
         return stamps, slopes
 
     def _run(self, work: Callable[..., None], samples: np.ndarray, size: int) -> None:
         """Call `work` with the operator and the numbers of each batch of wavefronts."""
-        in_batches(samples, size, self._threads, lambda n: partial(work, self.operator(n)))
+        run_grids(samples, size, self._threads, lambda n: partial(work, self.operator(n)))
 
 
 def normalise_with_derivatives(
@@ -468,15 +474,16 @@ def normalise_with_derivatives(
 
     Returns
     -------
-    normalised : ndarray, shape (..., d, d)
-        Sum 1.
+    unit_stamps : ndarray, shape (..., d, d)
+        Stamps of sum 1.
     derivatives : ndarray, shape (..., K, d, d)
         (∂p − (p/f) ∂f)/f; each sums to 0.
     flux : ndarray, shape (...)
+        Sum f of each stamp.
     """
     # Derivative of the quotient p/f: (∂p − (p/f) ∂f)/f.
     flux = stamps.sum(axis=(-2, -1))
-    normalised = stamps / flux[..., None, None]
+    unit_stamps = stamps / flux[..., None, None]
     flux_slope = derivatives.sum(axis=(-2, -1))[..., None, None]
-    slope = (derivatives - normalised[..., None, :, :] * flux_slope) / flux[..., None, None, None]
-    return normalised, slope, flux
+    slope = (derivatives - unit_stamps[..., None, :, :] * flux_slope) / flux[..., None, None, None]
+    return unit_stamps, slope, flux

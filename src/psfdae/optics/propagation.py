@@ -6,19 +6,18 @@ and OPD W(x) in waves, x in pupil radii, is
     E(u) = Σ A(x) exp(2πi W(x)) exp(−πi u·x),
 
 two matrix products per stamp (a matrix DFT, Soummer et al. 2007, Opt. Express
-15, 15935). Only the points that are needed are computed; there is no padded grid. The
-pupil is the same at +y and −y, and the points are symmetric about the chief ray. With s
-and t the even and odd part of the phase 2πW over y, the rows of the pupil at +y and −y
-together are
+15, 15935). Only the necessary points are computed, without a padded grid. The pupil is
+the same at +y and −y, and the points are symmetric about the chief ray. With s and t the
+even and odd part of the phase 2πW over y, the rows of the pupil at +y and −y together are
 
     2 A exp(is) cos(t − πu_y y) = 2 A exp(is) (cos t cos πu_y y + sin t sin πu_y y),
 
-so one half of the pupil and of the points suffices, and all products are real.
+so that half of the pupil and of the points is enough, and all products are real.
 
-The spectrum of an intensity ends at the largest distance of two points of the
-pupil. Two points per λ/D and a few more therefore determine it on the whole
-stamp, and with it the light on every pixel: far fewer points than a quadrature
-in each pixel needs.
+The spectrum of an intensity is limited by the largest distance of two points of
+the pupil. Two points per λ/D and a few more therefore determine the intensity on
+the whole stamp, and the light on every pixel. A quadrature in each pixel would
+need far more points.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from psfdae.base.threads import side_by_side
+from psfdae.base.threads import run_parallel
 from psfdae.optics.pupil import Pupil
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ Backend = Literal["numpy", "torch"]
 Precision = Literal["complex64", "complex128"]
 
 EXTRA_POINTS = 6
-"""Points beyond two per λ/D; they integrate a wave to 5e-4 of a pixel's width."""
+"""Points in addition to two per λ/D; they integrate a wave to 5e-4 of a pixel's width."""
 
 
 def real_dtype(precision: Precision) -> np.dtype:
@@ -60,34 +59,35 @@ def complex_field(phase: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
 def image_points(
     pupil: Pupil, stamp_px: int, pixel: float, extra: int = EXTRA_POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose points on one side of a stamp's axis, and weights that make pixels of intensities.
+    """Choose points on one side of a stamp's axis, and weights from intensities to pixels.
 
-    Chebyshev points of the stamp that are spread as far as the error permits, until they
-    are nearly equidistant (Kosloff & Tal-Ezer 1993, J. Comput. Phys. 104, 457). The weights
-    integrate every wave that an intensity can hold, by least squares.
+    Chebyshev points of the stamp, mapped so that they are nearly equidistant as far as the error
+    permits (Kosloff & Tal-Ezer 1993, J. Comput. Phys. 104, 457). The weights integrate every
+    wave that an intensity can contain, by least squares.
 
     Parameters
     ----------
     pupil : Pupil
+        Pupil, whose width limits the spectrum of the intensity.
     stamp_px : int
         Pixels d along a side.
     pixel : float
         Pixel width in λ/D.
     extra : int
-        Points along the whole axis beyond two per λ/D; two more gain about one digit.
+        Points along the whole axis in addition to two per λ/D; two more gain about one digit.
 
     Returns
     -------
     points : ndarray, shape (m,)
-        In λ/D from the chief ray, ascending.
+        Distance from the chief ray in λ/D, ascending.
     even_weights, odd_weights : ndarray, shape (m, ⌈d/2⌉)
         For the intensity I (m,) at the points, even_weights.T @ I is its integral over each
         pixel from the chief ray outward if I is even about the chief ray, odd_weights.T @ I if
         I is odd.
     """
-    # Half of the points. Two per λ/D resolve the highest frequency, in cycles per λ/D the pupil's
-    # width in D, which is half of that in radii;
-    # `extra` more are for the accuracy.
+    # Half of the points. Two per λ/D resolve the highest frequency: in cycles per λ/D, it is the
+    # width of the pupil in diameters, half of its width in radii. `extra` more are for the
+    # accuracy.
     edge = 0.5 * stamp_px * pixel
     highest = 0.5 * (pupil.axis.size - 1) * pupil.spacing
     m = max(1, (int(np.ceil(4.0 * edge * highest)) + extra + 1) // 2)
@@ -110,10 +110,10 @@ def image_points(
 class StampPropagator:
     """Operator from batches of OPD maps to pixel-integrated stamps.
 
-    The stamp is centred on the chief ray moved by an offset per star, which
-    enters as a tilt: all stars share the same matrices. For an even stamp the
-    chief ray falls on a pixel corner. Several threads may use one propagator at
-    the same time: each has scratch space of its own.
+    The stamp is centred on the chief ray plus an offset per star. The offset is a
+    tilt of the wavefront, so that all stars share the same matrices. For an even
+    stamp the chief ray falls on a pixel corner. Several threads may use one
+    propagator at the same time: each has its own scratch space.
 
     Parameters
     ----------
@@ -124,9 +124,11 @@ class StampPropagator:
     pixel : float
         Pixel width in λ/D.
     extra : int
-        Points of the image beyond two per λ/D, see `image_points`.
+        Points of the image in addition to two per λ/D, see `image_points`.
     precision : "complex64" or "complex128"
+        Precision of the fields.
     backend : "numpy" or "torch"
+        Library of the matrix products.
 
     Raises
     ------
@@ -146,7 +148,7 @@ class StampPropagator:
         # One half of the pupil stands for both.
         if not np.allclose(pupil.amplitude, pupil.amplitude[::-1], atol=1e-9):
             raise ValueError("pupil: its halves above and below the chief ray differ")
-        # Arrays of numpy or of torch, by the same names of functions.
+        # numpy or torch, which have functions of the same names.
         self._xp: Any = np
         if backend == "torch":
             import torch
@@ -163,8 +165,8 @@ class StampPropagator:
         angle = np.pi * np.outer(pupil.axis, points)
         waves = np.stack([np.cos(angle), np.sin(angle)])
         self._from_x = self._array(waves)
-        # The same along y for both halves of the pupil at once. The middle row of an odd grid is
-        # its own mirror image and counts once.
+        # The same along y for both halves of the pupil. The middle row of an odd grid is its own
+        # mirror image and counts once.
         multiplicity = np.where(pupil.axis[-half:] == 0.0, 1.0, 2.0)
         self._from_y = self._array((waves[:, -half:] * multiplicity[:, None]).swapaxes(1, 2))
         # Weights from intensities to pixels, even and odd ones.
@@ -194,33 +196,33 @@ class StampPropagator:
         xp, (batch, n, _) = self._xp, opd.shape
         m = self._from_y.shape[1]
         opd = self._array(opd) if isinstance(opd, np.ndarray) else opd
-        # Looking at a stamp moved by +u is the tilt that moves the image by −u.
+        # A shift of the stamp by +u is a tilt that moves the image by −u.
         tilt = np.zeros((batch, 2)) if offset_px is None else np.asarray(offset_px, float)
         tilt = self._array(-np.pi * self.pixel * tilt)
         # Along y. Axes: [cosine or sine in y, real or imaginary, star, point in y, pupil x]. Stars
-        # with 2^17 samples are worked on together: their phases stay in a core's cache.
+        # with 2^17 samples are processed together: their phases fit into a core's cache.
         rows = self._buffer("rows", 2, 2, batch, m, n)
         size = max(1, 2**17 // n**2)
         for part in (slice(start, start + size) for start in range(0, batch, size)):
-            fields = self._folded_fields(opd[part], tilt[part])
+            fields = self._fold_fields(opd[part], tilt[part])
             xp.matmul(self._from_y[:, None, None], fields, out=rows[:, :, part])
         # Along x, with a leading axis: cosine or sine in x.
         field = self._buffer("field", 2, 2, 2, batch, m, m)
         xp.matmul(rows, self._from_x[:, None, None, None], out=field)
         return self._pixels(self._intensities(field))
 
-    def _folded_fields(self, opd: Any, tilt: Any) -> Any:
+    def _fold_fields(self, opd: Any, tilt: Any) -> Any:
         """Return exp(is) cos t and exp(is) sin t over half of the pupil, (2, 2, b, half, M).
 
         s and t are the even and odd part of the phase over y. The second axis is the real or
         imaginary part.
         """
         xp, half, shape = self._xp, self._half, (len(opd), self._half, opd.shape[-1])
-        upper, mirrored = opd[:, -half:], xp.flip(opd[:, :half], (1,))
+        upper, lower = opd[:, -half:], xp.flip(opd[:, :half], (1,))
         # s = π (W(y) + W(−y)) and t = π (W(y) − W(−y)); tilts along x are even, along y odd.
         phase = self._buffer("phase", 2, *shape)
-        xp.add(upper, mirrored, out=phase[0])
-        xp.subtract(upper, mirrored, out=phase[1])
+        xp.add(upper, lower, out=phase[0])
+        xp.subtract(upper, lower, out=phase[1])
         phase *= np.pi
         phase[0] += tilt[:, 1, None, None] * self._axis
         phase[1] += tilt[:, 0, None, None] * self._axis[-half:, None]
@@ -235,7 +237,7 @@ class StampPropagator:
     def _intensities(self, field: Any) -> Any:
         """Return the even and odd parts of |E|² over x and over y, (2, 2, B, m, m).
 
-        Those that are odd in x are halved. `field` holds [cosine or sine in x, in y, real or
+        Parts that are odd in x are halved. `field` holds [cosine or sine in x, in y, real or
         imaginary]. With C and S the cosine and sine parts in y, the field at (a x, b y), a and b
         each ±1, is (C + b S)_cos − i a (C + b S)_sin; the subscript is the part in x.
         """
@@ -251,8 +253,8 @@ class StampPropagator:
         # Odd over x: products of real and imaginary parts across cosines and sines in x. They are
         # even over y for equal parts in y, and odd for different ones.
         (cos_re, cos_im), (sin_re, sin_im) = field[0].swapaxes(0, 1), field[1].swapaxes(0, 1)
-        crossed = (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,)))
-        for parity, (re, im) in enumerate(((sin_re, sin_im), crossed)):
+        swapped = (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,)))
+        for parity, (re, im) in enumerate(((sin_re, sin_im), swapped)):
             xp.multiply(cos_re, im, out=half[0])
             xp.multiply(cos_im, re, out=half[1])
             intensity[1, parity] = half[0].sum(0) - half[1].sum(0)
@@ -265,7 +267,7 @@ class StampPropagator:
         parts = np.asarray(self._xp.matmul(self._to_y[:, None], along_x))
         d, half = self.stamp_px, (self.stamp_px + 1) // 2
         above, below = slice(d // 2, None), slice(half - 1, None, -1)
-        # Pixels at ±x and ±y are even ± odd parts; those odd in x were halved, hence the factor 2.
+        # Pixels at ±x and ±y are even ± odd parts; parts odd in x were halved, hence the factor 2.
         # The middle pixel of an odd stamp is written by both sides, which agree.
         stamp = np.empty((len(parts[0, 0]), d, d), self.real_dtype)
         for sign, columns in ((2.0, above), (-2.0, below)):
@@ -280,9 +282,9 @@ class StampPropagator:
         return array if self._xp is np else self._xp.from_numpy(array)
 
     def _buffer(self, name: str, *shape: int) -> Any:
-        """Return scratch space that is kept between calls, one for each thread.
+        """Return scratch space that is kept between calls, one array for each thread.
 
-        Fresh pages of memory would cost more than the arithmetic.
+        New pages of memory would take more time than the arithmetic.
         """
         buffers: dict[tuple[int, ...], Any] = vars(self._scratch).setdefault(name, {})
         if shape not in buffers:
@@ -290,13 +292,13 @@ class StampPropagator:
         return buffers[shape]
 
 
-def in_batches(
+def run_grids(
     samples: np.ndarray,
     size: int,
     threads: int,
     prepare: Callable[[int], Callable[[np.ndarray], None]],
 ) -> None:
-    """Work on wavefronts in batches that share a pupil grid, side by side in threads.
+    """Process wavefronts in batches that share a pupil grid, in parallel threads.
 
     Parameters
     ----------
@@ -305,13 +307,13 @@ def in_batches(
     size : int
         Largest number of wavefronts in a batch.
     threads : int
-        Batches at once; linear algebra should be on one thread meanwhile.
+        Number of batches at once; linear algebra should use one thread meanwhile.
     prepare : callable
-        Function of N that returns the work on one batch: a function of the indices into
-        `samples`, shape (b,), which stores its own results.
+        Function of N that returns the function for one batch. This takes indices into `samples`,
+        shape (b,), and stores its own results.
     """
-    # One grid after the other, from the coarsest on.
+    # Grid by grid, beginning with the coarsest.
     for count in np.unique(samples):
         members = np.flatnonzero(samples == count)
         batches = np.array_split(members, range(size, members.size, size))
-        side_by_side(prepare(int(count)), batches, threads)
+        run_parallel(prepare(int(count)), batches, threads)

@@ -33,9 +33,9 @@ class Pupil:
     def light(self) -> float:
         """Light of the whole image plane, in the image's unit |Σ A exp(…)|² times (λ/D)².
 
-        (2/spacing)² Σ A, because a grey cell passes light by its lit area. By Parseval one
-        period of the image holds Σ A² instead, a few thousandths less: that is the grey
-        pupil, whose image lacks faint outer light and agrees with the true one inside.
+        (2/spacing)² Σ A, because a grey cell transmits light in proportion to its lit area. By
+        Parseval's theorem, one period of the image holds Σ A² instead, a few thousandths less:
+        the image of the grey pupil lacks faint outer light and agrees with the true one inside.
         """
         return (2.0 / self.spacing) ** 2 * float(self.amplitude.sum())
 
@@ -76,14 +76,14 @@ def disc_coverage(samples: int, radius: float, guard: int = 0) -> np.ndarray:
     ndarray, shape (M, M), float64
         Coverage, 0 … 1.
     """
-    # By symmetry, distances from the centre are all that counts.
+    # By symmetry, only distances from the centre matter.
     x = np.abs(pupil_axis(samples, guard))
     half = 1.0 / samples  # half of a cell's side
     # Distance of the nearest and of the farthest point of each cell from the centre.
     low, high = np.maximum(x - half, 0), x + half
     nearest = np.hypot(low[:, None], low)
     farthest: np.ndarray = np.hypot(high[:, None], high)
-    # Cells are inside, outside, or crossed by the rim: of those, count 64 × 64 sub-samples.
+    # Cells are inside, outside, or crossed by the rim; crossed cells get 64 × 64 sub-samples.
     coverage = (farthest <= radius).astype(np.float64)
     rows, columns = np.nonzero((nearest < radius) & (farthest > radius))
     # The share of the sub-samples of a crossed cell that are in the disc.
@@ -98,11 +98,11 @@ def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pup
     """Make an annular pupil with grey edges.
 
     A grey (area-weighted) edge is the pupil convolved with one cell, which
-    dims the outer image by a second moment of 1/12 cell². `sharpen` takes
-    that moment out again, A − ∇²A/24 with the five-point Laplacian: the stamps
-    of scene 1 then carry about a tenth of the squared error at equal N. The
-    correction reaches one cell beyond the rim, hence the guard cells, and
-    over- and undershoots by a few per cent there.
+    dims the outer image by a second moment of 1/12 cell². `sharpen` removes
+    this moment, A − ∇²A/24 with the five-point Laplacian: the squared error of
+    the stamps of scene 1 falls to about a tenth at equal N. The correction
+    extends one cell outside of the rim, hence the guard cells, and over- and
+    undershoots by a few per cent there.
 
     Parameters
     ----------
@@ -120,14 +120,14 @@ def annular_pupil(samples: int, obscuration: float, sharpen: bool = True) -> Pup
     """
     if not 0.0 <= obscuration < 1.0:
         raise ValueError(f"obscuration = {obscuration} is outside [0, 1)")
-    # Lit part of every cell: the outer disc less the central obscuration.
+    # Lit fraction of every cell: the outer disc minus the central obscuration.
     grey = disc_coverage(samples, 1.0, guard=1)
     if obscuration:
         grey = grey - disc_coverage(samples, obscuration, guard=1)
     if sharpen:
         # A − ∇²A/24.
-        framed = np.pad(grey, 1)
-        neighbours = framed[:-2, 1:-1] + framed[2:, 1:-1] + framed[1:-1, :-2] + framed[1:-1, 2:]
+        frame = np.pad(grey, 1)
+        neighbours = frame[:-2, 1:-1] + frame[2:, 1:-1] + frame[1:-1, :-2] + frame[1:-1, 2:]
         grey = grey - (neighbours - 4.0 * grey) / 24.0
     return Pupil(grey, pupil_axis(samples, guard=1))
 
@@ -136,12 +136,12 @@ class SamplingError(Error, ValueError):
     """Error of a pupil grid that is too coarse for a wavefront or for the stamp's position."""
 
 
-def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def count_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Compute the smallest number of pupil samples that represents a wavefront and its stamp.
 
-    Two conditions per axis. The OPD may change by half a wave per sample:
-    N ≥ 4·max|∂W/∂ρ|. And the images of the pupil grid repeat every N λ/D, so
-    no replica of the geometric blur, which spans 2·∂W/∂ρ, may reach the stamp.
+    There are two conditions per axis. The OPD may change by half a wave per sample:
+    N ≥ 4·max|∂W/∂ρ|. And the image of the pupil grid repeats every N λ/D:
+    no replica of the geometric blur, which spans 2·∂W/∂ρ, may overlap the stamp.
 
     Parameters
     ----------
@@ -153,6 +153,7 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray of int, shape (...)
+        Smallest number N of samples.
 
     Raises
     ------
@@ -161,16 +162,16 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """
     # Half a wave per sample of 2/N radii: N ≥ 4 |∂W/∂ρ|.
     for_slope = 4.0 * np.abs(slopes).max(axis=(-2, -1))
-    # Replicas, N λ/D away, of the geometric blur 2 ∂W/∂ρ stay clear of the stamp on both sides.
+    # Replicas of the geometric blur 2 ∂W/∂ρ, N λ/D away, stay clear of the stamp on both sides.
     blur = 2.0 * slopes
     upper, lower = blur[..., 1] - reach[..., 0], reach[..., 1] - blur[..., 0]
     for_replica = np.maximum(upper, lower).max(axis=-1)
-    needed = np.maximum(for_slope, for_replica)
-    if not np.isfinite(needed).all():
-        wavefront = int(np.flatnonzero(~np.isfinite(needed))[0])
+    min_samples = np.maximum(for_slope, for_replica)
+    if not np.isfinite(min_samples).all():
+        wavefront = int(np.flatnonzero(~np.isfinite(min_samples))[0])
         raise SamplingError(f"wavefront {wavefront} is not finite: no grid can sample it")
-    # Larger numbers would wrap around as integers; no grid is that large.
-    return np.asarray(np.ceil(np.minimum(needed, 2.0**53)), np.int64)
+    # Larger numbers would overflow as integers; no grid is that large.
+    return np.asarray(np.ceil(np.minimum(min_samples, 2.0**53)), np.int64)
 
 
 def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> float:
@@ -180,32 +181,33 @@ def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> 
     return scale_arcsec * arcsec * diameter_m / wavelength_m
 
 
-def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
-    """Choose the smallest of some grid sizes that serves each wavefront.
+def choose_samples(samples: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
+    """Choose the smallest of the available grid sizes that is enough for each wavefront.
 
     Parameters
     ----------
-    needed : ndarray of int, shape (B,)
-        Result of `required_samples`.
+    samples : ndarray of int, shape (B,)
+        Result of `count_samples`.
     sizes : tuple of int
         Available grid sizes N, ascending.
 
     Returns
     -------
     ndarray of int, shape (B,)
+        Grid size of each wavefront.
 
     Raises
     ------
     SamplingError
-        If a wavefront needs more than the largest; names the N that would do.
+        If a wavefront needs more samples than the largest size; names the required N.
     """
     # The message names the grid that the worst wavefront needs.
-    largest = int(needed.max())
+    largest = int(samples.max())
     if largest > sizes[-1]:
-        star = int(needed.argmax())
+        star = int(samples.argmax())
         raise SamplingError(
             f"optics.pupil_samples = {list(sizes)}: wavefront {star} needs N ≥ {largest} pupil "
-            f"samples (half a wave per sample, replicas clear of the stamp); "
-            f"{int((needed > sizes[-1]).sum())} of {needed.size} wavefronts exceed the last value"
+            "samples (half a wave per sample, replicas clear of the stamp); "
+            f"{(samples > sizes[-1]).sum()} of {samples.size} wavefronts exceed the last value"
         )
-    return np.asarray(sizes)[np.searchsorted(sizes, needed)]
+    return np.asarray(sizes)[np.searchsorted(sizes, samples)]

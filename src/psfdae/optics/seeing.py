@@ -1,13 +1,14 @@
-"""Stamps that a long exposure through the atmosphere has blurred.
+"""Stamps blurred by a long exposure through the atmosphere.
 
-The blur is a convolution with a round profile, the same all over the field. It multiplies
-the transfer function, and so does the pixel: on the lags l of the pupil's samples
+The blur is a convolution with a round profile, the same over the whole field. It multiplies
+the transfer function, as the pixel does: on the lags l of the pupil's samples
 
     |E(u)|² = Σ_l c_l exp(−πi l·spacing·u)
 
 (`psfdae.optics.derivatives.PeriodSampling`), and stamps are the sums of c_l times the
 transfer functions of profile and pixel. Nothing is cut off or interpolated, but the image
-repeats with the pupil grid's period, and so do the wings of the profile (`Profile.reach`).
+is periodic with the period of the pupil grid, and so are the wings of the profile
+(`Profile.reach`).
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ class Profile:
     fwhm: float
     beta: float | None = None
     negligible_wing: ClassVar[float] = 1e-4
-    """Fraction of the profile's maximum below which wings of the next period do not matter.
+    """Fraction of the profile's maximum below which wings of the next period are negligible.
 
-    In a stamp that is some 1e-5 of the light on single pixels at its edge, an MSE of 1e-10.
+    They add some 1e-5 of the light to single pixels at the edge of a stamp, an MSE of 1e-10.
     """
 
     @property
@@ -54,7 +55,7 @@ class Profile:
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
         """Return the Fourier transform at frequencies in cycles per λ/D, 1 at 0; any shape.
 
-        That of the Moffat profile is 2 (z/2)^ν K_ν(z) / Γ(ν) with ν = β − 1, z = 2πaf.
+        The transform of the Moffat profile is 2 (z/2)^ν K_ν(z) / Γ(ν) with ν = β − 1, z = 2πaf.
         """
         # The Gaussian exp(−r²/2σ²) has the transform exp(−(2πσf)²/2).
         z = 2.0 * np.pi * self.scale * frequency
@@ -78,10 +79,10 @@ class Profile:
 
 @dataclass(frozen=True)
 class Broadening:
-    """Derivative of a profile by the logarithm of its width, in the place of the profile.
+    """Derivative of a profile with respect to the logarithm of its width, in place of a profile.
 
-    A stamp is linear in the profile's transfer function: a stamp that is blurred by this is the
-    derivative of the stamp.
+    A stamp is linear in the profile's transfer function: a stamp that is "blurred" by this
+    derivative is the derivative of the stamp.
     """
 
     profile: Profile
@@ -106,7 +107,9 @@ class WholePeriod:
     Parameters
     ----------
     pupil : Pupil
+        Pupil whose fields are propagated.
     precision : "complex64" or "complex128"
+        Precision of the fields.
     """
 
     product_cost = 0.6
@@ -121,22 +124,22 @@ class WholePeriod:
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate along x as `Sampling` does, to m = `points` points."""
-        return self._transformed(pupil_fields, degrees, -1)
+        return self._transform(pupil_fields, degrees, -1)
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate along y as `Sampling` does."""
-        return self._transformed(rows, degrees, -2)
+        return self._transform(rows, degrees, -2)
 
-    def _transformed(self, fields: np.ndarray, degrees: Sequence[int], axis: int) -> np.ndarray:
+    def _transform(self, fields: np.ndarray, degrees: Sequence[int], axis: int) -> np.ndarray:
         """Return fields (B, ., .) times Legendre polynomials, transformed along an axis."""
         from scipy import fft
 
-        # Zeros behind the pupil's samples, up to the number of points.
+        # Zeros after the samples of the pupil, up to the number of points.
         shape = [len(degrees), *fields.shape]
         shape[axis] = self.points
-        padded = np.zeros(shape, fields.dtype)
+        padded_fields = np.zeros(shape, fields.dtype)
         # The axis that is transformed comes last.
-        along = padded if axis == -1 else padded.swapaxes(-1, -2)
+        along = padded_fields if axis == -1 else padded_fields.swapaxes(-1, -2)
         lit = along[..., : len(self._axis)]
         values = fields if axis == -1 else fields.swapaxes(-1, -2)
         # P_0 = 1 needs no product.
@@ -145,7 +148,7 @@ class WholePeriod:
             np.multiply(values, weights[:, None, None], out=lit)
         else:
             lit[:] = values
-        return np.asarray(fft.fft(padded, axis=axis, overwrite_x=True))
+        return np.asarray(fft.fft(padded_fields, axis=axis, overwrite_x=True))
 
 
 class BlurredSampling(WholePeriod):
@@ -154,12 +157,15 @@ class BlurredSampling(WholePeriod):
     Parameters
     ----------
     pupil : Pupil
+        Pupil whose fields are propagated.
     stamp_px : int
         Pixels d along a side.
     pixel : float
         Pixel width in λ/D.
     profile : Profile or Broadening
+        Blur, or its derivative with respect to the logarithm of the width.
     precision : "complex64" or "complex128"
+        Precision of the fields.
     """
 
     def __init__(
@@ -174,7 +180,7 @@ class BlurredSampling(WholePeriod):
 
         super().__init__(pupil, precision)
         # Cycles per pixel of the lags l along rows and columns. The image is real: lags of one
-        # sign along the columns stand for both and count twice.
+        # sign along the columns represent both signs and have twice the weight.
         # Lag k has the frequency ½ k · spacing in cycles per λ/D; fftfreq gives k/n.
         n = self.points
         step = 0.5 * pupil.spacing * pixel * n
@@ -192,11 +198,11 @@ class BlurredSampling(WholePeriod):
     def to_pixels(
         self, values: np.ndarray, offset_px: Sequence[float] | np.ndarray = (0, 0)
     ) -> np.ndarray:
-        """Return pixels (..., d, d) of intensities (..., n, n) around a place (row, column)."""
+        """Return pixels (..., d, d) of intensities (..., n, n) about a position (row, column)."""
         from scipy import fft
 
-        # Lags c_l of the intensity times the transfer functions, and the inverse transform at the
-        # centres of the pixels alone.
+        # Lags c_l of the intensity times the transfer functions, and the inverse transform only at
+        # the centres of the pixels.
         spectrum = fft.rfft2(values) * self._transfer
         frequencies = (self._row_frequency, self._column_frequency)
         to_rows, to_columns = (
@@ -220,16 +226,16 @@ class BlurredPropagator:
         profile: Profile,
         precision: Precision = "complex128",
     ) -> None:
-        # For a whole light of 1, the transmission is divided by the root of the pupil's light.
+        # The transmission is divided by the root of the pupil's light, for a total light of 1.
         self._sampling = BlurredSampling(pupil, stamp_px, pixel, profile, precision)
         self.real_dtype = self._sampling.dtype
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
 
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, moved by (B, 2) pixels."""
+        """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, shifted by (B, 2) pixels."""
         offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
-        # Field of the pupil, field at the points of a period, and blurred pixels of one star after
-        # the other: each has its own offset.
+        # Field of the pupil, field at the points of a period, and blurred pixels, star by star,
+        # because each star has its own offset.
         stamps = []
         for waves, offset in zip(opd, offset_px, strict=True):
             phase = (2.0 * np.pi) * waves.astype(self.real_dtype)

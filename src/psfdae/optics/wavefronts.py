@@ -1,17 +1,18 @@
 """Wavefronts that are sums of modes, on any pupil grid.
 
-A mode is the OPD in waves of a unit coefficient: a Seidel monomial, a Zernike
-polynomial. Scenes differ only in their modes and in how they draw coefficients.
+A mode is the OPD in waves for a coefficient of 1, such as a Seidel monomial or a
+Zernike polynomial. Scenes differ only in their modes and in the distribution of
+their coefficients.
 
 The third-order (Seidel) wavefront of a telescope over its field is
 
 W(H, ρ, φ) = W040 ρ⁴ + W131 H ρ³cosφ + W222 H²ρ²cos²φ + W220 H²ρ² + W311 H³ρcosφ
 
 with φ counted from the direction of the field point and H = 1 at the edge of
-the field on an axis. Written with the field vector h = (h_x, h_y), |h| = H,
-every term is a polynomial in the pupil's (x, y), so one set of eight monomial
-images serves all field points and no angle has to be formed (it would be
-undefined on axis). Zernike polynomials are in Noll's order and normalisation
+the field on an axis. With the field vector h = (h_x, h_y), |h| = H, every term
+is a polynomial in the pupil's (x, y): one set of eight monomial images is enough
+for all field points, and no angle is needed (it is undefined on the axis).
+Zernike polynomials are in Noll's order and normalisation
 (Noll 1976, JOSA 66, 207).
 """
 
@@ -30,7 +31,7 @@ SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distorti
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""
 
 FIRST_NOLL = 4
-"""First Noll index of terms that are no piston and no tilt: those only move the image."""
+"""First Noll index after piston and tilts, which only move the image."""
 
 MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 """Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
@@ -79,6 +80,7 @@ def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (8, ...)
+        Values in the order of `MONOMIALS`.
     """
     # In the order of `MONOMIALS`.
     x, y = np.broadcast_arrays(x, y)
@@ -128,17 +130,17 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     j : int
         Noll index.
     x, y : ndarray
-        Pupil coordinates in pupil radii; values outside the disc are those of
-        the polynomial.
+        Pupil coordinates in pupil radii; the polynomial is also evaluated outside of the disc.
 
     Returns
     -------
     ndarray of the broadcast shape of x and y
+        Values of the polynomial.
     """
     # √(n+1) R_n⁰ for m = 0, else √(2(n+1)) R_n^m times cos mθ or sin mθ.
     n, m = noll_to_nm(j)
     r, theta = np.hypot(x, y), np.arctan2(y, x)
-    # The factor makes the mean square over the disc 1: that of cos² is ½ for m ≠ 0.
+    # The factor makes the mean square over the disc 1: the mean of cos² is ½ for m ≠ 0.
     if m == 0:
         return np.asarray(np.sqrt(n + 1.0) * radial_polynomial(n, 0, r))
     angular = np.cos(m * theta) if m > 0 else np.sin(-m * theta)
@@ -155,9 +157,9 @@ def field_coefficients(
 ) -> np.ndarray:
     """Evaluate coefficients that are polynomials of the field, at field points.
 
-    Nodal aberration theory writes every Zernike coefficient of a telescope, aligned or
-    not, as a polynomial of the field vector (Thompson 2005, JOSA A 22, 1389). Pupil and
-    field share x and y: a coefficient of Z8 that grows with x is coma as in Seidel's theory.
+    In nodal aberration theory, every Zernike coefficient of a telescope, aligned or not, is a
+    polynomial of the field vector (Thompson 2005, JOSA A 22, 1389). Pupil and field have the
+    same axes x and y: a coefficient of Z8 that is proportional to x is coma of Seidel's theory.
 
     Parameters
     ----------
@@ -169,7 +171,7 @@ def field_coefficients(
     Returns
     -------
     ndarray, shape (F, J)
-        In waves.
+        Coefficients in waves.
     """
     # Σ waves x^a y^b of every term; a term without powers is 0.
     x, y = field[:, 0], field[:, 1]
@@ -204,13 +206,14 @@ def legendre_expansion(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     degrees : ndarray of int, shape (T, 2)
-        (a, b) of every product that occurs, but for the constant.
+        (a, b) of every product that occurs, except the constant.
     coefficients : ndarray, shape (J, T)
+        Coefficient of each product in each mode.
 
     Raises
     ------
     ValueError
-        If modes are no polynomials of a degree below 16 in either coordinate.
+        If a mode is not a polynomial of a degree below 16 in either coordinate.
     """
     # Gauss–Legendre quadrature of (a + ½) (b + ½) ∫∫ M P_a(x) P_b(y) dx dy, exact for polynomials.
     highest = 16
@@ -219,21 +222,22 @@ def legendre_expansion(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     norm = np.arange(highest + 1) + 0.5  # ∫ P_a² dx = 1/(a + ½)
     projection = legendre(range(highest + 1), nodes) * weights * norm[:, None]
     coefficients = (projection @ values @ projection.T).swapaxes(1, 2)  # [mode, a, b]
-    # Products that occur in a mode, beyond rounding. The highest ones are there to show modes
-    # that are no polynomials.
+    # Products that occur in a mode, apart from rounding. A product of the highest degree shows
+    # that a mode is not a polynomial.
     largest = np.abs(coefficients).max(axis=(1, 2), keepdims=True)
     occurs = (np.abs(coefficients) > 1e-11 * largest).any(axis=0)
     if occurs[-1].any() or occurs[:, -1].any():
         raise ValueError(f"modes: no polynomials of a degree below {highest}")
-    # A constant is piston, which no image shows.
+    # A constant is piston, which does not change an image.
     occurs[0, 0] = False
     return np.argwhere(occurs), coefficients[:, occurs]
 
 
 class WavefrontSource(Protocol):
-    """Batch of wavefronts that can be put on any pupil grid."""
+    """Batch of wavefronts that can be evaluated on any pupil grid."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """Return the number B of wavefronts."""
 
     def slopes(self) -> np.ndarray:
         """Return extreme slopes in waves per pupil radius, (B, 2, 2).
@@ -246,9 +250,9 @@ class WavefrontSource(Protocol):
 
 
 def mode_slopes(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
-    """Compute slopes of modes by x and by y over the full disc and its rim, (J, points) each.
+    """Compute slopes of modes along x and y over the full disc and its rim, (J, points) each.
 
-    An obscured centre is included: its slopes are the smaller ones and never decide.
+    An obscured centre is included: slopes are smaller there and do not decide.
     """
     # 65 points along the diameter, and 520 on the rim.
     axis = np.linspace(-1.0, 1.0, 65)
@@ -258,7 +262,7 @@ def mode_slopes(modes: PupilModes) -> tuple[np.ndarray, np.ndarray]:
     angle = np.linspace(0.0, 2.0 * np.pi, 8 * axis.size, endpoint=False)
     x = np.append(grid_x[is_inside], np.cos(angle))
     y = np.append(grid_y[is_inside], np.sin(angle))
-    # Central differences; those of polynomials err by less than 1e-6.
+    # Central differences, with errors below 1e-6 for polynomials.
     step = 1e-4
     return (
         (modes(x + step, y) - modes(x - step, y)) / (2.0 * step),
@@ -274,8 +278,9 @@ def slope_ranges(
     Parameters
     ----------
     mode_slopes : pair of ndarray, shape (J, points)
+        Slopes of the modes along x and y, the result of `mode_slopes`.
     coefficients : ndarray, shape (B, J)
-        In waves.
+        Coefficients of the modes in waves.
 
     Returns
     -------
@@ -283,7 +288,7 @@ def slope_ranges(
         [wavefront, axis (x, y), (min, max)] in waves per pupil radius.
     """
     # Slopes of 256 wavefronts are in memory at a time: 8 MB per axis.
-    # ∂W/∂x = Σ c_j ∂M_j/∂x at all points; its least and greatest value count.
+    # ∂W/∂x = Σ c_j ∂M_j/∂x at all points, and its minimum and maximum.
     ranges = np.empty((len(coefficients), 2, 2))
     for axis, gradient in enumerate(mode_slopes):
         for start in range(0, len(coefficients), 256):
@@ -300,8 +305,9 @@ class ModalWavefronts:
     Parameters
     ----------
     modes : PupilModes
+        Function that returns the J modes at pupil points.
     coefficients : ndarray, shape (B, J)
-        In waves.
+        Coefficients of the modes in waves.
     star_columns : mapping of str to (ndarray, str), optional
         Columns of a product of stars, by name: coefficients in waves and their meaning.
     """
@@ -318,6 +324,7 @@ class ModalWavefronts:
         self._images: dict[tuple[int, str], np.ndarray] = {}
 
     def __len__(self) -> int:
+        """Return the number B of wavefronts."""
         return len(self.coefficients)
 
     def slopes(self) -> np.ndarray:
@@ -338,7 +345,7 @@ class ModalWavefronts:
 
 
 def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:
-    """Make third-order wavefronts of field points.
+    """Return third-order wavefronts at field points.
 
     Parameters
     ----------
@@ -352,7 +359,7 @@ def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:
 
 
 def zernike_wavefronts(noll: Sequence[int], coefficients: np.ndarray) -> ModalWavefronts:
-    """Make wavefronts that are sums of Zernike polynomials.
+    """Return wavefronts that are sums of Zernike polynomials.
 
     Parameters
     ----------

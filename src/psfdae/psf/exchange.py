@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from psfdae.base.errors import keyword
-from psfdae.base.files import atomic_path, sha256_of, write_fits
+from psfdae.base.files import atomic_path, compute_sha256, write_fits
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line, reading
 from psfdae.image.fits_file import BLOCK_BYTES, Card, find_image, open_hdus, open_pixels, plain_file
@@ -49,7 +49,7 @@ class FieldFile(FieldPsfs):
     @cached_property
     def sha256(self) -> str:
         """Checksum of the file."""
-        return sha256_of(self.path)
+        return compute_sha256(self.path)
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: these files do not say how large pixels are."""

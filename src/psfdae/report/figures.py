@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.base.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae.base.types import Figure, Table
 from psfdae.report.checks import MEAN_PSF, method_labels, nearest_snr, size_errors
 from psfdae.report.plot import has_shape
 
 
-@styled
+@apply_style
 def errors_figure(errors: Table, model_method: str) -> Figure:
     """Draw MSE against S/N for each method, with the noise of the bright images as a floor.
 
@@ -42,7 +42,7 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def error_maps(restored: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """Draw mean and RMS, over held-out stars, of restored minus bright image.
 
@@ -77,7 +77,7 @@ def error_maps(restored: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
     """Draw bright held-out stars, and below them their residuals within ± 5 σ of the sky.
 
@@ -101,7 +101,7 @@ def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def shapes_figure(
     stars: Mapping[str, np.ndarray],
     degraded_rows: np.ndarray,
@@ -154,7 +154,7 @@ def shapes_figure(
     return figure
 
 
-@styled
+@apply_style
 def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
     """Draw χ² per pixel of all stars against S/N: flagged, used for training, and neither.
 

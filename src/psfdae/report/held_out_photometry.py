@@ -14,7 +14,7 @@ from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import table_of_rows
-from psfdae.methods.metrics import clustered_mean
+from psfdae.methods.metrics import cluster_mean
 from psfdae.training.calibration import COVERAGE
 from psfdae.training.star_sets import field_positions, own_noise, star_area
 from psfdae.training.stars import ImageStars
@@ -105,4 +105,4 @@ def usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tup
         Value of each image, and number of the star that it shows.
     usable : ndarray of bool, shape (n,)
     """
-    return clustered_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)
+    return cluster_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)

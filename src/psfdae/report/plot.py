@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.base.figures import WIDTH_IN, new_figure, styled
+from psfdae.base.figures import WIDTH_IN, apply_style, new_figure
 from psfdae.base.types import Axes, Figure, LineCollection
 from psfdae.image.stamps import StarFlag
 
@@ -97,7 +97,7 @@ def read_psf_map(path: Path) -> Figure:
         return psf_map(stars, read_psfs, file[0].header["INFILE"])
 
 
-@styled
+@apply_style
 def psf_map(
     stars: Mapping[str, np.ndarray], psfs_of: Callable[[np.ndarray], np.ndarray], image_name: str
 ) -> Figure:

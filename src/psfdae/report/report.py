@@ -167,7 +167,7 @@ class Report:
         rows = [StripRow("bright\nstar", truth)]
         for name, method in self.methods.items():
             look = method.look
-            if look.drawn:
+            if look.is_drawn:
                 scale = level_scale(self.model, self.stars, name)
                 stamps = method.estimate(noisy, scale * levels[snr], place[shown], False).psf
                 error = mse(stamps, truth)

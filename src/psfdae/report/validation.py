@@ -10,14 +10,14 @@ import numpy as np
 from psfdae.base.arguments import check_arguments
 from psfdae.base.errors import warn
 from psfdae.base.progress import steps
-from psfdae.base.threads import fixed_threads
+from psfdae.base.threads import fix_threads
 from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import table_of_rows, with_format
 from psfdae.methods import method as method_of
 from psfdae.methods.interface import Method
-from psfdae.methods.metrics import all_metrics, quality, summarised
+from psfdae.methods.metrics import all_metrics, quality, summarise_metrics
 from psfdae.psf.interface import PredictionError
 from psfdae.report.checks import (
     MEAN_PSF,
@@ -70,7 +70,7 @@ def validate(
     baselines = ("noisy", "lmmse")
     names = [name for name in settings.methods if name in fits or name in baselines]
     methods: dict[str, Method] = {}
-    with fixed_threads(settings.evaluation.threads):
+    with fix_threads(settings.evaluation.threads):
         for name in dict.fromkeys([*names, model.info.method, *baselines]):
             if name not in fits:
                 method_class = method_of(name)
@@ -134,14 +134,14 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
         # The centre is fitted up to a pixel beyond the jitter: noise moves the brightest pixel.
         by_mean_psf = fit_mean_psf(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
-        mean_rows += summarised(row, all_metrics(by_mean_psf, truth, data_range), star)
+        mean_rows += summarise_metrics(row, all_metrics(by_mean_psf, truth, data_range), star)
         for name, method in methods.items():
             scale = level_scale(model, stars, name)
             estimate = method.estimate(noisy, scale * level, position)
             # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
-            rows += summarised(row, metrics, star)
+            rows += summarise_metrics(row, metrics, star)
             per_star.append({**row, "star": test, "field": star, **metrics})
             if name == model.info.method:
                 images = {"noisy": noisy, "truth": truth, "model": estimate.psf}

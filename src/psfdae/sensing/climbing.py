@@ -1,9 +1,9 @@
 """Maxima of posteriors of Poisson counts, many at once.
 
-Each climb is Fisher scoring: Gauss–Newton steps with the expected information of the current
+Each climb is Fisher scoring: Gauss–Newton steps with the expected information at the current
 parameters, damped after Levenberg and Marquardt where a step does not raise the posterior. The
-caller computes the expected counts: from the aberrations of one star, from those of a whole
-field, or from the state of a misaligned telescope.
+caller computes the expected counts from the aberrations of one star or a whole field, or from the
+state of a misaligned telescope.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
 
 Evaluate = Callable[[np.ndarray, np.ndarray], Evaluation]
-"""Function of the numbers of some starts, (a,), and their parameters, (a, K), that evaluates the
-logarithm of their posterior."""
+"""Function of indices of starts (a,) and their parameters (a, K) that evaluates the logarithm of
+their posterior."""
 
 
 class Steps(NamedTuple):
-    """Settings of a climb: how long it goes on, and how carefully it starts."""
+    """Settings of a climb: its number of steps, its end and its damping."""
 
     max_steps: int = 12
     min_gain: float = 0.02
-    """Smallest promised gain in the logarithm of the posterior; a step below it is the last."""
+    """Smallest predicted gain in the logarithm of the posterior; a step below it is the last."""
     counted_parameters: int | None = None
-    """Number of leading parameters whose gain alone is compared with `min_gain`; None: all."""
+    """Number of leading parameters whose gain is compared with `min_gain`; None: all."""
     initial_damping: float = 1e-2
     max_damping: float = 1e6
-    """Damping at which a climb is given up."""
+    """Damping at which a climb is abandoned."""
     relative_rounding: float = 0.0
-    """Relative fall of the posterior that a step may cause by rounding."""
+    """Relative decrease of the posterior in a step that is attributed to rounding."""
     max_drop: float = np.inf
-    """Largest distance in ln of the posterior below the best climb of a group. A climb is given up
-    where even twice its promised gain leaves it farther below."""
+    """Largest distance in ln of the posterior below the best climb of a group. A climb is abandoned
+    if it stays farther below even after twice its predicted gain."""
 
 
 @dataclass
@@ -49,13 +49,15 @@ class Peaks:
     Attributes
     ----------
     parameters : ndarray, shape (M, K)
+        Parameters at the end of each climb.
     height : ndarray, shape (M,)
-        Logarithm of the posterior, including the promised gain of the last step if it was taken.
+        Logarithm of the posterior, including the predicted gain of the last step if it was taken.
     slope, information : ndarray, shapes (M, K) and (M, K, K)
         Gradient and expected information before the last step.
     evaluations : ndarray of int, shape (M,)
         Number of evaluations of the posterior.
-    converged : ndarray of bool, shape (M,)
+    has_converged : ndarray of bool, shape (M,)
+        True if the predicted gain fell below `Steps.min_gain`.
     """
 
     parameters: np.ndarray
@@ -63,75 +65,76 @@ class Peaks:
     slope: np.ndarray
     information: np.ndarray
     evaluations: np.ndarray
-    converged: np.ndarray
+    has_converged: np.ndarray
 
     def laplace(self) -> tuple[np.ndarray, np.ndarray]:
         """Return covariances (M, K, K) and logarithms (M,) of the mass by Laplace's approximation.
 
-        The mass of a peak is its height times √|covariance|; it is 0 where no normal distribution
-        has the peak's information.
+        The mass of a peak is its posterior density times √|covariance|; it is 0 where the
+        information is not positive definite.
         """
+        # ln mass = height + ½ ln det covariance.
         covariance = np.linalg.inv(self.information)
         sign, log_determinant = np.linalg.slogdet(covariance)
         return covariance, np.where(sign > 0, self.height + 0.5 * log_determinant, -np.inf)
 
     def overwrite(self, rows: np.ndarray, peaks: Peaks, peak_rows: np.ndarray) -> None:
-        """Replace the peaks at `rows` by those at `peak_rows` of `peaks`, counts aside."""
-        for name in ("parameters", "height", "slope", "information", "converged"):
+        """Replace the peaks at `rows` by `peak_rows` of `peaks`, except numbers of evaluations."""
+        for name in ("parameters", "height", "slope", "information", "has_converged"):
             getattr(self, name)[rows] = getattr(peaks, name)[peak_rows]
 
 
-def poisson_information(counts: np.ndarray, expected: np.ndarray, slopes: np.ndarray) -> Evaluation:
+def poisson_information(counts: np.ndarray, mean: np.ndarray, slopes: np.ndarray) -> Evaluation:
     """Return deviance (n,), score (n, K) and Fisher information (n, K, K) of Poisson counts.
 
     Parameters
     ----------
     counts : ndarray, shape (n, P)
-        NaN where a pixel is not used.
-    expected : ndarray, shape (n, P)
-        Mean μ of the counts, above 0.
+        Counts n of the pixels; NaN where a pixel is not used.
+    mean : ndarray, shape (n, P)
+        Expected counts μ, above 0.
     slopes : ndarray, shape (n, K, P)
-        Derivatives of μ by the parameters.
+        Derivatives of μ with respect to the parameters.
     """
     # Relative excess e = n/μ − 1 of each pixel.
-    used = np.isfinite(counts)
-    excess = np.where(used, counts / expected - 1.0, 0.0)
-    # Deviance 2 Σ (n ln(n/μ) − (n − μ)). Each term is written as μ ((1 + e) ln(1 + e) − e), which
-    # does not cancel for small e; the limit keeps the logarithm of a pixel without counts finite.
+    is_used = np.isfinite(counts)
+    excess = np.where(is_used, counts / mean - 1.0, 0.0)
+    # Deviance 2 Σ (n ln(n/μ) − (n − μ)). The form μ ((1 + e) ln(1 + e) − e) of its terms avoids
+    # cancellation for small e; the limit keeps the logarithm of a pixel without counts finite.
     log_ratio = np.log1p(np.maximum(excess, -1.0 + 1e-12))
-    deviance = 2.0 * (expected * ((1.0 + excess) * log_ratio - excess)).sum(axis=-1)
+    deviance = 2.0 * (mean * ((1.0 + excess) * log_ratio - excess)).sum(axis=-1)
     # Score Σ e ∂μ, and information Σ ∂μ ∂μᵀ / μ.
-    weighted = slopes * np.where(used, 1.0 / expected, 0.0)[:, None]
+    weighted_slopes = slopes * np.where(is_used, 1.0 / mean, 0.0)[:, None]
     score = (slopes @ excess[:, :, None])[:, :, 0]
-    return deviance, score, weighted @ slopes.swapaxes(1, 2)
+    return deviance, score, weighted_slopes @ slopes.swapaxes(1, 2)
 
 
 def combine_images(
-    score: np.ndarray, information: np.ndarray, shared: int
+    score: np.ndarray, information: np.ndarray, shared_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Add up score and information of images that share their first parameters.
 
     Parameters
     ----------
     score, information : ndarray, shapes (n, F, k) and (n, F, k, k)
-        Score and information of F images by the k parameters of each.
-    shared : int
+        Score and information of F images with respect to the k parameters of each.
+    shared_count : int
         Number s of leading parameters that all images have in common.
 
     Returns
     -------
     score, information : ndarray, shapes (n, K) and (n, K, K)
-        K = s + F (k − s): the common parameters, then those of each image in turn.
+        K = s + F (k − s): the common parameters, then the own parameters of each image in turn.
     """
     count, images, k = score.shape
-    size = shared + images * (k - shared)
+    size = shared_count + images * (k - shared_count)
     # Likelihoods multiply: scores and informations of independent images add up.
     total_score = np.zeros((count, size))
     total_information = np.zeros((count, size, size))
     for image in range(images):
-        # Places of this image's parameters among all.
-        first = shared + image * (k - shared)
-        columns = np.r_[0:shared, first : first + k - shared]
+        # Columns of this image's parameters among all.
+        first = shared_count + image * (k - shared_count)
+        columns = np.r_[0:shared_count, first : first + k - shared_count]
         total_score[:, columns] += score[:, image]
         total_information[:, columns[:, None], columns] += information[:, image]
     return total_score, total_information
@@ -144,23 +147,26 @@ def climb(
     steps: Steps,
     group: np.ndarray | None = None,
 ) -> Peaks:
-    """Follow starts to the maxima of their posteriors.
+    """Climb from starts to the maxima of their posteriors.
 
-    An undamped step that promises little is the last one. It is taken without another evaluation:
-    its gain is the one that slope and information predict.
+    An undamped step with a small predicted gain is the last one. It is taken without another
+    evaluation: its gain follows from slope and information.
 
     Parameters
     ----------
     evaluate : Evaluate
+        Logarithm of the posterior, its slope and its expected information.
     start : ndarray, shape (M, K)
+        Parameters at which the climbs begin.
     limit : float or ndarray, shape (K,)
         Parameters stay within ± this.
     steps : Steps
+        Number of steps, criteria of the end, and damping.
     group : ndarray of int, shape (M,), optional
-        Number of the posterior of each start; climbs far below the best of their group are given
-        up.
+        Index of the posterior of each start; climbs far below the best of their group are
+        abandoned.
     """
-    # All climbs begin together; those that arrive or are given up leave `active`.
+    # All climbs begin together; a climb that has arrived or is abandoned leaves `active`.
     start = np.clip(np.asarray(start, np.float64), -limit, limit)
     active = np.arange(len(start))
     evaluations = np.ones(len(start), int)
@@ -168,27 +174,27 @@ def climb(
     damping = np.full(len(start), steps.initial_damping)
     gain = np.full(len(start), np.inf)
     for _ in progress.steps("maxima of the posterior", range(steps.max_steps)):
-        # Gain sᵀg − ½ sᵀIs that the undamped step s promises. Damping makes a step small, which
-        # says nothing about the distance of the maximum.
-        step = _damped_step(peaks, active, np.zeros(active.size), limit)
+        # Predicted gain sᵀg − ½ sᵀIs of the undamped step s. A damped step is small whatever the
+        # distance of the maximum.
+        step = _compute_damped_step(peaks, active, np.zeros(active.size), limit)
         gain[active] = np.einsum("nk,nk->n", step, peaks.slope[active])
         gain[active] -= 0.5 * np.einsum("nk,nkl,nl->n", step, peaks.information[active], step)
         promise = gain[active]
-        # If some parameters count alone, the others are marginalised: the information on the
-        # first ones is the inverse of their block of the covariance.
+        # If only the leading parameters count, the others are marginalised: the information on the
+        # leading ones is the inverse of their block of the covariance.
         if steps.counted_parameters is not None:
-            counted = slice(steps.counted_parameters)
-            covariance = np.linalg.inv(peaks.information[active])[:, counted, counted]
-            step_counted, marginal = step[:, counted], np.linalg.inv(covariance)
+            leading = slice(steps.counted_parameters)
+            covariance = np.linalg.inv(peaks.information[active])[:, leading, leading]
+            step_counted, marginal = step[:, leading], np.linalg.inv(covariance)
             promise = 0.5 * np.einsum("nk,nkl,nl->n", step_counted, marginal, step_counted)
         # The last step of climbs that have arrived.
         is_last = promise <= steps.min_gain
-        arrived = active[is_last]
-        peaks.parameters[arrived] += step[is_last]
-        peaks.height[arrived] += gain[arrived]
-        peaks.converged[arrived] = True
-        # Climbs that go on.
-        goes_on = ~peaks.converged & (damping < steps.max_damping)
+        last_rows = active[is_last]
+        peaks.parameters[last_rows] += step[is_last]
+        peaks.height[last_rows] += gain[last_rows]
+        peaks.has_converged[last_rows] = True
+        # Climbs that continue.
+        goes_on = ~peaks.has_converged & (damping < steps.max_damping)
         if group is not None:
             lowest = group_maximum(peaks.height, group) - steps.max_drop
             goes_on &= peaks.height + 2.0 * gain > lowest
@@ -196,37 +202,37 @@ def climb(
         if not active.size:
             break
         # A damped step is kept if it raises the posterior. The damping falls by a factor of 10
-        # after a good step, and rises by as much after a bad one: at once to where it shortens the
-        # step, because less of it would only repeat the step that has failed.
+        # after a good step and rises by as much after a bad one, but at least to 0.3: a smaller
+        # damping would hardly shorten the step that has failed.
         parameters = peaks.parameters[active]
-        parameters = parameters + _damped_step(peaks, active, damping[active], limit)
+        parameters = parameters + _compute_damped_step(peaks, active, damping[active], limit)
         peaks.evaluations[active] += 1
-        state = peaks.evaluations[active], peaks.converged[active]
+        state = peaks.evaluations[active], peaks.has_converged[active]
         trial = Peaks(parameters, *evaluate(active, parameters), *state)
         tolerance = steps.relative_rounding * np.abs(peaks.height[active])
         is_improved = trial.height >= peaks.height[active] - tolerance
         peaks.overwrite(active[is_improved], trial, is_improved)
-        increased = np.maximum(10.0 * damping[active], 0.3)
-        damping[active] = np.where(is_improved, damping[active] / 10.0, increased)
+        larger_damping = np.maximum(10.0 * damping[active], 0.3)
+        damping[active] = np.where(is_improved, damping[active] / 10.0, larger_damping)
     return peaks
 
 
-def _damped_step(
+def _compute_damped_step(
     peaks: Peaks, active: np.ndarray, damping: np.ndarray, limit: np.ndarray | float
 ) -> np.ndarray:
-    """Return the steps (a, K) of the peaks `active` with a damping (a,), cut at the limit.
+    """Return the steps (a, K) of the peaks `active` with a damping (a,), within the limit.
 
-    A step s solves (I + damping · diag I) s = g, I the information and g the slope.
+    A step s solves (I + damping · diag I) s = g with the information I and the slope g.
     """
     parameters, slope = peaks.parameters[active], peaks.slope[active]
     information = peaks.information[active].copy()
     diagonal = np.arange(parameters.shape[1])
     information[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-    # A parameter that stands at its limit and would be pushed beyond leaves the equations.
+    # A parameter at its limit that would exceed it is removed from the equations.
     is_fixed = ((parameters >= limit) & (slope > 0)) | ((parameters <= -limit) & (slope < 0))
     information[is_fixed[:, :, None] | is_fixed[:, None, :]] = 0.0
     information[:, diagonal, diagonal] += is_fixed
-    # Its row and column are those of the unit matrix: its step is 0.
+    # Its row and column are taken from the unit matrix: its step is 0.
     step = np.linalg.solve(information, np.where(is_fixed, 0.0, slope)[:, :, None])[:, :, 0]
     return np.asarray(np.clip(parameters + step, -limit, limit) - parameters)
 

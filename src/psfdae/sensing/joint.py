@@ -1,7 +1,8 @@
 """Joint fit of the numbers of a telescope to the stars of an image.
 
-The aberrations of all stars follow from a few numbers of the telescope
-(`psfdae.telescope.field.TelescopeModel`); each star has its own place, flux and sky besides.
+The aberrations of all stars depend on a few numbers of the telescope
+(`psfdae.telescope.field.TelescopeModel`); in addition, each star has its own position, flux and
+sky.
 """
 
 from __future__ import annotations
@@ -39,19 +40,20 @@ class Joint:
     Attributes
     ----------
     model : TelescopeModel
+        Names, units and prior of the numbers.
     value, error : ndarray, shape (Q,)
         Numbers of the telescope in the units of the model.
     correlation : ndarray, shape (Q, Q)
         Correlation of the errors.
     probability : float
-        Probability of these numbers against their twin, whose even aberrations have the other
+        Probability of these numbers against their twin, whose even aberrations have the opposite
         sign.
     twin : ndarray or None, shape (Q,)
         Numbers of the twin, if there is one.
     star : ndarray of int, shape (m,)
-        Indices of the stars that took part, in the order of the search.
+        Indices of the stars in the fit, in the order of the search.
     disagrees : ndarray of bool, shape (m,)
-        True for stars whose deviance is above the limit: the numbers do not explain them.
+        True for stars whose deviance is above the limit, which the numbers do not explain.
     """
 
     model: TelescopeModel
@@ -67,7 +69,7 @@ class Joint:
     def table(self) -> Table:
         """Table with a row for each number: name, unit, prior, fitted value, errors, correlation.
 
-        `correlation` (Q,) is that of the error with the errors of all numbers.
+        `correlation` (Q,) is the correlation of the error with the errors of all numbers.
         """
         from astropy.table import Table
 
@@ -85,11 +87,11 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class TelescopePosterior:
-    """Posterior of the numbers of a telescope, and of the places, fluxes and skies of its stars.
+    """Posterior of the numbers of a telescope, and of positions, fluxes and skies of its stars.
 
     Its parameters are the Q standardised numbers t of the telescope, (number − prior mean)/prior σ,
-    whose prior is normal with σ = 1, then four for each star: place (x, y) of its centre in px off
-    the middle of the stamp, flux in units of `search.flux`, and sky above its level in units of its
+    whose prior is normal with σ = 1, then four for each star: position (x, y) from the middle of
+    the stamp in pixels, flux in units of `search.flux`, and sky above its level in units of its
     noise. If the FWHM of the seeing is one of the numbers, stamps are linear in it about the seeing
     of `optics`.
 
@@ -98,10 +100,11 @@ class TelescopePosterior:
     search : WavefrontSearch
         Search that has the counts and fluxes of all stars.
     model : TelescopeModel
+        Model of all stars of the search.
     star : ndarray of int, shape (m,)
-        Indices of the stars that take part, in the order of the search.
+        Indices of the stars in the fit, in the order of the search.
     optics : StarOptics
-        Optics with the seeing about which stamps are linear; those of `search` keep the first
+        Optics with the seeing about which stamps are linear; the optics of `search` keep the first
         seeing.
     """
 
@@ -110,8 +113,8 @@ class TelescopePosterior:
     star: np.ndarray
     optics: StarOptics
     max_seeing_change: ClassVar[float] = 0.5
-    """Largest relative change of the FWHM of the seeing from its prior mean; also the largest
-    decrease from one round of `fit_telescope` to the next."""
+    """Largest relative change of the FWHM of the seeing from its prior mean, and the largest
+    decrease in one round of `fit_telescope`."""
 
     @property
     def number_count(self) -> int:
@@ -120,7 +123,7 @@ class TelescopePosterior:
 
     @cached_property
     def broadening(self) -> SampledStamps:
-        """Propagation of the derivatives of stamps by the logarithm of the FWHM of the seeing."""
+        """Propagation to derivatives of stamps with respect to ln FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
@@ -130,15 +133,15 @@ class TelescopePosterior:
         return self.optics.telescope.seeing
 
     def relative_seeing(self, t: np.ndarray) -> float:
-        """Return the FWHM of the seeing at standardised numbers t (Q,) over that of `optics`."""
+        """Return the FWHM of the seeing at standardised numbers t (Q,), relative to `optics`."""
         # The FWHM is the last number of the model.
         fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
         return float(fwhm / self.seeing.fwhm_arcsec)
 
-    def with_seeing_of(self, t: np.ndarray) -> TelescopePosterior:
+    def replace_seeing(self, t: np.ndarray) -> TelescopePosterior:
         """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
         fwhm = max(self.relative_seeing(t), 1.0 - self.max_seeing_change) * self.seeing.fwhm_arcsec
-        # The same telescope but for its seeing.
+        # The same telescope with another seeing.
         seeing = self.seeing.model_copy(update={"fwhm_arcsec": fwhm})
         telescope = self.optics.telescope.model_copy(update={"seeing": seeing})
         return replace(self, optics=replace(self.optics, telescope=telescope))
@@ -148,16 +151,16 @@ class TelescopePosterior:
         return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.star])
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the coefficients of the stars by t, (m, Q, K)."""
+        """Return the derivatives of the coefficients of the stars with respect to t, (m, Q, K)."""
         # ∂c/∂t = σ ∂c/∂number, from [number, star, coefficient] to [star, number, coefficient].
         jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
         return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.star])
 
     def evaluate(self, _: np.ndarray, parameters: np.ndarray) -> Evaluation:
-        """Evaluate the posterior in the form in which `climb` calls it.
+        """Evaluate the posterior, as an `Evaluate` of `psfdae.sensing.climbing.climb`.
 
-        The first argument, the numbers of the starts, is not used. A telescope through which no
-        rays pass, or whose wavefronts no grid can sample, has a height of −∞.
+        The first argument, the indices of the starts, is not used. A telescope through which rays
+        cannot pass, or whose wavefronts no grid can sample, has a height of −∞.
 
         Parameters
         ----------
@@ -167,8 +170,7 @@ class TelescopePosterior:
         Returns
         -------
         height, score, information : ndarray, shapes (a,), (a, N) and (a, N, N)
-            Logarithm of the posterior, its slope, and the expected information with that of the
-            prior.
+            Logarithm of the posterior, its slope, and its expected information, with the prior.
         """
         q, (count, size) = self.number_count, parameters.shape
         # Parameters without an image keep a height of −∞.
@@ -178,55 +180,56 @@ class TelescopePosterior:
             with suppress(RayTracingError, SamplingError):
                 deviance, star_score, star_information = self.evaluate_stars(values)
                 height[row] = -0.5 * (deviance.sum() + (values[:q] ** 2).sum())
-                # Sum over the stars of what concerns the numbers; the four of each star have rows
-                # of their own.
+                # The numbers are shared by all stars; the four parameters of each star have rows of
+                # their own.
                 (score[row],), (information[row],) = combine_images(
                     star_score[None], star_information[None], q
                 )
-                # Normal prior of the numbers, and a tiny information on places, fluxes and skies,
-                # so that no matrix is singular.
+                # Normal prior of the numbers, and a tiny information on positions, fluxes and
+                # skies, so that no matrix is singular.
                 score[row, :q] -= values[:q]
                 information[row, range(q), range(q)] += 1.0
                 information[row, range(q, size), range(q, size)] += 1e-9
         return height, score, information
 
     def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
-        """Evaluate every star by itself at `parameters` (Q + 4 m,), without any prior.
+        """Evaluate every single star at `parameters` (Q + 4 m,), without any prior.
 
         Returns
         -------
         deviance, score, information : ndarray, shapes (m,), (m, Q + 4), (m, Q + 4, Q + 4)
-            Derivatives are by the Q numbers of the telescope and the four of the star.
+            Derivatives are with respect to the Q numbers of the telescope and four of the star.
         """
         q, optics = self.number_count, self.optics
         t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.star), 4)
         place = star_parameters[:, :2]
-        # Stamps (m, d²) and their derivatives (m, Q + 2, d²): by t, through the pupil modes (a
-        # basis, not `StarModes`), and by the place.
+        # Stamps (m, d²) and their derivatives (m, Q + 2, d²) with respect to t, through the pupil
+        # modes (a basis, not `StarModes`), and to the position.
         modes = optics.mode_coefficients(self.star, self.coefficients(t), place)
         directions = self.slopes(t) @ optics.terms.to_modes[self.star]
         stamps, slopes = optics.derivatives(modes, directions)
         if self.model.has_seeing:
             # p(w) = p(1) + (w − 1) ∂p/∂ln w about w = 1, the relative FWHM of the seeing.
-            broadened = self.broadening.stamps(modes).reshape(len(self.star), -1)
-            broadened = broadened.astype(np.float64)
-            stamps = stamps + (self.relative_seeing(t) - 1.0) * broadened
-            slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadened
-        expected = self.search.expected_counts(self.star, stamps, slopes, star_parameters)
-        return poisson_information(self.search.photons.counts[self.star], *expected)
+            broadening_slope = self.broadening.stamps(modes).reshape(len(self.star), -1)
+            broadening_slope = broadening_slope.astype(np.float64)
+            stamps = stamps + (self.relative_seeing(t) - 1.0) * broadening_slope
+            slopes[:, q - 1] = self.model.sd[-1] / self.seeing.fwhm_arcsec * broadening_slope
+        expected_counts = self.search.predict_counts(self.star, stamps, slopes, star_parameters)
+        return poisson_information(self.search.photons.counts[self.star], *expected_counts)
 
 
 def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeModel) -> Joint:
     """Fit the numbers of a telescope to the stamps of its stars.
 
-    These are the 500 with most light over the sky's noise that a mode explains, or all such stars.
+    The fit uses the 500 stars with the most light over the sky noise that a mode explains, or all
+    of them if there are fewer.
 
     Parameters
     ----------
     search : WavefrontSearch
         Search that has the counts and fluxes of all stars.
     modes : StarModes
-        Modes of the single stars; stars that no mode explains take no part.
+        Modes of the single stars; stars that no mode explains are not used.
     model : TelescopeModel
         Model of all stars of the search.
 
@@ -242,8 +245,8 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     """
     if not model.sd.size:
         raise SensingError("the prior fixes all numbers of the telescope: there is nothing to fit")
-    # The 500 explained stars with the most light in units of the sky's noise; the cost grows
-    # with their number.
+    # The 500 explained stars with the most light in units of the sky noise: the time grows with
+    # their number.
     optics, best_modes = search.optics, modes.best_modes
     best_modes = best_modes.take(np.flatnonzero(search.is_explained(best_modes)))
     stars = best_modes.star
@@ -256,15 +259,14 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
             f"{stars.size} stars that a wavefront explains are too few for "
             f"{model.sd.size} numbers of the telescope"
         )
-    modes = modes.of_stars(stars)
+    modes = modes.select_stars(stars)
     posterior = TelescopePosterior(search, model, stars, optics)
-    # Two starts: near the prior's mean, and near the twin of that, unless no rays pass that
-    # telescope.
+    # Two starts: near the prior mean, and near its twin, unless rays cannot pass that telescope.
     q = posterior.number_count
     starts = [start_near(posterior, modes, np.zeros(q))]
     with suppress(RayTracingError):
         starts.append(start_near(posterior, modes, twin_numbers(posterior, starts[0][:q])))
-    # Limits of the numbers, and of the places of the stars.
+    # Limits of the numbers, and of the positions of the stars.
     limit = np.full(starts[0].size, np.inf)
     limit[:q] = MAX_Z
     if model.has_seeing:
@@ -272,13 +274,13 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     limit[q:].reshape(-1, 4)[:, :2] = optics.reach_px
     steps = Steps(max_steps=30, min_gain=0.005, relative_rounding=1e-7)
     peaks = climb(posterior.evaluate, np.stack(starts), limit, steps)
-    # Stamps are linear in the seeing: they are computed again at the fitted FWHM until it changes
-    # by less than 0.2 %, at most four times.
+    # Stamps are linearised in the seeing: they are computed again at the fitted FWHM until it
+    # changes by less than 0.2 %, at most four times.
     for _ in range(4 if model.has_seeing else 0):
         t = peaks.parameters[peaks.height.argmax(), :q]
         if abs(posterior.relative_seeing(t) - 1.0) < 2e-3:
             break
-        posterior = posterior.with_seeing_of(t)
+        posterior = posterior.replace_seeing(t)
         peaks = climb(posterior.evaluate, peaks.parameters, limit, steps)
     return summarise_peaks(posterior, peaks)
 
@@ -289,8 +291,9 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     Parameters
     ----------
     posterior : TelescopePosterior
+        Posterior of the numbers.
     peaks : Peaks
-        Where the climbs from both starts have come to; they may be the same place.
+        Ends of the climbs from both starts, which may coincide.
     """
     model, star = posterior.model, posterior.star
     t = peaks.parameters[:, : posterior.number_count]
@@ -298,9 +301,9 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     best_peak = int(log_evidence.argmax())
     number_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
     sigma = np.sqrt(np.diagonal(number_covariance))
-    # Peaks that are more than a standard deviation from the best one share the probability.
+    # Peaks more than a standard deviation from the best one share the probability.
     twins = np.flatnonzero(np.abs((t - t[best_peak]) / sigma).max(axis=1) > 1)
-    # Masses relative to that of the best peak.
+    # Masses relative to the best peak.
     mass = np.exp(log_evidence - log_evidence[best_peak])
     deviance = posterior.evaluate_stars(peaks.parameters[best_peak])[0]
     return Joint(
@@ -318,62 +321,63 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
 def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
     """Return parameters that agree with the modes of the single stars, near t (Q,).
 
-    In each round every star chooses the mode nearest to the telescope, and the numbers are fitted
-    to the chosen modes, each weighed by its covariance.
+    In each round the mode nearest to the telescope is chosen for every star, and the numbers are
+    fitted to the chosen modes, weighted by their inverse covariance.
 
     Parameters
     ----------
     posterior : TelescopePosterior
+        Posterior of the numbers.
     modes : StarModes
-        Modes of the stars of the posterior, all of them.
+        All modes of the stars of the posterior.
     t : ndarray, shape (Q,)
         Standardised numbers of the first telescope.
 
     Returns
     -------
     ndarray, shape (Q + 4 m,)
-        Standardised numbers of the telescope, then place, flux and sky of the chosen mode of each
-        star.
+        Standardised numbers of the telescope, then position, flux and sky of the chosen mode of
+        each star.
     """
-    # Coefficients of all modes in waves, with their covariance; a little is added to it, for
+    # Coefficients of all modes in waves, with their covariance; a small diagonal is added to it for
     # coefficients that the prior fixes.
     optics = posterior.search.optics
     count, sd = optics.coefficient_count, optics.terms.sd[modes.star]
-    measured = optics.coefficients(modes.star, modes.parameters[:, :count])
+    mode_coefficients = optics.coefficients(modes.star, modes.parameters[:, :count])
     covariance = sd[:, :, None] * modes.covariance[:, :count, :count] * sd[:, None]
     covariance = covariance + 1e-6 * np.eye(count)
-    # Which star of the posterior each mode belongs to.
+    # Row of the star of each mode in the posterior.
     row = np.searchsorted(posterior.star, modes.star)
-    # Four rounds: a star may choose another mode as the numbers move.
+    # Four rounds: another mode of a star may become the nearest as the numbers change.
     for _ in range(4):
-        # Squared Mahalanobis distance of each mode; the first of each star in this order is the
-        # nearest.
-        gap = measured - posterior.coefficients(t)[row]
+        # Squared Mahalanobis distance of each mode; in this order, the first mode of each star is
+        # the nearest.
+        gap = mode_coefficients - posterior.coefficients(t)[row]
         weighted_gap = np.linalg.solve(covariance, gap[:, :, None])[:, :, 0]
         order = np.lexsort((np.einsum("mk,mk->m", gap, weighted_gap), modes.star))
         nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
         # Gauss–Newton step of the numbers, with their prior.
         slopes = posterior.slopes(t)
-        weighted = slopes @ np.linalg.inv(covariance[nearest])
-        information = (weighted @ slopes.swapaxes(1, 2)).sum(axis=0) + np.eye(t.size)
-        score = (weighted @ gap[nearest][:, :, None]).sum(axis=0)[:, 0] - t
+        weighted_slopes = slopes @ np.linalg.inv(covariance[nearest])
+        information = (weighted_slopes @ slopes.swapaxes(1, 2)).sum(axis=0) + np.eye(t.size)
+        score = (weighted_slopes @ gap[nearest][:, :, None]).sum(axis=0)[:, 0] - t
         t = np.clip(t + np.linalg.solve(information, score), -MAX_Z, MAX_Z)
     return np.concatenate([t, modes.parameters[nearest, count:].ravel()])
 
 
 def twin_numbers(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
-    """Return standardised numbers whose coefficients are those of t (Q,), the even ones negated.
+    """Return standardised numbers with the coefficients of t (Q,), but even ones negated.
 
-    Even terms are equal at opposite points of the pupil. A least-squares solution by Gauss–Newton
-    steps: often no telescope has exactly these coefficients.
+    Even terms are equal at opposite points of the pupil. It is a least-squares solution by
+    Gauss–Newton steps, because often no telescope has exactly these coefficients.
     """
     is_even = posterior.search.optics.terms.is_even
-    # Coefficients that the twin should have; those of odd terms stay.
+    # Target coefficients of the twin; coefficients of odd terms do not change.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
-    # Few steps do: coefficients are linear in the numbers, or nearly so.
+    # Few steps are enough: coefficients are linear in the numbers, or nearly so.
     for _ in range(4):
-        # All coefficients of all stars are equations for the numbers; singular values below 1e-9 of
-        # the largest are combinations of numbers that no coefficient shows.
+        # All coefficients of all stars are equations for the numbers. Singular values below 1e-9 of
+        # the largest belong to combinations of numbers that change no coefficient.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)
         gap = (target - posterior.coefficients(t)).ravel()
         t = np.clip(t + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0], -MAX_Z, MAX_Z)

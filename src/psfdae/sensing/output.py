@@ -1,6 +1,7 @@
 """Output of measured wavefronts: the FITS file with all results, and the report for a terminal.
 
-In: `psfdae.sensing.results.Wavefronts`. The command `psfdae wavefront` writes and prints both.
+Inputs: `psfdae.sensing.results.Wavefronts`. The command `psfdae wavefront` writes the file and
+prints the report.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     Parameters
     ----------
     wavefronts : Wavefronts
+        Measured wavefronts, with a joint fit or without.
     image : str
         Name of the image, for the header.
 
@@ -37,7 +39,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     """
     from astropy.io import fits
 
-    # What was measured, with which telescope and prior.
+    # Header: image, telescope and prior of the measurement.
     primary = fits.PrimaryHDU()
     prior = wavefronts.telescope.prior
     primary.header.extend(
@@ -51,7 +53,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
             ("NPOOR", int((~wavefronts.explained).sum()), "stars that no wavefront explains"),
         ]
     )
-    # A row for each mode of a star, that is, each wavefront that its image does not exclude.
+    # A row for each mode of a star: each wavefront that is compatible with its image.
     modes = wavefronts.table
     # Names of stars are ASCII in FITS.
     if modes["id"].dtype.kind == "U":
@@ -59,12 +61,12 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     table = fits.table_to_hdu(modes)
     table.name = "WAVEFRONT"
     table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."
-    # Covariances of the coefficients of each mode; NaN for stars without usable pixels, which
-    # have a row in the table, but no mode.
+    # Covariances of the coefficients of each mode; NaN for stars without usable pixels, which have
+    # a row in the table but no mode.
     of_modes = wavefronts.summary["covariance"]
     covariance = np.full((len(modes), *of_modes.shape[1:]), np.nan)
     covariance[np.isfinite(modes["probability"])] = of_modes
-    # Images of each star: its PSF with errors, and the residuals of the pixels that were used.
+    # Images of each star: its PSF with errors, and the residuals of the used pixels.
     psf, psf_error = wavefronts.psf_and_error()
     sky = wavefronts.measured()["sky"][:, None, None]
     residual = np.where(
@@ -83,7 +85,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
         hdu = fits.ImageHDU(values.astype(np.float32), name=name)
         hdu.header["COMMENT"] = comment
         hdus.append(hdu)
-    # State of the telescope, if one was fitted to all stars: a row for each of its numbers.
+    # State of the telescope, if it was fitted to all stars: a row for each of its numbers.
     if wavefronts.joint is not None:
         joint = wavefronts.joint
         state = fits.table_to_hdu(joint.table)
@@ -94,7 +96,7 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
 
 
 def report_lines(wavefronts: Wavefronts) -> list[str]:
-    """Return a table of the errors of one star, and sentences on the modes and the telescope.
+    """Return a table of the errors of a single star, and sentences on the modes and the telescope.
 
     Errors are medians over the stars, in waves and in nanometres.
 
@@ -104,7 +106,7 @@ def report_lines(wavefronts: Wavefronts) -> list[str]:
         Lines for a terminal.
     """
     terms, summary = wavefronts.terms, wavefronts.summary
-    # Modes stand star by star, the most probable one first: the first row of each star.
+    # First row of each star: modes are sorted by star, the most probable one first.
     first = np.flatnonzero(np.diff(summary["star"], prepend=-1))
     error = np.sqrt(np.einsum("mkk->mk", summary["covariance"][first]))
     wavelength_nm = wavefronts.wavelength_nm
@@ -114,14 +116,14 @@ def report_lines(wavefronts: Wavefronts) -> list[str]:
         f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   of one star, median of {len(first)}",
         f"{'':12}{'(waves)':>10}{'(waves)':>10}{'(nm)':>10}",
     ]
-    # A line for each coefficient. The prior may differ from star to star, as aberrations do.
+    # A line for each coefficient. The prior may differ from star to star, as the aberrations do.
     for k, name in enumerate(terms.names):
         prior = np.median(terms.sd[summary["star"][first], k])
         term_error = np.median(error[:, k])
         lines.append(f"{name:12}{prior:10.4f}{term_error:10.4f}{wavelength_nm * term_error:10.2f}")
     # One wave of OPD is a wavelength.
     rms_nm = wavelength_nm * np.nanmedian(wavefronts.rms[0])
-    # Stars whose best mode has less than 95 % have another one that their image does not exclude.
+    # If the best mode has less than 95 %, another one is compatible with the image, too.
     ambiguous = np.mean(summary["probability"][first] < 0.95)
     lines.append(
         f"RMS of the wavefronts {rms_nm:.3g} nm in the median; {ambiguous:.0%} of the stars have a "
@@ -131,7 +133,7 @@ def report_lines(wavefronts: Wavefronts) -> list[str]:
 
 
 def joint_report_lines(joint: Joint) -> list[str]:
-    """Return a table of the telescope's state, and sentences on how well stars determine it.
+    """Return a table of the telescope's state, and sentences on the accuracy of the state.
 
     The table has the prior of each number and its fitted value, both with standard deviations.
 
@@ -149,16 +151,16 @@ def joint_report_lines(joint: Joint) -> list[str]:
         form.format(*row)
         for row in joint.table["name", "unit", "prior", "prior_error", "value", "error"]
     ]
-    # Two numbers that change the image alike are known worse than their errors suggest, each by
-    # itself: name pairs with a correlation above 0.5.
-    correlated = np.argwhere(np.triu(np.abs(joint.correlation) > 0.5, 1))
-    if len(correlated):
+    # Errors of two numbers with a similar effect on the image are correlated: pairs with a
+    # correlation above 0.5 are named.
+    correlated_pairs = np.argwhere(np.triu(np.abs(joint.correlation) > 0.5, 1))
+    if len(correlated_pairs):
         pairs = [
             f"{joint.model.names[i]}, {joint.model.names[j]} {joint.correlation[i, j]:+.2f}"
-            for i, j in correlated
+            for i, j in correlated_pairs
         ]
         lines.append(f"correlations of errors: {'; '.join(pairs)}")
-    # A pupil that is the same at opposite points hides the sign of the even aberrations.
+    # A pupil that is equal at opposite points hides the sign of the even aberrations.
     if joint.twin is not None:
         lines.append(
             f"its probability is {joint.probability:.3f}; the twin, of the other sign of focus, "

@@ -1,7 +1,7 @@
-"""Figure of the wavefronts over the field: measured, of the model, and residuals of the stars.
+"""Figure of the wavefronts over the field: of single stars, of the model, and residual stamps.
 
-In: `psfdae.sensing.results.Wavefronts`. Out: a figure with three panels, in which each star has
-its pupil, or its stamp, at its field angle.
+Inputs: `psfdae.sensing.results.Wavefronts`. Outputs: a figure with three panels that show the
+pupil, or the stamp, of each star at its field angle.
 """
 
 from __future__ import annotations
@@ -10,56 +10,57 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.base.figures import WIDTH_IN, new_figure, styled
+from psfdae.base.figures import WIDTH_IN, apply_style, new_figure
 from psfdae.sensing.results import Wavefronts, flat_modes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@styled
+@apply_style
 def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
-    """Draw wavefronts of bright stars at their places, those of the model, and residual stamps.
+    """Draw measured and modelled wavefronts of bright stars over the field, and residual stamps.
 
-    The model is the telescope's state if it was fitted, else the mean of the prior.
+    The model is the fitted state of the telescope, or else the mean of the prior.
 
     Parameters
     ----------
     wavefronts : Wavefronts
+        Measured wavefronts, with a joint fit or without.
     title : str
         Title above the three panels.
     """
-    # At most 8 pupils along a side of the field: each is drawn in a cell.
+    # At most 8 pupils along a side of the field, one in each cell.
     low, high = wavefronts.field_deg.min(axis=0), wavefronts.field_deg.max(axis=0)
     cell_deg = (high - low).max() / 8
     stars = bright_separate_stars(wavefronts, cell_deg)
     # OPD of the most probable mode of each star, and of the model.
     summary, joint = wavefronts.summary, wavefronts.joint
     first = np.searchsorted(summary["star"], stars)
-    measured = pupil_opd(wavefronts, stars, summary["mean"][first])
-    expected = wavefronts.terms.mean
+    star_opd = pupil_opd(wavefronts, stars, summary["mean"][first])
+    model_waves = wavefronts.terms.mean
     if joint is not None:
-        expected = joint.model.coefficients(joint.value)
-    model = pupil_opd(wavefronts, stars, expected[stars])
-    # Residuals in units of the sky's noise, less the median of each stamp.
+        model_waves = joint.model.coefficients(joint.value)
+    model = pupil_opd(wavefronts, stars, model_waves[stars])
+    # Residuals in units of the sky noise, minus the median of each stamp.
     stamps, photons = wavefronts.stamps, wavefronts.search.photons
     residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
     residual[stamps.bad | stamps.saturated] = np.nan
     residual -= np.nanmedian(residual, axis=(1, 2), keepdims=True)
     residual = (residual / photons.sky_noise[:, None, None])[stars]
-    # The colour scale ends at the 98th percentile: the rim alone would take the whole of it.
-    peak = float(np.nanpercentile(np.abs([measured, model]), 98)) if len(stars) else 1.0
+    # The colour scale ends at the 98th percentile: otherwise it would only show the rim.
+    peak = float(np.nanpercentile(np.abs([star_opd, model]), 98)) if len(stars) else 1.0
     model_name = "fitted telescope" if joint else "prior's mean"
     panels = (
-        ("measured", measured, peak, "RdBu_r", "OPD (waves)"),
+        ("measured", star_opd, peak, "RdBu_r", "OPD (waves)"),
         (model_name, model, peak, "RdBu_r", "OPD (waves)"),
         ("residuals of the stars", residual, 4.0, "Greys", "noise of the sky"),
     )
     # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    # Each image fills its cell about the place of the star, but for a gap to the next one. If all
-    # stars have one place, any cell will do.
+    # Each image fills its cell about the star's field angle, except a gap to the next cell. If all
+    # stars have the same field angle, any size of the cell is right.
     cell = 0.92 * (cell_deg or 0.125)
     half = 0.5 * cell
     for panel, (name, images, limit, colours, unit) in zip(axes, panels, strict=True):
@@ -81,7 +82,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
             xlabel="x (deg)",
             title=name,
         )
-        # Without stars there is nothing that a colour bar could explain.
+        # Without stars there is no image that a colour bar could explain.
         if len(stars):
             figure.colorbar(mappable, ax=panel, location="bottom", shrink=0.8, label=unit)
     axes[0].set_ylabel("y (deg)")
@@ -90,11 +91,11 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
 
 
 def bright_separate_stars(wavefronts: Wavefronts, cell_deg: float) -> np.ndarray:
-    """Return the numbers of the brightest explained stars, a cell or more from each other."""
+    """Return the indices of the brightest explained stars, a cell or more from each other."""
     stars = np.intersect1d(wavefronts.star, np.flatnonzero(wavefronts.explained))
-    # Brightest first: of stars in one cell, the brightest is drawn.
+    # Brightest first: the brightest star of a cell is drawn.
     stars = stars[np.argsort(-wavefronts.snr[stars], kind="stable")]
-    # Rounding must not part stars of a regular grid.
+    # Rounding must not drop stars of a regular grid.
     distance_deg = (1.0 - 1e-6) * cell_deg
     separate = []
     while stars.size:

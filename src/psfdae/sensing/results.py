@@ -1,7 +1,7 @@
 """Measurement of wavefronts: from stamps of stars and a telescope to coefficients and PSFs.
 
 `wavefront` runs the search, the draws and the joint fit; `Wavefronts` holds the posteriors of the
-stars and the state of the telescope, and derives coefficients, PSFs and tables from them.
+stars and the state of the telescope, and computes coefficients, PSFs and tables from them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
 from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, WavefrontSearch
 from psfdae.sensing.summary import nearest_modes, summarise_modes
-from psfdae.telescope.field import Terms, telescope_model, terms_of
+from psfdae.telescope.field import Terms, build_terms, model_telescope
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
 if TYPE_CHECKING:
@@ -44,15 +44,15 @@ def wavefront(
     Parameters
     ----------
     stars : array, shape (n, d, d), or Stamps
-        Images in any unit, sky included, the star about index [d/2, d/2], pixels of the
-        telescope's scale. Pixels that are not finite are not used.
+        Images in any unit, with sky, the star near index [d/2, d/2], with the pixel scale of the
+        telescope. Pixels that are not finite are not used.
     telescope : OwnTelescope or path
         Telescope, or its YAML file as in `config/telescope`, with the prior of its aberrations.
     field_deg : array, shape (n, 2)
         Field angle (x, y) of each star in degrees, along columns and rows.
     noise, gain : float or array, shape (n,), optional
-        RMS of the sky in a pixel (by default the scatter of the stamp's border) and electrons
-        per unit (by default the star's own photon noise is neglected); of arrays only.
+        RMS of the sky noise in a pixel (by default the scatter of the stamp's border) and electrons
+        per unit (by default the photon noise of the star is neglected); only for arrays.
     joint : bool
         Fit the state of the telescope to all stars together.
     seed : int
@@ -61,7 +61,7 @@ def wavefront(
     Raises
     ------
     SensingError
-        If shapes do not fit, no star is usable, or the aberrations are too large for any grid.
+        If shapes do not agree, no star is usable, or the aberrations are too large for any grid.
     ConfigError, RayTracingError, MissingExtraError
         If the telescope cannot be used.
 
@@ -70,23 +70,23 @@ def wavefront(
     >>> psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
     Wavefronts('refractor', 1 stars)
     """
-    # Telescope and stamps, read or converted where they are files or arrays.
+    # Files are read, and arrays converted to stamps.
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
-    stamps = stars if isinstance(stars, Stamps) else sensed_stamps(stars, noise, gain)
+    stamps = stars if isinstance(stars, Stamps) else build_stamps(stars, noise, gain)
     # A field angle for each star: aberrations change over the field.
     angle = real_numbers("field_deg", field_deg).astype(float)
     if angle.shape != (len(stamps), 2) or not np.isfinite(angle).all():
         raise SensingError(
             f"field_deg of shape {angle.shape}, expected ({len(stamps)}, 2) finite numbers"
         )
-    # The posterior of each star by itself, and then the telescope that explains them together.
+    # The posterior of each single star, then the telescope that explains all stars.
     try:
-        terms = terms_of(telescope, angle)
+        terms = build_terms(telescope, angle)
         optics = StarOptics(telescope, terms, stamps.data.shape[-1])
         search = WavefrontSearch(optics, Photons.from_stamps(stamps), seed)
         modes = search.find_modes()
-        state = fit_telescope(search, modes, telescope_model(telescope, angle)) if joint else None
+        state = fit_telescope(search, modes, model_telescope(telescope, angle)) if joint else None
     except SamplingError as error:
         raise SensingError(
             f"{telescope.name}: aberrations or seeing need a finer pupil grid ({error})"
@@ -94,13 +94,13 @@ def wavefront(
     return Wavefronts(search, stamps, angle, modes, state)
 
 
-def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
-    """Return stamps of arrays, of which only noise and gain may be known.
+def build_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -> Stamps:
+    """Return stamps from arrays, for which at most noise and gain are known.
 
     Raises
     ------
     SensingError
-        If shapes do not fit, or noise or gain is not above 0.
+        If shapes do not agree, or noise or gain is not above 0.
     """
     # Square stamps in double precision, one or more.
     data = real_numbers("stars", stars).astype(float)
@@ -109,7 +109,7 @@ def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | N
     count = len(data)
 
     def per_star(name: str, value: ArrayLike | None) -> np.ndarray:
-        # One number serves all stars; NaN stands for a number that is to be estimated.
+        # One number may be given for all stars; NaN stands for a number to be estimated.
         numbers = real_numbers(name, np.nan if value is None else value).astype(float)
         if numbers.shape not in ((), (count,)):
             raise SensingError(
@@ -120,7 +120,7 @@ def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | N
             raise SensingError(f"{name}: expected numbers above 0")
         return np.broadcast_to(numbers, count).copy()
 
-    # Pixels that are not finite are bad; nothing is known of flux, sky and place.
+    # Pixels that are not finite are bad; flux, sky and position are unknown.
     is_finite, unknown = np.isfinite(data), np.full(count, np.nan)
     return Stamps(
         data=np.where(is_finite, data, 0.0),
@@ -138,12 +138,12 @@ def sensed_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | N
 def flat_modes(terms: Terms, obscuration: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the modes of the pupil without piston and tilts, and the light on its samples.
 
-    Taking the plane off every mode takes it off every sum of modes.
+    A sum of modes without planes has no plane either.
 
     Parameters
     ----------
     terms : Terms
-        With J modes.
+        Terms of the wavefronts, with J modes.
     obscuration : float
         Linear central obscuration of the pupil.
     samples : int
@@ -172,11 +172,12 @@ class Wavefronts:
     """Wavefronts of stars, and the state of their telescope.
 
     Arrays have n rows for all stars, with NaN where a star has no usable pixels, or m rows for
-    the stars `star` that have some. K is the number of coefficients.
+    the stars `star` with usable pixels. K is the number of coefficients.
 
     Attributes
     ----------
     search : WavefrontSearch
+        Search of the modes, with the optics and the counts of the stars.
     stamps : Stamps
         Stamps of n stars.
     field_deg : ndarray, shape (n, 2)
@@ -205,6 +206,7 @@ class Wavefronts:
     joint: Joint | None = None
 
     def __repr__(self) -> str:
+        """Return the name of the telescope and the number of stars."""
         return f"Wavefronts({self.telescope.name!r}, {len(self.stamps)} stars)"
 
     @property
@@ -219,7 +221,7 @@ class Wavefronts:
 
     @property
     def wavelength_nm(self) -> float:
-        """Wavelength of the telescope in nanometres: the OPD of one wave."""
+        """Wavelength of the telescope in nanometres, the OPD of one wave."""
         return self.telescope.wavelength_m / 1e-9
 
     @property
@@ -257,7 +259,7 @@ class Wavefronts:
         Parameters
         ----------
         probability : float
-            Probability that an interval holds; by default that of ± σ of a normal distribution.
+            Probability of the intervals, 0 … 1; by default as for ± σ of a normal distribution.
 
         Returns
         -------
@@ -265,10 +267,10 @@ class Wavefronts:
             Lower and upper ends in waves; NaN for stars without usable pixels.
         """
         # Quantiles of the draws at (1 ± probability)/2 leave out equal parts on both sides. Draws
-        # go to all modes by their probabilities, so an interval spans a star's twins, too.
+        # come from all modes by their probabilities, so that an interval includes twins.
         half = 0.5 * probability
         ends = np.quantile(self.coefficients, [0.5 - half, 0.5 + half], axis=1)
-        return self._for_all_stars(np.moveaxis(ends, 0, -1))
+        return self._spread_over_stars(np.moveaxis(ends, 0, -1))
 
     @cached_property
     def rms(self) -> tuple[np.ndarray, np.ndarray]:
@@ -279,7 +281,7 @@ class Wavefronts:
         modes = np.einsum("msk,mkj->msj", self.coefficients, self.terms.to_modes[self.star])
         # Rounding can make the square of a perfect wavefront negative.
         rms = np.sqrt(np.maximum(np.einsum("msi,ij,msj->ms", modes, gram, modes), 0.0))
-        return self._for_all_stars(rms.mean(axis=1)), self._for_all_stars(rms.std(axis=1))
+        return self._spread_over_stars(rms.mean(axis=1)), self._spread_over_stars(rms.std(axis=1))
 
     def psf(self, oversampling: int = 1, side: int | None = None) -> np.ndarray:
         """Return posterior mean PSFs, with the chief ray in the middle.
@@ -289,12 +291,12 @@ class Wavefronts:
         oversampling : int
             Values per pixel along each axis.
         side : int, optional
-            Side in pixels, by default that of the stamps.
+            Side in pixels, by default the side of the stamps.
 
         Returns
         -------
         ndarray, shape (n, s, s)
-            With s = oversampling × side. Values are light per pixel: over the whole image they
+            PSFs, s = oversampling × side. Values are light per pixel: over the whole image they
             sum to oversampling². NaN for stars without usable pixels.
         """
         return self.psf_and_error(oversampling, side)[0]
@@ -304,26 +306,26 @@ class Wavefronts:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return `psf`, and the standard deviation of its pixels over the star's wavefronts.
 
-        Parameters and shapes are those of `psf`.
+        For parameters and shapes see `psf`.
         """
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
-        # The star stands in the middle: its place is no part of the PSF.
-        centred = np.zeros((self.draws.shape[1], 2))
-        # Each draw is a wavefront with its PSF: mean and scatter over them, star by star, because
-        # all images of all stars would not fit the memory.
+        # The star is in the middle: its position is not part of the PSF.
+        centre_px = np.zeros((self.draws.shape[1], 2))
+        # Mean and scatter over the PSFs of all draws, star by star, because the images of all stars
+        # would not fit into the memory.
         mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
-            # Smaller pixels hold less light: their values are those of a whole pixel.
-            images = operator.stamps(self._pupil_modes(row, centred)) * oversampling**2
+            # Smaller pixels hold less light: values are scaled to whole pixels.
+            images = operator.stamps(self._pupil_modes(row, centre_px)) * oversampling**2
             mean[star], error[star] = images.mean(axis=0), images.std(axis=0)
         return mean, error
 
     @cached_property
     def model(self) -> np.ndarray:
         """Posterior mean images of the stars without sky, in the unit of the stamps, (n, d, d)."""
-        # A draw has coefficients, then the place (x, y), flux and sky.
+        # A draw has coefficients, then position (x, y), flux and sky.
         k = len(self.terms.names)
         model = np.full(self.stamps.data.shape, np.nan)
         for row, star in enumerate(self.star):
@@ -335,51 +337,51 @@ class Wavefronts:
         return model
 
     def _pupil_modes(self, row: int, place_px: np.ndarray) -> np.ndarray:
-        """Return the mode coefficients (s, J + 2) of the draws of `star[row]` at places (s, 2)."""
+        """Return mode coefficients (s, J + 2) of the draws of `star[row]` at positions (s, 2)."""
         stars = np.full(len(place_px), self.star[row])
         return self.search.optics.mode_coefficients(stars, self.coefficients[row], place_px)
 
     @property
     def snr(self) -> np.ndarray:
         """S/N of a matched filter, (n,): √Σ model² over the noise of the sky in a pixel."""
-        # The filter that is the star's image m has the variance σ² Σ m² and the signal Σ m².
+        # The filter m, the image of the star, has the signal Σ m² and the variance σ² Σ m².
         power = np.sqrt((self.model**2).sum(axis=(1, 2)))
         return np.asarray(power / self.search.photons.sky_noise)
 
     @property
     def explained(self) -> np.ndarray:
-        """True for stars that a mode explains, (n,)."""
+        """True for stars that are explained by a mode, (n,)."""
         # Stars without usable pixels have no mode and count as unexplained.
-        explained = np.zeros(len(self.stamps), bool)
-        explained[self.star] = self.search.is_explained(self.modes.best_modes)
-        return explained
+        is_explained = np.zeros(len(self.stamps), bool)
+        is_explained[self.star] = self.search.is_explained(self.modes.best_modes)
+        return is_explained
 
     @property
     def chi2(self) -> np.ndarray:
-        """Deviance of the best mode over the number of pixels, (n,); about 1 if it is right."""
+        """Deviance of the best mode over the number of pixels, (n,); about 1 for a good fit."""
         pixels = self.search.photons.pixels[self.star]
-        return self._for_all_stars(self.modes.best_modes.deviance / pixels)
+        return self._spread_over_stars(self.modes.best_modes.deviance / pixels)
 
     def measured(self) -> dict[str, np.ndarray]:
-        """Return place, flux and sky of every star with errors.
+        """Return position, flux and sky of every star with errors.
 
         Returns
         -------
         dict of ndarray, shape (n,)
-            `x` and `y`, the place of the chief ray: a 0-based pixel of the image, where stamps
-            were cut from one, else of the stamp; `flux`, the whole light, and `sky`, in the unit
-            of the stamps. Each has an error, `x_error` and so on; all are means and standard
-            deviations over all modes. NaN for stars without usable pixels.
+            `x` and `y`, the position of the chief ray in 0-based pixels of the image from which
+            stamps were cut, or else of the stamp; `flux`, the total light, and `sky`, in the unit
+            of the stamps. Each has an error, `x_error` and so on. Values and errors are means and
+            standard deviations over all modes. NaN for stars without usable pixels.
         """
         star, photons, side = self.star, self.search.photons, self.stamps.data.shape[-1]
 
         def middle(position: np.ndarray) -> np.ndarray:
-            # Stamps begin at the first pixel about a position; at 0 where it is unknown.
+            # First pixel of the stamp about a position; 0 where the position is unknown.
             corner = np.where(np.isfinite(position), central_pixel(position) - side // 2, 0)
             return np.asarray(corner[star] + 0.5 * (side - 1))
 
-        # Zero and unit of each parameter. Places count from the middle of the stamp, flux and sky
-        # are in electrons, the sky in units of the root of its counts.
+        # Zero and unit of each parameter. Positions are relative to the middle of the stamp, flux
+        # and sky are in electrons, the sky in units of the root of its counts.
         gain = photons.gain[star]
         unit_px = np.ones(len(star))
         columns: dict[str, np.ndarray] = {}
@@ -392,11 +394,11 @@ class Wavefronts:
         for index, (name, (zero, unit)) in enumerate(scales.items(), len(self.terms.names)):
             # Mean and standard deviation of the draws of all modes, in the unit of the column.
             draws = self.draws[..., index]
-            columns[name] = self._for_all_stars(zero + unit * draws.mean(axis=1))
-            columns[f"{name}_error"] = self._for_all_stars(unit * draws.std(axis=1))
+            columns[name] = self._spread_over_stars(zero + unit * draws.mean(axis=1))
+            columns[f"{name}_error"] = self._spread_over_stars(unit * draws.std(axis=1))
         return columns
 
-    def _for_all_stars(self, values: np.ndarray) -> np.ndarray:
+    def _spread_over_stars(self, values: np.ndarray) -> np.ndarray:
         """Return values (m, ...) of the usable stars as (n, ...), NaN for the others."""
         spread = np.full((len(self.stamps), *values.shape[1:]), np.nan)
         spread[self.star] = values
@@ -404,15 +406,15 @@ class Wavefronts:
 
     @property
     def table(self) -> Table:
-        """Table with a row for every star and mode, the likeliest mode of a star first.
+        """Table with a row for every star and mode, the most probable mode of a star first.
 
         A star without usable pixels has a row of NaN. Columns are
 
-        - `id` of the star, number `mode` and its `probability`;
+        - `id` of the star, index `mode` and its `probability`;
         - `explained`, `chi2` and `snr` of the star, and its field angle `x_deg`, `y_deg`;
         - each coefficient and its error in waves, the standard deviation inside the mode;
         - `rms` of the wavefront over all modes and `rms_error`, in nanometres;
-        - place, flux and sky with errors, as in `measured`.
+        - position, flux and sky with errors, as in `measured`.
         """
         return wavefront_table(self)
 
@@ -421,22 +423,22 @@ def wavefront_table(wavefronts: Wavefronts) -> Table:
     """Return the table with a row for every star and mode; see `Wavefronts.table`."""
     from astropy.table import Column, Table
 
-    # Rows of the summary, then one for each star without usable pixels, ordered by star.
+    # Rows of the summary and one row for each star without usable pixels, sorted by star.
     summary, stamps = wavefronts.summary, wavefronts.stamps
     star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), wavefronts.star))
     unusable = np.full(star.size - summary["star"].size, np.nan)
     order = np.argsort(star, kind="stable")
     star = star[order]
 
-    def completed(values: np.ndarray) -> np.ndarray:
-        # Values of the summary, and NaN for stars that it has not.
+    def complete(values: np.ndarray) -> np.ndarray:
+        # Values of the summary, and NaN for stars without usable pixels.
         return np.append(values, unusable)[order]
 
     columns: list[tuple[str, np.ndarray, str | None]] = [
         ("id", stamps.id[star], None),
-        # Number of the mode: rows since the first one of the star.
+        # Index of the mode: rows since the first row of the star.
         ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
-        ("probability", completed(summary["probability"]), None),
+        ("probability", complete(summary["probability"]), None),
         ("explained", wavefronts.explained[star], None),
         ("chi2", wavefronts.chi2[star], None),
         ("snr", wavefronts.snr[star], None),
@@ -444,18 +446,18 @@ def wavefront_table(wavefronts: Wavefronts) -> Table:
         ("y_deg", wavefronts.field_deg[star, 1], "deg"),
     ]
     for k, name in enumerate(wavefronts.terms.names):
-        # Coefficients with the standard deviation of their mode.
+        # Coefficients with their standard deviation in the mode.
         error = np.sqrt(summary["covariance"][:, k, k])
-        columns.append((name, completed(summary["mean"][:, k]), "wave"))
-        columns.append((f"{name}_error", completed(error), "wave"))
-    # The RMS is that of the whole posterior, the same for all modes of a star.
+        columns.append((name, complete(summary["mean"][:, k]), "wave"))
+        columns.append((f"{name}_error", complete(error), "wave"))
+    # The RMS belongs to the whole posterior and is the same for all modes of a star.
     for name, waves in zip(("rms", "rms_error"), wavefronts.rms, strict=True):
         columns.append((name, wavefronts.wavelength_nm * waves[star], "nm"))
     for name, values in wavefronts.measured().items():
         columns.append((name, values[star], "pix" if name[0] in "xy" else None))
     table = Table()
     for name, values, unit in columns:
-        # A wave is no unit of the FITS standard; the description has it.
+        # The FITS standard has no unit wave: it is in the description.
         fits_unit = None if unit == "wave" else unit
         table[name] = Column(values, unit=fits_unit, description=unit)
     return table

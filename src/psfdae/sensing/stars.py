@@ -1,11 +1,11 @@
 """Wavefronts of single stars: the modes of the posterior of each star, and draws from it.
 
-The image of a star depends on the coefficients of its wavefront, its place, its flux and the sky.
-Photon counts are Poisson. The coefficients have the prior of the telescope; flux and sky have
-none. Candidates are drawn from the prior and matched with the stamp at whole pixels, and the best
-ones are followed to modes. More are drawn for stars that no mode explains. A pupil that is the
-same at opposite points hides the sign of the even part of a wavefront: the twin of every mode is
-a start, too, and both are given with their probabilities.
+The image of a star depends on the coefficients of its wavefront, its position, its flux and the
+sky. Photon counts are Poisson distributed. The coefficients have the prior of the telescope; flux
+and sky have a flat prior. Candidates are drawn from the prior and matched to the stamp at whole
+pixels, and the best ones are optimised to modes. More candidates are drawn for stars that no mode
+explains. A pupil that is equal at opposite points hides the sign of the even part of a wavefront:
+the twin of every mode is a start, too, and both are returned with their probabilities.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from psfdae.telescope.settings import OwnTelescope
 PUPIL_SIZES = (48, 64, 80, 96, 126, 158, 190, 222, 254, 318, 398, 478, 638, 830, 1000)
 """Pupil samples to choose from; the sampling guard decides for each wavefront.
 
-The first one serves stars in seeing alone, which forgives a coarser grid. Either way the error is
-below a thousandth of the noise of stars of S/N 200.
+The first one is only for stars in seeing, where a coarser grid is enough. In both cases the error
+is below a thousandth of the noise of stars of S/N 200.
 """
 
 MAX_Z = 6.0
-"""Standard deviations of the prior beyond which no coefficient is searched."""
+"""Largest deviation of a coefficient from its prior mean in the search, in standard deviations."""
 
 
 class SensingError(Error, ValueError):
-    """Stars, or a telescope, from which no wavefronts can be measured."""
+    """Error of stars, or of a telescope, that do not allow a measurement of wavefronts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,7 @@ class StarOptics:
     Attributes
     ----------
     telescope : OwnTelescope
+        Telescope with its pupil, pixels and seeing.
     terms : Terms
         Aberrations of n stars, K coefficients each.
     stamp_px : int
@@ -81,12 +82,13 @@ class StarOptics:
     def propagation(
         self, stamp_px: int, oversampling: int = 1, *, broadening: bool = False
     ) -> SampledStamps:
-        """Return the propagation to stamps of a side, with several values per pixel and axis.
+        """Return the propagation to stamps, with `oversampling` values per pixel and axis.
 
-        With `broadening`, the stamps are derivatives by the logarithm of the FWHM of the seeing.
+        With `broadening`, stamps are derivatives with respect to the logarithm of the FWHM of the
+        seeing.
         """
         telescope, blur = self.telescope, self.telescope.blur
-        # Points of the image for stamps without blur, its whole period for blurred ones.
+        # Points of the image without blur, the whole period of the image for blurred stamps.
         pixel = telescope.pixel / oversampling
         sampling: Callable[..., Sampling] = PointSampling
         if blur is not None:
@@ -94,7 +96,7 @@ class StarOptics:
             sampling = partial(BlurredSampling, profile=profile)
         return SampledStamps(
             telescope.obscuration,
-            # Two modes more move the star by a pixel of the telescope along x and y.
+            # Two additional modes move the star by a pixel of the telescope along x and y.
             partial(movable_modes, self.terms.modes, telescope.pixel),
             sampling,
             stamp_px,
@@ -117,12 +119,13 @@ class StarOptics:
         Parameters
         ----------
         star : ndarray of int, shape (m,)
+            Index of the star of each row.
         coefficients : ndarray, shape (m, K)
-            In waves.
+            Coefficients of the terms in waves.
         place_px : ndarray, shape (m, 2)
-            Place (x, y) of the star from the middle of the stamp.
+            Position (x, y) of the star from the middle of the stamp.
         """
-        # Terms are linear in the modes, by a matrix of each star's field.
+        # Terms are linear in the modes; the matrix depends on the field angle of the star.
         waves = np.einsum("mk,mkj->mj", coefficients, self.terms.to_modes[star])
         return np.concatenate([waves, place_px], axis=1)
 
@@ -134,26 +137,26 @@ class StarOptics:
         modes : ndarray, shape (m, J + 2)
             Result of `mode_coefficients`.
         directions : ndarray, shape (m, k, J)
-            Derivatives of the modes by k parameters; those by the place (x, y) are added.
+            Derivatives of the modes with respect to k parameters; the position (x, y) is added.
         """
-        # Two parameters more, each of which is the coefficient of one of the last two modes.
+        # Two additional parameters, the coefficients of the last two modes.
         directions = np.pad(directions, ((0, 0), (0, 2), (0, 2)))
         directions[:, [-2, -1], [-2, -1]] = 1.0
         stamps, slopes = self.operator.derivatives(modes, directions)
-        # Counts are compared in double precision.
+        # Double precision for the comparison with counts.
         slopes = slopes.reshape(*slopes.shape[:2], -1).astype(np.float64)
         return stamps.reshape(len(modes), -1).astype(np.float64), slopes
 
     def twins(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Return standardised coefficients (m, K) whose even terms are negated in waves.
 
-        A coefficient that has no twin, because the prior fixes it, becomes ∞.
+        A coefficient without twin, because the prior fixes it, becomes ∞.
         """
         mean, sd = self.terms.mean[star], self.terms.sd[star]
         # −(mean + sd z) = mean + sd z' for z' = −z − 2 mean/sd.
         with np.errstate(divide="ignore", invalid="ignore"):
-            negated = np.where(sd > 0, -z - 2.0 * mean / sd, np.where(mean == 0, z, np.inf))
-        return np.where(self.terms.is_even, negated, z)
+            negated_z = np.where(sd > 0, -z - 2.0 * mean / sd, np.where(mean == 0, z, np.inf))
+        return np.where(self.terms.is_even, negated_z, z)
 
 
 @dataclass(frozen=True)
@@ -163,13 +166,13 @@ class Photons:
     Attributes
     ----------
     counts : ndarray, shape (n, P)
-        Electrons, sky included; NaN where a pixel is not used.
+        Electrons, with sky; NaN where a pixel is not used.
     sky_counts : ndarray, shape (n,)
-        Electrons per pixel that have the noise of the sky, read noise included.
+        Electrons per pixel whose Poisson noise equals the noise of the sky with the read noise.
     gain : ndarray, shape (n,)
         Electrons per unit of the stamps.
     sky_level, sky_noise : ndarray, shape (n,)
-        Sky and its RMS in a pixel, in the unit of the stamps.
+        Sky and RMS of its noise in a pixel, in the unit of the stamps.
     """
 
     counts: np.ndarray
@@ -180,54 +183,56 @@ class Photons:
 
     @classmethod
     def from_stamps(cls, stamps: Stamps) -> Photons:
-        """Convert stamps to electrons; without a gain, the noise of the sky alone counts."""
-        # Sky and noise as given, else from the border of the stamp.
+        """Convert stamps to electrons; without a gain, only the noise of the sky is used."""
+        # Sky and noise as given, or else from the border of the stamp.
         data = stamps.data.astype(np.float64)
         border = border_median(data, stamps.bad)
         level = np.where(np.isfinite(stamps.background), stamps.background, border)
         scatter = border_scatter(data, stamps.bad)
         noise = np.where(np.isfinite(stamps.noise), stamps.noise, scatter)
         noise = np.where(noise > 0, noise, np.nan)
-        # A gain that is not given is so large that the star's own photon noise vanishes beside
-        # the sky's. N electrons have the variance N, so the sky counts are (gain · noise)².
+        # The default gain is so large that the photon noise of the star is negligible compared with
+        # the sky noise. N electrons have the variance N: the sky counts are (gain · noise)².
         gain = np.where(np.isfinite(stamps.gain), stamps.gain, BrightStars.max_sky**0.5 / noise)
         sky = np.clip((gain * noise) ** 2, BrightStars.min_sky, BrightStars.max_sky)
-        # Counts of star and sky; pixels that are bad or saturated are not used.
+        # Counts of star and sky; bad or saturated pixels are not used.
         counts = gain[:, None, None] * (data - level[:, None, None]) + sky[:, None, None]
         counts = np.where(stamps.bad | stamps.saturated, np.nan, counts).reshape(len(data), -1)
         return cls(counts, sky, gain, level, noise)
 
     @property
     def pixels(self) -> np.ndarray:
-        """Number of used pixels of each star, (n,): the mean deviance of the true image."""
+        """Number of used pixels of each star, (n,), the mean deviance of the true image."""
         return np.asarray(np.isfinite(self.counts).sum(axis=1))
 
     @property
     def deviance_limit(self) -> np.ndarray:
-        """Deviance above which an image does not explain a star, (n,).
+        """Deviance above which a model image does not explain a star, (n,).
 
         Like χ², the deviance of the true image has the mean P and the variance 2P for P pixels;
-        the limit is four standard deviations above.
+        the limit is four standard deviations above the mean.
         """
         return np.asarray(self.pixels + 4.0 * np.sqrt(2.0 * self.pixels))
 
     @property
     def usable(self) -> np.ndarray:
-        """True for stars with half of their pixels and a noise, (n,)."""
+        """True for stars with at least half of their pixels and a known noise, (n,)."""
         return np.asarray((self.pixels >= 0.5 * self.counts.shape[1]) & np.isfinite(self.sky_noise))
 
 
 @dataclass(frozen=True)
 class StarModes:
-    """Modes of the posteriors of stars, M in all, by star and from the best on.
+    """Modes of the posteriors of stars, M in all, sorted by star, the best mode first.
 
     Attributes
     ----------
     star : ndarray of int, shape (M,)
+        Index of the star of each mode.
     parameters : ndarray, shape (M, K + 4)
-        Standardised coefficients, place (x, y) from the middle of the stamp in pixels, flux and
-        sky in the units of `WavefrontSearch.flux` and of the sky's noise.
+        Standardised coefficients, position (x, y) from the middle of the stamp in pixels, flux and
+        sky in the units of `WavefrontSearch.flux` and of the sky noise.
     covariance : ndarray, shape (M, K + 4, K + 4)
+        Covariance of the parameters in the mode.
     evidence : ndarray, shape (M,)
         Logarithm of the mass of the mode.
     deviance : ndarray, shape (M,)
@@ -241,11 +246,11 @@ class StarModes:
     deviance: np.ndarray
 
     def take(self, modes: np.ndarray) -> StarModes:
-        """Select modes by their numbers, in the order given."""
+        """Return modes by their indices, in the given order."""
         return StarModes(*(values[modes] for values in vars(self).values()))
 
-    def of_stars(self, stars: np.ndarray) -> StarModes:
-        """Select the modes of some stars."""
+    def select_stars(self, stars: np.ndarray) -> StarModes:
+        """Return the modes of some stars."""
         return self.take(np.flatnonzero(np.isin(self.star, stars)))
 
     @property
@@ -255,19 +260,21 @@ class StarModes:
 
     @property
     def probability(self) -> np.ndarray:
-        """Fraction of the mass of its star that each mode has, (M,)."""
-        # Masses relative to the best mode of the star do not underflow all together.
+        """Fraction of the mass of the posterior of its star in each mode, (M,)."""
+        # Masses relative to the best mode of the star, so that they do not all underflow.
         mass = np.exp(self.evidence - group_maximum(self.evidence, self.star))
         return np.asarray(mass / np.bincount(self.star, mass)[self.star])
 
 
 class WavefrontSearch:
-    """Search for the modes of the stars of some stamps.
+    """Search for the modes of the posteriors of stars.
 
     Parameters
     ----------
     optics : StarOptics
+        Propagation to the stamps of the stars.
     photons : Photons
+        Counts of the stamps.
     seed : int
         Seed of the candidates and of the draws.
 
@@ -278,7 +285,7 @@ class WavefrontSearch:
     """
 
     stars_at_once: ClassVar[int] = 128
-    """Stars of 16 × 16 px that are worked on together, to bound the memory."""
+    """Number of stars of 16 × 16 px that are processed together, to limit the memory."""
 
     def __init__(self, optics: StarOptics, photons: Photons, seed: int) -> None:
         self.optics, self.photons, self.seed = optics, photons, seed
@@ -297,15 +304,15 @@ class WavefrontSearch:
         usable = np.flatnonzero(self.photons.usable)
         if not usable.size:
             raise SensingError("no star has enough usable pixels")
-        return join_modes([self._find_modes_of(block) for block in self._blocks(usable)])
+        return join_modes([self._find_block(block) for block in self._blocks(usable)])
 
     def draw_parameters(self, modes: StarModes) -> np.ndarray:
         """Draw (m, `CHAINS.draws`, K + 4) parameters from the posteriors of stars with modes."""
         blocks = self._blocks(modes.best_modes.star)
-        return np.concatenate([self._draw_parameters_of(modes.of_stars(block)) for block in blocks])
+        return np.concatenate([self._draw_block(modes.select_stars(block)) for block in blocks])
 
     def is_explained(self, modes: StarModes) -> np.ndarray:
-        """Return True for modes that fit as well as the true image nearly always does."""
+        """Return True for modes with a deviance that is usual for the true image."""
         return np.asarray(modes.deviance <= self.photons.deviance_limit[modes.star])
 
     def _blocks(self, stars: np.ndarray) -> list[np.ndarray]:
@@ -313,12 +320,12 @@ class WavefrontSearch:
         size = max(1, int(self.stars_at_once * (16 / self.optics.stamp_px) ** 2))
         return np.split(stars, range(size, stars.size, size))
 
-    def _find_modes_of(self, stars: np.ndarray) -> StarModes:
-        """Find the modes of some stars, in as many rounds as each needs."""
+    def _find_block(self, stars: np.ndarray) -> StarModes:
+        """Find the modes of some stars, with as many rounds of candidates as each star needs."""
         count = self.optics.coefficient_count
         modes: list[StarModes] = []
         likely_modes = np.ones(len(self.flux), int)
-        # Candidates drawn for a star in each round, and those of them that are followed to modes.
+        # Number of candidates drawn for a star in each round, and of climbs from the best of them.
         rounds = ((48, 4), (100, 6), (400, 12), (1000, 12))
         for number, sizes in enumerate(rounds):
             if not stars.size:
@@ -327,7 +334,7 @@ class WavefrontSearch:
             starts = [self._match_candidates(star, number, *sizes) for star in stars]
             members = np.repeat(stars, [len(start) for start in starts])
             fresh = self._climb(members, np.concatenate(starts))
-            # Climbs from the twins of their modes, where the prior permits them.
+            # Climbs from the twins of the modes, where the prior permits them.
             twins = fresh.parameters.copy()
             twins[:, :count] = self.optics.twins(fresh.star, twins[:, :count])
             is_reachable = (np.abs(twins[:, :count]) <= MAX_Z).all(axis=1)
@@ -335,8 +342,8 @@ class WavefrontSearch:
                 twin_modes = self._climb(fresh.star[is_reachable], twins[is_reachable])
                 fresh = join_modes([fresh, twin_modes])
             modes = [separate_modes(join_modes([*modes, fresh]))]
-            # The next round is for stars that are not explained, and for those that have got
-            # another mode with a probability above 1 %: there may be more.
+            # The next round is for stars that are not explained, and for stars with an additional
+            # mode of a probability above 1 %: there may be more.
             best_modes = modes[0].best_modes
             is_likely = modes[0].probability > 0.01
             likely_before = likely_modes
@@ -349,39 +356,39 @@ class WavefrontSearch:
     def _match_candidates(self, star: int, number: int, candidates: int, starts: int) -> np.ndarray:
         """Return the best candidates of a star in a round as starts, (at most `starts`, K + 4)."""
         optics = self.optics
-        # Candidates from the prior; the first one of all is its mean.
+        # Candidates from the prior; the very first one is the prior mean.
         rng = stream(self.seed, "wavefront", int(star), number)
         z = rng.standard_normal((candidates, optics.coefficient_count))
         z = np.clip(z, -MAX_Z, MAX_Z)
         if number == 0:
             z[0] = 0.0
-        # Match at most 100 of them at once, to bound the memory. The logarithm of the posterior
-        # is the gain by the star minus ½|z|²; each candidate has its best shift.
+        # Match at most 100 of them at once, to limit the memory. The logarithm of the posterior is
+        # the gain in log-likelihood minus ½|z|²; each candidate takes its best shift.
         parts = [self._match(star, part) for part in np.split(z, range(100, len(z), 100))]
         flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
         value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
         shift = value.argmax(axis=1)
-        ranked = np.argsort(-value.max(axis=1), kind="stable")[:starts]
+        best_rows = np.argsort(-value.max(axis=1), kind="stable")[:starts]
         if number == 0:
-            # The unit of flux, not below the noise of a pixel.
-            first_flux = flux[ranked[0], shift[ranked[0]]]
+            # Unit of flux, at least the noise of a pixel.
+            first_flux = flux[best_rows[0], shift[best_rows[0]]]
             self.flux[star] = max(first_flux, np.sqrt(self.photons.sky_counts[star]))
-        # There are 2 · search_px + 1 shifts along each axis. A window that begins later in the
-        # wide stamp shows the star earlier.
-        row, column = np.divmod(shift[ranked], 2 * optics.search_px + 1)
+        # There are 2 · search_px + 1 shifts along each axis. A window that begins at a higher index
+        # of the wide stamp shows the star at a lower index.
+        row, column = np.divmod(shift[best_rows], 2 * optics.search_px + 1)
         place = optics.search_px - np.stack([column, row], axis=1)
-        relative_flux = np.maximum(flux[ranked, shift[ranked]] / self.flux[star], 0.01)
-        return np.column_stack([z[ranked], place, relative_flux, np.zeros(ranked.size)])
+        relative_flux = np.maximum(flux[best_rows, shift[best_rows]] / self.flux[star], 0.01)
+        return np.column_stack([z[best_rows], place, relative_flux, np.zeros(best_rows.size)])
 
     def _match(self, star: int, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Fit the flux of candidates z (c, K) at S shifts; return it and its gain, (c, S).
 
-        The gain is that in log-likelihood over no star, with a free sky.
+        The gain is the increase in log-likelihood over a model without star, with a free sky.
         """
-        # Light of the star, its mean taken out: the sky is free.
+        # Light of the star minus its mean, because the sky is free.
         light = self.photons.counts[star] - self.photons.sky_counts[star]
-        used = np.isfinite(light)
-        light = light[used] - light[used].mean()
+        is_used = np.isfinite(light)
+        light = light[is_used] - light[is_used].mean()
         # All windows of a stamp's size in the wide images of the candidates.
         optics, side = self.optics, self.optics.stamp_px
         stars = np.full(len(z), star)
@@ -389,7 +396,7 @@ class WavefrontSearch:
         modes = optics.mode_coefficients(stars, coefficients, np.zeros((len(z), 2)))
         wide_stamps = self._wide_operator.stamps(modes).astype(np.float64)
         windows = np.lib.stride_tricks.sliding_window_view(wide_stamps, (side, side), axis=(1, 2))
-        image = windows.reshape(-1, side**2)[:, used]
+        image = windows.reshape(-1, side**2)[:, is_used]
         image -= image.mean(axis=1, keepdims=True)
         # Least squares: flux = p·d/p·p, and χ² falls by flux p·d/σ², with σ² the sky's counts.
         product = image @ light
@@ -398,11 +405,11 @@ class WavefrontSearch:
         return flux.reshape(len(z), -1), gain.reshape(len(z), -1)
 
     def _climb(self, star: np.ndarray, start: np.ndarray) -> StarModes:
-        """Follow starts (M, K + 4) of stars (M,) to modes."""
+        """Climb from starts (M, K + 4) of stars (M,) to modes."""
         optics, photons, k = self.optics, self.photons, self.optics.coefficient_count
         limit = np.array([MAX_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
-        # Normal priors of the coefficients, σ = 1, and of the place, σ = the stamp's side. A trace
-        # of information on flux and sky keeps all matrices regular.
+        # Normal priors of the coefficients, σ = 1, and of the position, σ = side of the stamp. A
+        # tiny information on flux and sky keeps all matrices regular.
         prior_variance = np.array([1.0] * k + [optics.stamp_px**2] * 2 + [np.inf] * 2)
         prior_information = np.maximum(1.0 / prior_variance, 1e-9)
         diagonal = range(k + 4)
@@ -413,7 +420,7 @@ class WavefrontSearch:
             modes = optics.mode_coefficients(stars, optics.coefficients(stars, z), place)
             directions = optics.terms.sd[stars][:, :, None] * optics.terms.to_modes[stars]
             stamps, slopes = optics.derivatives(modes, directions)
-            mean, slopes = self.expected_counts(stars, stamps, slopes, parameters[:, k:])
+            mean, slopes = self.predict_counts(stars, stamps, slopes, parameters[:, k:])
             deviance, score, information = poisson_information(photons.counts[stars], mean, slopes)
             score -= parameters / prior_variance
             information[:, diagonal, diagonal] += prior_information
@@ -425,8 +432,8 @@ class WavefrontSearch:
         deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
         return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
 
-    def _draw_parameters_of(self, modes: StarModes) -> np.ndarray:
-        """Draw from the posteriors of all stars that the modes belong to."""
+    def _draw_block(self, modes: StarModes) -> np.ndarray:
+        """Draw from the posteriors of all stars of the modes."""
         stars, optics, k = modes.best_modes.star, self.optics, self.optics.coefficient_count
 
         def twin(member: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -438,20 +445,20 @@ class WavefrontSearch:
             return np.concatenate([twin_z, parameters[:, k:]], axis=1), gain
 
         def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-            # Images are those at the limits where parameters are beyond.
+            # Outside of the limits, the image at the limit is used.
             star, place, reach = stars[member], parameters[:, k : k + 2], optics.reach_px
             coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
             modes = optics.mode_coefficients(star, coefficients, np.clip(place, -reach, reach))
             stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
-            # The likelihood alone; no derivatives are needed.
+            # Only the likelihood; derivatives are not needed.
             no_slopes = np.empty((len(star), 0, stamps.shape[1]))
-            mean, no_slopes = self.expected_counts(star, stamps, no_slopes, parameters[:, k:])
+            mean, no_slopes = self.predict_counts(star, stamps, no_slopes, parameters[:, k:])
             deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
             height = -0.5 * (deviance + self._prior_penalty(parameters))
-            # A star far from its stamp is impossible; a finite number keeps differences finite.
+            # A star far from its stamp is impossible; a finite value keeps differences finite.
             return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
 
-        # A random stream for each star: its draws do not depend on the other stars.
+        # A random stream for each star: its draws do not depend on other stars.
         owner = np.searchsorted(stars, modes.star)
         rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
         mixture = modes.parameters, modes.covariance, modes.evidence
@@ -460,35 +467,36 @@ class WavefrontSearch:
     def _prior_penalty(self, parameters: np.ndarray) -> np.ndarray:
         """Return −2 ln of the prior of parameters (m, K + 4), (m,).
 
-        Coefficients are normal with σ = 1; the place has a wide prior, σ = the stamp's side.
+        Coefficients are normal with σ = 1; the position has a wide prior, σ = side of the stamp.
         """
         k = self.optics.coefficient_count
         place = parameters[:, k : k + 2] / self.optics.stamp_px
         return np.asarray((parameters[:, :k] ** 2).sum(axis=1) + (place**2).sum(axis=1))
 
-    def expected_counts(
+    def predict_counts(
         self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, star_parameters: np.ndarray
     ) -> StampsAndSlopes:
         """Return expected counts (m, P), and their derivatives (m, k + 2, P).
 
-        Two derivatives are added: by flux and by sky.
+        Two derivatives are added: with respect to flux and sky.
 
         Parameters
         ----------
         star : ndarray of int, shape (m,)
+            Index of the star of each row.
         stamps, slopes : ndarray, shapes (m, P) and (m, k, P)
-            Stamps of light 1 and their derivatives by k parameters.
+            Stamps of light 1 and their derivatives with respect to k parameters.
         star_parameters : ndarray, shape (m, 4)
-            Place (x, y), flux and sky of each star, in the units of `StarModes`.
+            Position (x, y), flux and sky of each star, in the units of `StarModes`.
         """
         # μ = F f p + B + √B s, with the unit of flux F, the flux f and the sky s.
-        # The derivatives by flux and sky are F p and √B.
+        # The derivatives with respect to flux and sky are F p and √B.
         flux, sky = self.flux[star, None], self.photons.sky_counts[star, None]
         sky_slope = np.broadcast_to(np.sqrt(sky), stamps.shape)
         mean = flux * star_parameters[:, 2:3] * stamps + sky + sky_slope * star_parameters[:, 3:]
         slopes = slopes * (flux * star_parameters[:, 2:3])[:, None]
         slopes = np.concatenate([slopes, (flux * stamps)[:, None], sky_slope[:, None]], axis=1)
-        # No pixel is expected to have less than a hundredth of the sky: counts are divided by it.
+        # At least a hundredth of the sky in each pixel, because counts are divided by their mean.
         return np.maximum(mean, 0.01 * sky), slopes
 
 
@@ -499,12 +507,12 @@ def join_modes(parts: list[StarModes]) -> StarModes:
 
 
 def separate_modes(modes: StarModes) -> StarModes:
-    """Return the likely modes, each once, by star and from the best on.
+    """Return the likely modes without duplicates, sorted by star, the best mode first.
 
     Modes whose evidence is 12 below the best one of their star (6e-6 of its mass) are dropped.
     """
     is_likely = modes.evidence > group_maximum(modes.evidence, modes.star) - 12.0
-    # Modes of each star from the best on.
+    # Modes of each star in descending order of the evidence.
     separate: dict[int, list[int]] = {}
     order = np.lexsort((-modes.evidence, modes.star))
     for mode in order[is_likely[order]]:

@@ -10,19 +10,20 @@ from psfdae.sensing.stars import StarModes
 
 
 def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
-    """Return the number of the mode that is nearest to every draw by the Mahalanobis distance.
+    """Return the index of the mode that is nearest to every draw by the Mahalanobis distance.
 
     Parameters
     ----------
     draws : ndarray, shape (m, s, K + 4)
-        m draws for each of the s stars with modes: coefficients, place, flux and sky in the units
-        of `StarModes.parameters`.
+        s draws for each of the m stars with modes: coefficients, position, flux and sky in the
+        units of `StarModes.parameters`.
     modes : StarModes
+        Modes of these stars.
 
     Returns
     -------
     ndarray of int, shape (m, s)
-        Numbers from 0 among all modes.
+        Indices among all modes.
     """
     nearest = np.empty(draws.shape[:2], int)
     for row, star in enumerate(modes.best_modes.star):
@@ -47,16 +48,17 @@ def summarise_modes(
     mode_of_draw : ndarray of int, shape (m, s)
         Result of `nearest_modes`.
     modes : StarModes
+        Modes of the stars.
     prior_sigma : ndarray, shape (n, K)
         Standard deviation of the prior of all n stars, in waves.
 
     Returns
     -------
     dict of ndarray
-        `star` (M,), its number; `probability` (M,), the part of its draws; `mean` (M, K) and
+        `star` (M,), its index; `probability` (M,), the fraction of its draws; `mean` (M, K) and
         `covariance` (M, K, K) of the coefficients in waves.
     """
-    # Draws belong to the mode that is nearest; a mode without draws is left out.
+    # Draws belong to the nearest mode; a mode without draws is left out.
     k = coefficients.shape[-1]
     rows: list[tuple[Any, ...]] = []
     for row, star in enumerate(modes.best_modes.star):
@@ -64,7 +66,7 @@ def summarise_modes(
         numbers, count = np.unique(mode_of_draw[row], return_counts=True)
         for mode in numbers[np.argsort(-count, kind="stable")]:
             draws = coefficients[row, mode_of_draw[row] == mode]
-            # Too few draws have no useful covariance: that of the peak takes its place.
+            # Too few draws do not determine a covariance: the peak's covariance is used.
             if len(draws) > 2 * k:
                 covariance = np.atleast_2d(np.cov(draws, rowvar=False))
             else:

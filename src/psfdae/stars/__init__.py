@@ -1,1 +1,1 @@
-"""Stars before any model: their noise, moments, splits, and those bright enough to learn from."""
+"""Stars independent of any model: noise, moments, splits, and bright stars for a training."""

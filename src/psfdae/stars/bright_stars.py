@@ -1,7 +1,7 @@
-"""`BrightStars`: stars of an image that are bright enough to learn the PSF from.
+"""`BrightStars`: stars of an image that are bright enough to train a PSF model on.
 
-In: stamps and measurements of stars (`image.selection`), or a product "stars". Out: the same stars
-aligned, framed, or as places on which the PSF may depend.
+Inputs: stamps and measurements of stars (`image.selection`), or a product "stars". Outputs: the
+same stars aligned or cut to frames, and the coordinates on which the PSF may depend.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from psfdae.stars.moments import shift_stamps
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
     """Return instrumental magnitudes of fluxes in counts, which are taken to be positive."""
-    # m = −2.5 lg F; a flux of 0 gets the magnitude of the least one that is above it.
+    # m = −2.5 lg F; a flux of 0 gets a large, finite magnitude.
     return np.asarray(-2.5 * np.log10(np.maximum(flux, 1e-300)))
 
 
 def places(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Return x, y, magnitude and colour of stars, on which the PSF may depend, shape (n, 4)."""
+    """Return the coordinates on which the PSF may depend: x, y, magnitude and colour, (n, 4)."""
+    # Coordinates of one star in a row.
     return np.column_stack([position, magnitude(flux), colour])
 
 
@@ -38,24 +39,25 @@ class BrightStars:
     peak : ndarray of int, shape (n, 2)
         Brightest pixel (row, column) from index (s//2, s//2).
     centre, listed : ndarray, shape (n, 2)
-        Centroid, and centre by the star list, from the same index; NaN where unknown.
+        Centroid, and centre in the star list, from the same index; NaN where unknown.
     position : ndarray, shape (n, 2)
         (x, y) in the image, NaN where unknown.
     flux, noise : ndarray, shape (n,)
-        Flux inside the stamp, and RMS of the sky in a pixel, in counts.
+        Flux inside the stamp, and RMS of the sky noise in a pixel, in counts.
     snr : ndarray, shape (n,)
-        S/N by a filter matched to the star.
+        S/N of a filter matched to the star.
     row : ndarray of int, shape (n,)
         Row of the star list.
     colour : ndarray, shape (n,)
         Colour in the star list, NaN where there is none.
     bad : ndarray of bool, shape (n, s, s)
-        Pixels of `stamps` that were not measured, and have values of nearby stars; by default none.
+        Pixels of `stamps` that were not measured, filled by values of nearby stars; by default
+        none.
     defect_sigma : float
-        Depth of a defect below the sky in σ of the sky; deeper pixels are raised to that.
+        Largest depth of a defect below the sky in σ of the sky; deeper pixels are raised to it.
     min_sky, max_sky : float
-        Limits of the sky B in photons per pixel: the deepest pixel, B − `defect_sigma` √B, must not
-        be negative, and beside the largest sky the photons of no star matter.
+        Limits of the sky B in photons per pixel. The deepest pixel, B − `defect_sigma` √B, must not
+        be negative; compared with the largest sky, photons of stars are negligible.
     """
 
     defect_sigma: ClassVar[float] = 6.0
@@ -75,13 +77,14 @@ class BrightStars:
     bad: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
-        # Stars that were made without a mask were measured in all pixels.
+        """Replace a missing mask by one of measured pixels."""
+        # Without a mask, all pixels were measured.
         if self.bad.shape != self.stamps.shape:
             object.__setattr__(self, "bad", np.zeros(self.stamps.shape, dtype=bool))
 
     @classmethod
-    def of_product(cls, stars: Product) -> BrightStars:
-        """Read the bright stars of a product "stars" of an image, which has no centroids."""
+    def read(cls, stars: Product) -> BrightStars:
+        """Return the bright stars of a product "stars" of an image, without centroids."""
         names = ("peak", "position", "snr", "row", "listed", "flux", "colour", "bad")
         arrays = {name: stars[name] for name in names}
         # The product has stamps and noise of stars of flux 1.
@@ -91,39 +94,53 @@ class BrightStars:
         return cls(**arrays, centre=np.full(arrays["position"].shape, np.nan))
 
     @classmethod
-    def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
-        """Return several sets with the same margin as one."""
+    def concatenate(cls, several: Sequence[BrightStars]) -> BrightStars:
+        """Concatenate sets of stars whose stamps have the same margin."""
+        # Attribute by attribute, in the order of the fields.
         columns = ([getattr(stars, f.name) for stars in several] for f in fields(cls))
         return cls(*map(np.concatenate, columns))
 
     def __len__(self) -> int:
+        """Return the number of stars."""
         return len(self.stamps)
 
-    def of(self, selected: np.ndarray) -> BrightStars:
-        """Return some of the stars, by a mask or by indices."""
-        return BrightStars(*(getattr(self, f.name)[selected] for f in fields(self)))
+    def select(self, rows: np.ndarray) -> BrightStars:
+        """Return some of the stars, selected by a mask or by indices."""
+        # The same rows of every attribute.
+        return BrightStars(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @property
     def place(self) -> np.ndarray:
         """x, y, magnitude and colour, (n, 4); an unknown colour is the median of the others."""
-        # A colour that nobody knows should change the PSF as little as may be.
+        # The median of the known colours takes the place of an unknown one.
         has_colour = np.isfinite(self.colour)
         median = np.median(self.colour[has_colour]) if has_colour.any() else np.nan
         return places(self.position, self.flux, np.where(has_colour, self.colour, median))
 
     def area(self) -> np.ndarray:
         """Return the noise-equivalent area A = (F / (σ S/N))² of each star in pixels, (n,)."""
+        # The S/N of a matched filter is F / (σ √A).
         return np.asarray((self.flux / (self.noise * self.snr)) ** 2)
 
-    def aligned(self) -> np.ndarray:
-        """Return the stars with flux 1, moved to the common centre (s//2, s//2), (n, s, s)."""
+    def align(self) -> np.ndarray:
+        """Return the stars with flux 1, shifted to the common centre (s//2, s//2), (n, s, s)."""
+        # By splines, so that the shift need not be a whole number of pixels.
         return np.asarray(shift_stamps(self.stamps, -self.centre) / self.flux[:, None, None])
 
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
-        """Return the photons per pixel whose Poisson noise is that of the sky and of reading out.
+        """Return the photons per pixel whose Poisson noise equals sky and read noise together.
 
-        `gain` is in electrons per count; `otherwise` is the result where it is unknown. It is at
-        most `max_sky`, beside which the photons of no star matter.
+        Parameters
+        ----------
+        gain : float or None
+            Electrons per count, > 0; None where unknown.
+        otherwise : float
+            Result where the gain is unknown.
+
+        Returns
+        -------
+        float
+            Between `min_sky` and `max_sky` for a known gain.
         """
         # Variance in electrons², N = (σ gain)²: a Poisson variable of mean N has it.
         if gain is None:
@@ -131,13 +148,13 @@ class BrightStars:
         limits = self.min_sky**0.5, self.max_sky**0.5
         return float(np.clip(np.median(self.noise) * gain, *limits) ** 2)
 
-    def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
+    def cut_frames(self, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return frames (n, side, side) with the brightest pixel at index (side//2, side//2).
 
-        The second array is True for pixels that were measured. Pixels outside of the stamps are 0.
+        The second array is True for measured pixels. Pixels outside of the stamps are 0.
         """
-        # Rows and columns of each frame in stamps with a margin as wide as a frame, in which images
-        # are NaN and no pixel is bad.
+        # Rows and columns of each frame in padded stamps. The margin is as wide as a frame; in it
+        # images are NaN and no pixel is bad.
         margin = ((0, 0), (side, side), (side, side))
         start = side + self.stamps.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))

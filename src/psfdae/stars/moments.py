@@ -1,12 +1,12 @@
-"""Robust scatter, centroids, shifts by parts of a pixel, and sizes and shapes of PSFs.
+"""Robust scatter, centroids, sub-pixel shifts, and sizes and shapes of PSFs.
 
-In: stamps of stars, (n, s, s). Out: one value for each star, or shifted stamps.
+Inputs: stamps of stars, (n, s, s). Outputs: one value for each star, or shifted stamps.
 
 Sizes and shapes are the moments of a PSF under an elliptical Gaussian weight that is matched to
 them (Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the
 ellipse of the Gaussian that fits the PSF best. Unlike plain second moments they do
-not hang on the wings and the edge of the stamp, and unlike a contour at half the
-maximum they do not hang on a few pixels.
+not depend on the wings and the edge of the stamp, and unlike a contour at half the
+maximum they do not depend on a few pixels.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def robust_scatter(values: np.ndarray) -> np.ndarray:
 
 
 def count_step(values: np.ndarray) -> float:
-    """Return the step of pixels (m, n) in whole counts, if it is above a tenth of their scatter.
+    """Return the quantisation step of pixels (m, n), if it is above a tenth of their scatter.
 
-    It is the least difference of two values, whatever the unit; 0 where noise is wider, or pixels
-    are not in steps. Pixels that are not finite do not count.
+    The step is the smallest difference of two values, in the unit of the pixels. The result is 0
+    where the noise is wider or pixels are not quantised. Pixels that are not finite are ignored.
     """
-    # At most 2 million pixels, and the scatter of neighbours in a row, without their light.
+    # At most 2 million pixels. Differences of neighbours in a row hardly contain starlight.
     sample = values[:: len(values) * values.shape[1] // 2_000_000 + 1]
     distinct = np.unique(sample[np.isfinite(sample)])
     differences = np.diff(sample, axis=1)
@@ -47,12 +47,13 @@ def count_step(values: np.ndarray) -> float:
 
 
 def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
-    """Return pixels (…, m, n) with even noise of ± one step, and the variance of this noise.
+    """Return pixels (…, m, n) with uniform noise of ± one step, and the variance of this noise.
 
-    Medians of whole counts are whole, whatever the level and the scatter of the sky. With this
-    noise, which is always the same, medians, modes and clipped deviations are within 0.2 σ of those
-    of the pixels before they were rounded, from a noise of 0.3 steps on.
+    The median of whole counts is a whole number, whatever the level and the scatter of the sky.
+    With this noise, which is the same in every call, medians, modes and clipped deviations differ
+    by less than 0.2 σ from their values before rounding, for a noise of 0.3 steps or more.
     """
+    # Values that are not quantised need no noise.
     if not step:
         return values, 0.0
     noise = np.random.default_rng(0).uniform(-step, step, values.shape[-2:])
@@ -60,7 +61,8 @@ def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
 
 
 def remove_dither(sigma: np.ndarray, variance: float) -> np.ndarray:
-    """Return σ of dithered pixels without the variance of `dither`; rounding remains, a quarter."""
+    """Return σ of dithered pixels without the variance of `dither`, but for its rounding part."""
+    # The variance of rounding, step²/12, is a quarter of the dither's, step²/3, and remains.
     return np.sqrt(np.maximum(sigma**2 - variance, variance / 4.0)) if variance else sigma
 
 
@@ -69,7 +71,7 @@ def shift_stamps(
 ) -> np.ndarray:
     """Return stamps shifted by cubic splines, their edge pixels repeated outside.
 
-    A star with a FWHM of 3 px gets a mean squared error of 1e-8.
+    The mean squared error is 1e-8 for a star of flux 1 with a FWHM of 3 px.
 
     Parameters
     ----------
@@ -87,36 +89,36 @@ def shift_stamps(
     """
     from scipy import ndimage
 
-    # A margin of 12 px, beyond which an edge has no influence on a spline inside.
+    # Edges farther than a margin of 12 px have no influence on a spline inside.
     side, margin = stamps.shape[-1], 12
-    # Each stamp has one set of splines, however often it is shifted.
+    # One set of splines per stamp, however often the stamp is shifted.
     stamp = np.arange(len(stamps)) if stamp is None else stamp
-    used, stamp = np.unique(stamp, return_inverse=True)
+    sources, stamp = np.unique(stamp, return_inverse=True)
     # Coefficients of the splines through the pixels of each stamp.
-    splines = np.pad(stamps[used], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
+    splines = np.pad(stamps[sources], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
     for axis in (1, 2):
         splines = ndimage.spline_filter1d(splines, 3, axis, mode="nearest")
     # The pixels of a shifted stamp lie at −shift among the knots. With coefficients c and matrices
     # R, C of the splines at the rows and columns of these pixels, their values are R c Cᵀ. 256
     # stamps at a time limit the memory.
-    shifted, knots = np.empty((len(stamp), side, side)), side + 2 * margin
+    shifted_stamps, knots = np.empty((len(stamp), side, side)), side + 2 * margin
     pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
     for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
         place = np.clip(pixels - shift[part, :, None], -farthest, farthest)
         rows, columns = cubic_splines(place, knots, 1.0).swapaxes(0, 1)
-        shifted[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
-    return shifted
+        shifted_stamps[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
+    return shifted_stamps
 
 
 def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
-    """Return the values of cubic B-splines at some places, or their slopes.
+    """Return the values of cubic B-splines at some positions, or their slopes.
 
     Parameters
     ----------
     place : ndarray, shape (…)
-        Places in pixels.
+        Positions in pixels.
     knots : int
-        Number of equidistant knots, in the middle of which place 0 lies.
+        Number of equidistant knots; position 0 lies in their middle.
     spacing : float
         Distance of two knots in pixels.
     slope : bool
@@ -125,26 +127,27 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
     Returns
     -------
     ndarray, shape (…, knots)
+        Value or slope of the spline of every knot.
     """
-    # At a part t of the way from one knot to the next, only the two knots on each side count: the
-    # cubic B-spline is ((1−t)³, 4 − 3t²(2−t), 4 − 3(1−t)²(1+t), t³)/6 there (de Boor 1978, A
-    # Practical Guide to Splines).
+    # At a fraction t of the way from one knot to the next, only the splines of two knots on each
+    # side are not 0: the cubic B-spline is ((1−t)³, 4 − 3t²(2−t), 4 − 3(1−t)²(1+t), t³)/6 there
+    # (de Boor 1978, A Practical Guide to Splines).
     knot_place = place / spacing + (knots - 1) / 2
     first = np.floor(knot_place)
     t = knot_place - first
     if slope:
-        # Their derivatives by the place.
+        # Their derivatives with respect to the position.
         values = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
         scale = spacing
     else:
         u = 1 - t
         values = (u**3, 4 - 3 * t**2 * (1 + u), 4 - 3 * u**2 * (1 + t), t**3)
         scale = 6.0
-    # Four more knots on each side take the values at knots that do not exist; they are cut off.
+    # Four more knots on each side hold values of knots that do not exist; they are cut off.
     count = knots + 8
     matrix = np.zeros((*place.shape, count))
     knot = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
-    # Index of the first of the four knots of each place, all knots in one row.
+    # Index of the first of the four knots of each position, all knots in one row.
     index = np.arange(place.size).reshape(place.shape) * count + knot + 3
     for number, value in enumerate(values):
         matrix.reshape(-1)[index + number] = value / scale
@@ -152,15 +155,15 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
-    """Return matrices (n, s, s) that shift the pixels of an axis by n steps; 0 beyond its ends."""
+    """Return matrices (n, s, s) that shift the pixels of an axis by n steps; 0 outside."""
     from scipy import ndimage
 
-    # Each pixel alone, shifted: a column of the matrix.
+    # A shifted image of a single pixel is a column of the matrix.
     impulses = np.eye(side)
     return np.array([ndimage.shift(impulses, (step, 0.0), order=3) for step in steps])
 
 
-def windowed_centres(
+def find_centroids(
     stamps: np.ndarray, start: np.ndarray, window_px: np.ndarray, rounds: int, reach_px: float
 ) -> np.ndarray:
     """Return centroids under a Gaussian window that follows the star (SExtractor's XWIN, YWIN).
@@ -172,18 +175,18 @@ def windowed_centres(
     start : ndarray, shape (n, 2)
         First estimate (row, column) from index (s//2, s//2).
     window_px : ndarray, shape (n,)
-        σ of the window, about that of the star.
+        σ of the window in pixels, similar to the star's.
     rounds : int
-        Number of iterations; each leaves less than a fifth of the distance.
+        Number of iterations; each reduces the distance to less than a fifth.
     reach_px : float
-        Greatest distance from the start, per axis.
+        Largest distance from the start, per axis, in pixels.
 
     Returns
     -------
     ndarray, shape (n, 2)
         (row, column) from index (s//2, s//2).
     """
-    # A Gaussian window is the product of one along rows and one along columns.
+    # A Gaussian window is a product of Gaussians along rows and along columns.
     axis = np.arange(stamps.shape[-1]) - stamps.shape[-1] // 2
     centre = start.astype(np.float64)
     for _ in range(rounds):
@@ -206,12 +209,11 @@ class Shapes:
     Attributes
     ----------
     fwhm_px : ndarray, shape (n,)
-        2 √(2 ln 2) · |M|^¼ of the moments M, in pixels; the pixel itself is in it.
+        2 √(2 ln 2) · |M|^¼ of the moments M, in pixels; it includes the width of the pixel.
     ellipticity : ndarray, shape (n,)
         1 − b/a of the axes of the ellipse.
     position_angle_deg : ndarray, shape (n,)
-        Angle of the major axis, from the columns' direction (+x) towards that of the
-        rows (+y), −90 … 90.
+        Angle of the major axis from +x (columns) towards +y (rows), −90 … 90.
     """
 
     fwhm_px: np.ndarray
@@ -220,7 +222,7 @@ class Shapes:
 
 
 def measure_shapes(psf: np.ndarray) -> Shapes:
-    """Return shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
+    """Return shapes of PSFs (n, d, d) of any flux; negative pixels are set to 0."""
     # The eigenvalues of the moments are (M_xx + M_yy ± spread)/2, the squares of the semi-axes.
     # With spread² = (M_xx − M_yy)² + 4 M_xy², the ratio of the squared axes gives b/a, and the
     # direction of the major axis is ½ atan2(2 M_xy, M_xx − M_yy). |M|^¼ is σ of a round Gaussian
@@ -243,7 +245,7 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     count, side = len(psf), psf.shape[-1]
     light = np.maximum(psf.reshape(count, -1), 0.0).astype(np.float32)
     peak = light.max(axis=1, initial=0.0)
-    # PSFs without light are replaced by flat ones, and are NaN in the end.
+    # PSFs without light are replaced by flat ones here, and become NaN at the end.
     lit = np.isfinite(peak) & (peak > 0)
     light /= np.where(lit, peak, 1.0)[:, None]
     light[~lit] = 1.0
@@ -254,19 +256,19 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     ).astype(np.float32)
     # Unweighted moments to start with.
     x, y, moments = _centre_and_moments(light @ terms.T)
-    moments = _bounded(*moments, side)
-    weighted = np.empty_like(light)
+    moments = _bound_moments(*moments, side)
+    weighted_light = np.empty_like(light)
     # A Gaussian needs two updates of the weight, the most aberrated PSF 30 for 1e-4.
     for _ in range(16):
-        # Moments under a weight a little wider than the PSF, by 0.5 px² of variance because narrow
-        # PSFs fall between pixels; then those of the Gaussian that would have them.
+        # Moments under a weight that is wider than the PSF by 0.5 px² of variance, because narrow
+        # PSFs fall between pixels; from them, the moments of the Gaussian without the weight.
         weight = (moments[0] + 0.5, moments[1], moments[2] + 0.5)
-        np.matmul(_exponent(x, y, *weight), terms, out=weighted)
-        np.exp(weighted, out=weighted)
-        weighted *= light
-        x1, y1, weighted_moments = _centre_and_moments(weighted @ terms.T)
-        moments = _bounded(*_without_weight(weighted_moments, weight), side)
-        centre = _without_weight_centre(x, y, x1, y1, weighted_moments, moments)
+        np.matmul(_exponent(x, y, *weight), terms, out=weighted_light)
+        np.exp(weighted_light, out=weighted_light)
+        weighted_light *= light
+        x1, y1, apparent = _centre_and_moments(weighted_light @ terms.T)
+        moments = _bound_moments(*_correct_moments(apparent, weight), side)
+        centre = _correct_centre(x, y, x1, y1, apparent, moments)
         x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in centre)
     return np.where(lit, np.array(moments), np.nan)
 
@@ -283,34 +285,34 @@ def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matri
     return x, y, (xx - x * x, xy - x * y, yy - y * y)
 
 
-def _without_weight(weighted: Matrix, weight: Matrix) -> Matrix:
-    """Return the moments T + T(W − T)⁻¹T of the Gaussian that has T under the weight W.
+def _correct_moments(apparent: Matrix, weight: Matrix) -> Matrix:
+    """Return the moments T + T(W − T)⁻¹T of the Gaussian with moments T under the weight W.
 
-    Twice the moments T where no Gaussian does: the PSF is flat.
+    The result is 2 T where no such Gaussian exists, because the PSF is flat.
     """
     # Elements of W − T, and T (W − T)⁻¹ T written out.
-    a, b, c = (w - t for w, t in zip(weight, weighted, strict=True))
+    a, b, c = (w - t for w, t in zip(weight, apparent, strict=True))
     determinant = a * c - b * b
     gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
     determinant = np.where(gaussian, determinant, 1.0)
-    xx, xy, yy = weighted
+    xx, xy, yy = apparent
     correction = (
         (xx * xx * c - 2.0 * xx * xy * b + xy * xy * a) / determinant,
         (xx * xy * c - (xx * yy + xy * xy) * b + xy * yy * a) / determinant,
         (xy * xy * c - 2.0 * xy * yy * b + yy * yy * a) / determinant,
     )
-    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(weighted, correction, strict=True))
+    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(apparent, correction, strict=True))
     return xx, xy, yy
 
 
-def _without_weight_centre(
-    x: np.ndarray, y: np.ndarray, x1: np.ndarray, y1: np.ndarray, weighted: Matrix, moments: Matrix
+def _correct_centre(
+    x: np.ndarray, y: np.ndarray, x1: np.ndarray, y1: np.ndarray, apparent: Matrix, moments: Matrix
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the centre c + M T⁻¹ (c₁ − c) of a Gaussian of moments M.
 
     Its centre under a weight about c is c₁ = (x1, y1), with the moments T = `weighted`.
     """
-    xx, xy, yy = weighted
+    xx, xy, yy = apparent
     # (u, v) = T⁻¹ (c₁ − c).
     determinant = np.maximum(xx * yy - xy * xy, 1e-12)
     u = (yy * (x1 - x) - xy * (y1 - y)) / determinant
@@ -318,8 +320,8 @@ def _without_weight_centre(
     return x + moments[0] * u + moments[1] * v, y + moments[1] * u + moments[2] * v
 
 
-def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
-    """Return moments between those of a pixel and of a stamp, of an ellipse with real axes."""
+def _bound_moments(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
+    """Limit moments to the range from a pixel to the stamp, and to ellipses with real axes."""
     # The variance of a pixel of side 1 is 1/12 ≈ 0.08 px² along an axis.
     xx, yy = (np.clip(variance, 0.08, (0.5 * side) ** 2) for variance in (xx, yy))
     limit = 0.99 * np.sqrt(xx * yy)

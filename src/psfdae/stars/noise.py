@@ -1,10 +1,10 @@
 """Photon noise of a star on a bright sky.
 
-In: noise-free PSFs of sum 1, (n, d, d), and noise levels. Out: variances and noisy images of
-pixels; for bright stars, the noise in the scatter of their images.
+Inputs: noise-free PSFs of sum 1, (n, d, d), and noise levels. Outputs: variances of pixels and
+noisy images; for bright stars, the contribution of noise to the scatter of their images.
 
-The paper's noise level λ is the RMS of a flux-normalised image's pixels up to
-a factor, σ = κλ, and larger for smaller stars. A star of flux F photons on a
+The paper's noise level λ is the RMS of the pixels of a flux-normalised image up to
+a factor, σ = κλ, and larger for fainter stars. A star of flux F photons on a
 sky of B photons per pixel gives exactly that,
 
     n ~ Poisson(F p + B),   image = (n − B) / F,   F = √B / (κ λ),
@@ -26,7 +26,7 @@ from psfdae.stars.moments import moving_matrices
 class NoiseModel:
     """Background-limited photon noise.
 
-    Noise-free images `psf` sum to 1; a noise level λ is a number or one per star.
+    Noise-free images `psf` sum to 1; a noise level λ is a number, or an array with one per star.
 
     Attributes
     ----------
@@ -58,22 +58,27 @@ class NoiseModel:
         Parameters
         ----------
         psf : ndarray, shape (B, ...)
+            Noise-free images of sum 1.
         level : float or ndarray, shape (B,)
+            Noise level λ, > 0, of all images or of each.
+        rng : Generator
+            Source of the photon counts.
 
         Returns
         -------
         ndarray, shape (B, ...), float32
+            Noisy images.
         """
         # n ~ Poisson(F p + B), and the image (n − B)/F.
         flux = _per_image(self.flux(level), psf)
-        # A pixel of a measured star may lie so far below the sky that no rate of photons is left.
+        # A pixel of a real star may lie so far below the sky that the rate would be negative.
         photons = rng.poisson(np.maximum(flux * psf + self.background, 0.0))
         return np.asarray((photons - self.background) / flux, np.float32)
 
     def draw_gaussian(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
     ) -> np.ndarray:
-        """Draw images with Gaussian noise of the same variance as `draw`, for training only.
+        """Draw images as `draw` does, but with Gaussian noise of the same variance; for training.
 
         With 1e4 photons of sky in a pixel the two distributions differ by 1 % in skewness,
         and the draw takes a tenth of the time.
@@ -91,17 +96,18 @@ def _per_image(values: np.ndarray | float, psf: np.ndarray) -> np.ndarray:
     return np.broadcast_to(values, len(psf)).reshape(-1, *[1] * (psf.ndim - 1))
 
 
-def mixed_levels(levels: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw a noise level λ of a band for each of `count` stars, shape (count,)."""
+def draw_levels(levels: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw one of the noise levels λ of a band for each of `count` stars, shape (count,)."""
+    # Each level with the same probability.
     return levels[rng.integers(levels.size, size=count)]
 
 
 def noise_equivalent_px(psf: np.ndarray) -> float:
     """Return the noise-equivalent area A = 1/Σp² in pixels of a PSF p of sum 1.
 
-    (King 1983, PASP 95, 163.) For several PSFs, shape (n, d, d), it is that of their mean Σp². The
-    mean of their images would be wider than each of them, because they lie at different places in
-    their stamps.
+    (King 1983, PASP 95, 163.) For several PSFs, shape (n, d, d), it follows from the mean of their
+    Σp². The mean of the images would be wider than each image, because the stars have different
+    positions in their stamps.
     """
     # n/Σp² over all images is 1 over the mean of Σp².
     count = len(psf) if psf.ndim == 3 else 1
@@ -110,16 +116,16 @@ def noise_equivalent_px(psf: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class OwnNoise:
-    """Noise of bright stars in images of them that were shifted to a common centre.
+    """Noise of bright stars in images that were shifted to a common centre.
 
     Attributes
     ----------
     noise : ndarray, shape (n,)
-        RMS of the sky in a pixel over the flux, of every image before it was shifted.
+        RMS of the sky noise in a pixel over the flux, for every image before its shift.
     background : float
         Sky level in photons per pixel.
     phase : ndarray, shape (n, 2)
-        Part of a pixel by which the image was shifted.
+        Fraction of a pixel by which the image was shifted, along rows and columns.
     star : ndarray of int, shape (n,)
         Star of every image; its images share their noise.
     """
@@ -130,11 +136,11 @@ class OwnNoise:
     star: np.ndarray
 
     def __call__(self, images: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Return what noise adds to the scatter of images about their mean, shape (P, P).
+        """Return the contribution of noise to the scatter of images about their mean, (P, P).
 
-        Splines mix neighbouring pixels, along rows and columns alike, and dividing by the
-        sum takes noise along the star away. Pixels have the variance of the sky and of the
-        star's photons (`NoiseModel`), these of the mean image.
+        Splines correlate neighbouring pixels along rows and columns, and the division by the
+        sum removes noise along the star. Pixels have the variance of the sky and of the photons
+        of the mean star (`NoiseModel`).
 
         Parameters
         ----------
@@ -143,14 +149,14 @@ class OwnNoise:
         mean : ndarray, shape (P,)
             Mean of these images, of sum 1.
         """
-        # The mean has its own share of each star's noise, which is no scatter about it.
+        # The mean contains a share of the noise of each star, which is no scatter about the mean.
         _, star, count = np.unique(self.star[images], return_inverse=True, return_counts=True)
         part = 1.0 - count[star] / images.size
         noise, side = self.noise[images], round(mean.size**0.5)
         sky = part * noise**2
-        # Correlation of pixels: that of shifted white noise, averaged over the images' shifts, for
-        # pairs of pixels (a, c) along rows and (b, d) along columns.
-        along = shifted_noise(side)
+        # Correlation of pixels: covariance of shifted white noise, averaged over the shifts of the
+        # images, for pairs of pixels (a, c) along rows and (b, d) along columns.
+        along = compute_shifted_noise(side)
         phases = len(along)
         place = np.rint(2 * (phases - 1) * np.abs(self.phase[images])).astype(int)
         share = np.zeros((phases, phases))
@@ -160,18 +166,19 @@ class OwnNoise:
         photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
         rms = np.sqrt(sky.sum() + photons)
         covariance = pairs.reshape(mean.size, mean.size) * rms * rms[:, None]
-        # Images have the sum 1: x − Σx m has lost the noise along the mean m.
+        # Images have the sum 1: x − Σx m has no noise along the mean m.
         projection = np.eye(mean.size) - mean[:, None]
         return np.asarray(projection @ covariance @ projection.T)
 
 
 @cache
-def shifted_noise(side: int, phases: int = 17) -> np.ndarray:
-    """Return the covariance of white noise along an axis that splines shift, (phases, d, d).
+def compute_shifted_noise(side: int, phases: int = 17) -> np.ndarray:
+    """Return the covariance of white noise after a shift by splines, (phases, d, d).
 
-    Shifts are 0 … ½ pixel. The axis is the middle third of a longer one, so that no edge counts.
+    Shifts are 0 … ½ pixel along one axis. The d pixels are the middle third of a longer axis, so
+    that its ends have no influence.
     """
     moving = moving_matrices(3 * side, np.linspace(0.0, 0.5, phases))
-    # A matrix M makes noise of covariance M Mᵀ of white noise.
+    # A matrix M turns white noise into noise of covariance M Mᵀ.
     rows = moving[:, side : 2 * side]
     return np.asarray(rows @ rows.transpose(0, 2, 1))

@@ -1,6 +1,6 @@
 """Parts of a set of stars for training, validation and test, and random centring errors.
 
-In: numbers or field points of stars, and a seed. Out: indices of the stars of each part.
+Inputs: numbers or field points of stars, and a seed. Outputs: indices of the stars of each part.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def draw_jitter(count: int, jitter_px: int, rng: np.random.Generator) -> np.ndar
 
 
 def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw the sub-pixel place of every star (row, column), uniform in ± ½ pixel."""
+    """Draw the sub-pixel position of every star (row, column), uniform in ± ½ pixel."""
     return rng.uniform(-0.5, 0.5, size=(count, 2))
 
 
@@ -37,8 +37,8 @@ class Split:
 
 
 def random_split(count: int, train: int, test: int, validation_fraction: float, seed: int) -> Split:
-    """Split stars at random, as in the paper: training has stars of every test star's field."""
-    # Of the stars in random order: validation, the rest of the training, then the test.
+    """Split stars at random, as in the paper: training and test have stars of the same fields."""
+    # Stars in random order: validation, the rest of the training, then the test.
     order = stream(seed, "split", "random").permutation(count)
     validation_count = round(validation_fraction * train)
     return Split(
@@ -59,6 +59,7 @@ def held_out_fields(grid: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray of bool, shape (F,)
+        True for about a fifth of the fields.
     """
     return np.asarray((grid[:, 0] + 2 * grid[:, 1]) % 5 == 1)
 
@@ -68,8 +69,8 @@ def held_out_split(
 ) -> Split:
     """Split stars by whole fields: the test part is all stars of `held_out_fields`.
 
-    Validation takes whole fields of the others, too, so that it asks the same
-    question as the test.
+    The validation part is whole fields of the others, so that it measures the same
+    generalisation as the test.
 
     Parameters
     ----------
@@ -77,6 +78,10 @@ def held_out_split(
         Field of every star.
     grid : ndarray of int, shape (F, 2)
         (ix, iy) of every field.
+    validation_fraction : float
+        Fraction of the training fields that are for validation, 0 … 1.
+    seed : int
+        Seed of the random order of the fields, ≥ 0.
     """
     # Fields of the test, and the other ones in random order.
     test_field = held_out_fields(grid)

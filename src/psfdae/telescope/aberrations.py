@@ -2,9 +2,9 @@
 
 They are given as Seidel terms, as Zernike terms over the field, or by a ray trace of the surfaces
 of a prescription. All are OPDs in waves of the telescope's wavelength; lengths of a prescription
-are in metres. `psfdae.telescope.field` turns them into coefficients at the field angles of stars.
+are in metres. `psfdae.telescope.field` converts them to coefficients at the field angles of stars.
 
-A ValueError of a check becomes a line of a ConfigError, which names the key.
+A ValueError of a check becomes a line of a ConfigError that names the key.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ Resonances = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
 class OmitsLateKeys(Group):
-    """Group some of whose keys came after its first products.
+    """Group with keys that were added after its first products.
 
-    These keys are left out of products while they have their default: products of telescopes that
-    do not use them keep their bytes.
+    These keys are left out of products while they have their default, so that products of
+    telescopes that do not use them keep their bytes.
     """
 
     late_keys: ClassVar[tuple[str, ...]] = ()
@@ -57,7 +57,7 @@ class OmitsLateKeys(Group):
     @model_serializer(mode="wrap")
     def omit_late_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the group as a tree, without late keys that have their default."""
-        # A key that has its default says nothing that readers would not assume.
+        # Readers assume the default of a key that is absent.
         fields = type(self).model_fields
         return {
             key: value
@@ -109,7 +109,7 @@ class Lens(Group):
 
     @model_validator(mode="after")
     def check_thickness(self) -> Lens:
-        """Refuse a lens whose back is not below its front."""
+        """Raise ValueError if the back of a lens is not below its front."""
         # z points to the sky, and light comes down: it meets the front above the back.
         thickness = self.front_vertex_m - self.back_vertex_m
         if not thickness > 0:
@@ -132,8 +132,8 @@ class Glass(Group):
 class Prescription(Group):
     """Optical design: one or two mirrors, and lenses behind the second; z up, light along −z.
 
-    Without a secondary the light is focused above the primary. A flat mirror that folds it,
-    as in a Newtonian, is left out: it is nothing but the telescope's obscuration.
+    Without a secondary the light is focused above the primary. A flat mirror that folds the beam,
+    as in a Newtonian, is left out: it only obscures the pupil.
     """
 
     name: Name
@@ -165,7 +165,7 @@ class Prescription(Group):
 
     @model_validator(mode="after")
     def check_path(self) -> Prescription:
-        """Refuse lenses without a secondary or a glass, and surfaces in a wrong order."""
+        """Raise ValueError for lenses without secondary or glass, or a wrong order of surfaces."""
         # Lenses need a secondary in front of them, and a glass.
         if self.lenses and self.secondary is None:
             raise ValueError(f"lenses = {list(self.lenses)}: must lie behind a secondary")
@@ -196,7 +196,7 @@ class Prescription(Group):
 class Seidel(Group):
     """Static third-order aberrations in waves at H = 1, the edge of the field on an axis.
 
-    The wavefront is that of `psfdae.optics.wavefronts`, a polynomial of pupil and field.
+    The wavefront is a polynomial of pupil and field (`psfdae.optics.wavefronts`).
     """
 
     kind: Literal["seidel"]
@@ -220,17 +220,17 @@ class Seidel(Group):
 
 
 def as_polynomial(term: Any) -> Any:
-    """Return a bare number as the term that is the same over the whole field."""
+    """Return a plain number as a term that is constant over the field."""
     return {"constant": term} if isinstance(term, int | float) else term
 
 
 def check_powers(term: dict[str, float]) -> dict[str, float]:
-    """Return a term whose keys are products of x and y, in this order, up to the sixth degree.
+    """Return a term if its keys are products of x and y, in this order, up to the sixth degree.
 
     Raises
     ------
     ValueError
-        For a key that is no such product; `constant` is the product of no factors.
+        For another key; `constant` is the product of no factors.
     """
     # x*y* alone would match the empty text, hence the look-ahead.
     for name in term:
@@ -242,12 +242,12 @@ def check_powers(term: dict[str, float]) -> dict[str, float]:
 
 
 def check_noll(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Return terms whose names are Zernike polynomials, z2 to the highest.
+    """Return terms if their names are Zernike polynomials, z2 to the highest.
 
     Raises
     ------
     ValueError
-        For another name; z1 is piston, which no image shows.
+        For another name; z1 is piston, which does not change an image.
     """
     for name in terms:
         # One or two digits, without a leading zero: a term has one name only.
@@ -277,7 +277,7 @@ class Zernike(Group):
     terms: Annotated[dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(check_noll)]
     """Waves RMS by Noll index and power of the field: z8: {constant: 0.1, x: 0.3, xyy: 0.02}."""
     jitter_waves: Jitter = 0.0
-    """Standard deviation of what is added to every term of each star."""
+    """Standard deviation of a random addition to every term of each star."""
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -297,8 +297,8 @@ class Zernike(Group):
 class Raytraced(OmitsLateKeys):
     """Aberrations of a telescope that a ray trace computes (batoid).
 
-    The telescope may be out of focus, and its secondary misaligned. The trace is that of
-    `psfdae.telescope.raytracing`.
+    The telescope may be out of focus, and its secondary misaligned. `psfdae.telescope.raytracing`
+    traces the rays.
     """
 
     late_keys = ("decentre_m", "tilt_deg")
@@ -314,7 +314,7 @@ class Raytraced(OmitsLateKeys):
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = 22
     """Highest Noll index of the wavefront."""
     jitter_waves: Jitter = 0.0
-    """Standard deviation of what is added to every term of each star."""
+    """Standard deviation of a random addition to every term of each star."""
 
     @property
     def misalignment(self) -> np.ndarray:
@@ -324,8 +324,8 @@ class Raytraced(OmitsLateKeys):
 
     @model_validator(mode="after")
     def check_secondary(self) -> Raytraced:
-        """Refuse a misalignment of a secondary that is not there."""
-        # The primary, with the detector, is the frame of all coordinates: it stays.
+        """Raise ValueError for a misalignment without a secondary."""
+        # The primary, with the detector, is the frame of all coordinates: it cannot move.
         if self.prescription.secondary is None and self.misalignment.any():
             raise ValueError(
                 f"decentre_m = {list(self.decentre_m)}, tilt_deg = {list(self.tilt_deg)}: "

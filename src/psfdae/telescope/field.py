@@ -1,12 +1,12 @@
-"""Aberrations of a telescope over its field: their static values, their prior, and their cause.
+"""Aberrations of a telescope over its field: static values, prior, and common parameters.
 
 The aberrations of a star are the coefficients of some terms of its wavefront. Tilts are left out:
-they move the star, whose place is not known better than its image tells. All stars follow from a
-few numbers of the telescope, such as the decentre of its secondary mirror.
+they move the star, and its position is only known from its image. The aberrations of all stars
+depend on a few numbers of the telescope, such as the decentre of its secondary mirror.
 
-In: the settings of a telescope (`psfdae.telescope.settings`) and field angles of stars. Out:
-`Terms`, the prior of each star by itself, and `TelescopeModel`, the numbers that are common to
-all stars, with their prior. `psfdae.sensing` measures both.
+Inputs: the settings of a telescope (`psfdae.telescope.settings`) and field angles of stars.
+Outputs: `Terms`, the prior of each single star, and `TelescopeModel`, the numbers that are common
+to all stars, with their prior. `psfdae.sensing` measures both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from psfdae.base.errors import needed_by
+from psfdae.base.errors import require_extra
 from psfdae.base.settings import ConfigError
 from psfdae.optics.wavefronts import (
     FIRST_NOLL,
@@ -43,6 +43,7 @@ class Terms:
     Attributes
     ----------
     names : tuple of str, length K
+        Names of the terms, such as "coma" or "z7".
     modes : PupilModes
         J modes of the pupil.
     to_modes : ndarray, shape (n, K, J)
@@ -50,8 +51,8 @@ class Terms:
     mean, sd : ndarray, shape (n, K)
         Mean and standard deviation of the coefficients of each star, in waves.
     is_even : ndarray of bool, shape (K,)
-        True for terms that are the same at opposite points of the pupil. A wavefront whose even
-        part has the other sign has the same image.
+        True for terms that are equal at opposite points of the pupil. A wavefront whose even part
+        has the opposite sign has the same image.
     """
 
     names: tuple[str, ...]
@@ -76,8 +77,9 @@ def static_zernikes(
     Parameters
     ----------
     telescope : OwnTelescope
+        Telescope with Zernike or ray-traced aberrations.
     angle_deg : ndarray, shape (n, 2)
-        Field angles (x, y).
+        Field angles (x, y) in degrees.
 
     Returns
     -------
@@ -91,7 +93,7 @@ def static_zernikes(
     RayTracingError
         If the ray trace of a field is vignetted.
     MissingExtraError
-        If a ray trace is asked for and batoid is not installed.
+        If the aberrations are ray-traced and batoid is not installed.
     """
     aberrations = telescope.aberrations
     if isinstance(aberrations, Zernike):
@@ -99,7 +101,7 @@ def static_zernikes(
         field = relative_field(telescope, angle_deg)
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
     assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
-    # The ray trace of the telescope as its file states it.
+    # Ray trace of the telescope of the file.
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
     defocus_m, misalignment = aberrations.defocus_m, aberrations.misalignment
     return noll, trace_zernikes(telescope, angle_deg, defocus_m, misalignment)
@@ -115,8 +117,9 @@ def trace_zernikes(
     telescope : OwnTelescope
         Telescope with a prescription.
     angle_deg : ndarray, shape (n, 2)
+        Field angles (x, y) in degrees.
     defocus_m : float
-        Distance of the detector beyond best focus.
+        Distance of the detector behind best focus in metres.
     misalignment : ndarray, shape (4,)
         Decentre x, y in metres and tilt about x, y in radians of the secondary.
 
@@ -131,17 +134,17 @@ def trace_zernikes(
 
     aberrations = telescope.aberrations
     assert isinstance(aberrations, Raytraced)
-    # batoid is an extra: the message says which telescope needs it.
-    with needed_by(f"{telescope.name}: a ray trace"):
+    # batoid is an extra: the message names the telescope that needs it.
+    with require_extra(f"{telescope.name}: a ray trace"):
         optic = build_optic(aberrations.prescription, telescope, defocus_m)
     field_rad, highest = np.deg2rad(angle_deg), aberrations.highest_zernike
     tracer = ZernikeTracer(optic, telescope.wavelength_m, field_rad, highest)
-    # The trace counts the lead of the wavefront, an OPD its delay.
+    # The trace is positive where the wavefront leads, an OPD where it lags.
     return np.asarray(-tracer(misalignment[None])[0])
 
 
-def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
-    """Return the terms of stars at field angles (n, 2) in degrees, with the telescope's prior.
+def build_terms(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
+    """Return the terms of stars at field angles (n, 2) in degrees, with the prior of the telescope.
 
     Raises
     ------
@@ -173,10 +176,10 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
         names = tuple(f"z{j}" for j in noll)
         to_modes = np.broadcast_to(np.eye(len(noll)), (len(mean), len(noll), len(noll)))
         modes = partial(zernike_images, noll)
-        # Z_j goes with cos mφ or sin mφ, which is the same at opposite points if m is even.
+        # Z_j is proportional to cos mφ or sin mφ, equal at opposite points if m is even.
         is_even = np.array([noll_to_nm(j)[1] % 2 == 0 for j in noll])
-    # Prior: σ² = (fraction × static coefficient)² + waves². The second part is what all stars have
-    # alike; by default it is the star-to-star jitter of the telescope's settings.
+    # Prior: σ² = (fraction × static coefficient)² + waves². The second part is the same for all
+    # stars, by default the star-to-star jitter of the telescope's settings.
     prior = telescope.prior
     waves = jitter if prior.waves is None else prior.waves
     sd = np.hypot(prior.fraction * np.abs(mean), waves)
@@ -185,17 +188,18 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
 
 @dataclass(frozen=True)
 class TelescopeModel:
-    """Numbers of a telescope from which the aberrations of all stars follow.
+    """Numbers of a telescope that determine the aberrations of all stars.
 
     Attributes
     ----------
     names, units : tuple of str, length Q
+        Names of the numbers, such as "decentre_x", and their units.
     mean, sd : ndarray, shape (Q,)
         Mean and standard deviation of the prior of the numbers.
     coefficients : callable
         Function of the numbers (Q,) that returns coefficients of all stars (n, K), in waves.
     has_seeing : bool
-        True if the last number is the FWHM of the seeing in arcsec, which moves no coefficient.
+        True if the last number is the FWHM of the seeing in arcsec; no coefficient depends on it.
     """
 
     names: tuple[str, ...]
@@ -219,23 +223,24 @@ class TelescopeModel:
         return np.array(slopes)
 
 
-def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> TelescopeModel:
+def model_telescope(telescope: OwnTelescope, angle_deg: np.ndarray) -> TelescopeModel:
     """Return the model of a telescope that is common to all stars at field angles (n, 2).
 
-    Its numbers depend on how the telescope is described:
+    Its numbers depend on the kind of the aberrations:
 
-    - Seidel terms: the coefficients that are no tilt;
+    - Seidel terms: the coefficients, without distortion, which is a tilt;
     - Zernike terms: the coefficients of their polynomials of the field;
-    - ray trace: the detector's defocus, and decentre and tilt of the secondary, or without one
-      the place of the optical axis.
+    - ray trace: defocus of the detector, decentre and tilt of the secondary; without a secondary
+      the position of the optical axis in place of the last two.
 
     The FWHM of the seeing is the last number if the prior leaves it free.
 
     Parameters
     ----------
     telescope : OwnTelescope
+        Telescope with its aberrations and their prior.
     angle_deg : ndarray, shape (n, 2)
-        Field angles (x, y) of the stars.
+        Field angles (x, y) of the stars in degrees.
     """
     # Each kind of aberrations has its own numbers and their prior.
     angle_deg = np.asarray(angle_deg, float)
@@ -248,7 +253,7 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
         mean, waves = aberrations.coefficients[:count], prior.waves or 0.0
         model = _linear_model(VISIBLE_SEIDEL_TERMS, mean, basis, prior.fraction, waves)
     elif isinstance(aberrations, Zernike):
-        # A row of the basis is a product of powers of the field, in the column of its Zernike.
+        # A row of the basis is a product of powers of the field, in the column of its Zernike term.
         field = relative_field(telescope, angle_deg)
         noll = [j for j in aberrations.noll if j >= FIRST_NOLL]
         rows = [(j, power) for j in noll for power in aberrations.terms[f"z{j}"]]
@@ -256,15 +261,15 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
         for row, (j, power) in enumerate(rows):
             x, y = (field[:, axis] ** power.count(letter) for axis, letter in enumerate("xy"))
             basis[row, :, noll.index(j)] = x * y
-        # Each power of the field is a number with a prior of its own, about its value in the file.
+        # Each power of the field is a number whose prior is centred on its value in the file.
         mean = np.array([aberrations.terms[f"z{j}"][power] for j, power in rows])
         waves = aberrations.jitter_waves if prior.waves is None else prior.waves
         names = tuple(f"z{j}.{power}" for j, power in rows)
         model = _linear_model(names, mean, basis, prior.fraction, waves)
     else:
         model = _ray_traced_model(telescope, aberrations, angle_deg)
-    # The FWHM of the seeing is added if the prior leaves it free. It moves no coefficient: stamps
-    # depend on it by another way (`psfdae.sensing.joint`).
+    # The FWHM of the seeing is added if the prior leaves it free. No coefficient depends on it:
+    # `psfdae.sensing.joint` computes its effect on stamps.
     if seeing is None or not prior.seeing:
         return model
     return TelescopeModel(
@@ -280,29 +285,30 @@ def telescope_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> Telescope
 def _linear_model(
     names: tuple[str, ...], mean: np.ndarray, basis: np.ndarray, fraction: float, waves: float
 ) -> TelescopeModel:
-    """Return the model of coefficients Σ_q number_q basis_q, numbers with σ = 0 being fixed.
+    """Return the model of coefficients Σ_q number_q basis_q; numbers with σ = 0 are constant.
 
     Parameters
     ----------
     names : tuple of str, length Q
+        Names of the numbers.
     mean : ndarray, shape (Q,)
-        In waves.
+        Mean of their prior, in waves.
     basis : ndarray, shape (Q, n, K)
         Coefficients of the stars for a unit of each number.
     fraction, waves : float
         Standard deviation of the numbers: relative to the mean, and in waves, in quadrature.
     """
-    # Prior of the numbers. Those without a width are constants, a fixed part of the coefficients.
+    # Prior of the numbers. Numbers without a width contribute a constant to the coefficients.
     sd = np.hypot(fraction * np.abs(mean), waves)
     is_free = sd > 0
-    fixed = np.tensordot(mean[~is_free], basis[~is_free], 1)
+    constant_part = np.tensordot(mean[~is_free], basis[~is_free], 1)
     names = tuple(names[index] for index in np.flatnonzero(is_free))
     return TelescopeModel(
         names,
         ("wave",) * len(names),
         mean[is_free],
         sd[is_free],
-        lambda numbers: fixed + np.tensordot(numbers, basis[is_free], 1),
+        lambda numbers: constant_part + np.tensordot(numbers, basis[is_free], 1),
     )
 
 
@@ -325,12 +331,12 @@ def _ray_traced_model(
             lambda numbers: trace_zernikes(telescope, angle_deg, numbers[0], units * numbers[1:]),
         )
     # Without a secondary, the optical axis may be off the middle of the field.
-    # A star is traced at its angle from the axis; there is nothing to misalign.
-    aligned = np.zeros(4)
+    # A star is traced at its angle from the axis; no element can be misaligned.
+    zero = np.zeros(4)
     return TelescopeModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),
         np.array([defocus_m, 0.0, 0.0]),
         np.array([prior.defocus_m, prior.tilt_deg, prior.tilt_deg]),
-        lambda numbers: trace_zernikes(telescope, angle_deg - numbers[1:], numbers[0], aligned),
+        lambda numbers: trace_zernikes(telescope, angle_deg - numbers[1:], numbers[0], zero),
     )

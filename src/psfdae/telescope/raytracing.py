@@ -4,10 +4,10 @@ batoid (https://github.com/jmeyers314/batoid) traces the rays of a telescope tha
 built from its settings.
 
 Coordinates: z from the primary to the sky, light along −z. A field angle (x, y)
-is that of the direction in which light travels, so that a star at +x is imaged
-at +x on the detector. Zernike coefficients are Noll's over the unit circle,
-fitted to the lit annulus, positive where the wavefront runs ahead: an optical
-path difference, which counts the delay, is their negative.
+is the direction in which light travels, so that a star at +x is imaged at +x on
+the detector. Zernike coefficients are Noll's over the unit circle, fitted to the
+lit annulus, positive where the wavefront leads: an optical path difference, which
+is a delay, is their negative.
 
 A misalignment moves the secondary by a decentre (x, y) and turns it about its
 vertex by the rotation vector (tilt x, tilt y, 0).
@@ -31,40 +31,41 @@ if TYPE_CHECKING:
 
 
 class RayTracingError(Error, ValueError):
-    """Error of a misalignment or a field whose rays cannot be traced."""
+    """Error of a misalignment or a field angle whose rays cannot be traced."""
 
 
 def misalign(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
-    """Return the telescope with its item M2, the secondary, displaced; `optic` stays as it is.
+    """Return the telescope with its item M2, the secondary, displaced; `optic` is not changed.
 
-    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; a telescope
-    without secondary has none but 0.
+    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; it must be 0 for
+    a telescope without secondary.
     """
     if not np.any(misalignment):
         return optic
     x, y, tilt_x, tilt_y = (float(value) for value in misalignment)
-    # One turn about an axis in the mirror's plane: neither tilt comes before the other.
+    # One rotation about an axis in the mirror's plane: the order of the tilts does not matter.
     turn = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).as_matrix()
-    # Decentred first, then tilted about the vertex, which has moved along.
+    # Decentred first, then tilted about the displaced vertex.
     return optic.withLocallyShiftedOptic("M2", [x, y, 0.0]).withLocallyRotatedOptic("M2", turn)
 
 
 class ZernikeTracer:
-    """Ray trace of a telescope that gives Zernike coefficients of its wavefront at some fields.
+    """Ray trace of a telescope, for Zernike coefficients of its wavefront at given field angles.
 
     The rays start on Gauss–Legendre rings in the entrance pupil: their weighted
-    least-squares fit is that over the whole lit annulus, exact for wavefronts of
-    the fitted order. The reference is the sphere about the mean landing point,
-    the mean path is 0 (batoid's reference "mean" in the limit of many rays).
+    least-squares fit equals a fit over the whole lit annulus, exactly for wavefronts
+    up to the fitted order. The reference is the sphere about the mean landing point,
+    and the mean path is 0 (batoid's reference "mean" in the limit of many rays).
 
     Parameters
     ----------
     optic : batoid.CompoundOptic
-        The aligned telescope; its pupil's size and obscuration and its reference
-        sphere are those of the wavefront.
+        The aligned telescope, with the size and obscuration of its pupil and its
+        reference sphere.
     wavelength_m : float
+        Wavelength in metres, the unit of the coefficients.
     field_rad : ndarray, shape (F, 2)
-        Field angles (x, y).
+        Field angles (x, y) in radians.
     highest_noll : int
         Highest Noll index.
     """
@@ -78,7 +79,7 @@ class ZernikeTracer:
     ) -> None:
         import batoid
 
-        # Facts of the trace that do not change with the misalignment.
+        # Quantities of the trace that do not depend on the misalignment.
         self.optic = optic
         self.wavelength_m = wavelength_m
         self.field_rad = np.asarray(field_rad, float)
@@ -88,7 +89,7 @@ class ZernikeTracer:
         root = np.sqrt(self._weights)
         basis = zernike_images(range(1, highest_noll + 1), x, y)
         self._fit = np.linalg.pinv((basis * root).T) * root
-        # 36 rays more, just inside the rim of the pupil, show whether it is vignetted.
+        # 36 additional rays, just inside the rim of the pupil, detect vignetting.
         angle = 2.0 * np.pi * np.arange(36) / 36
         start = np.stack([np.append(x, 0.998 * np.cos(angle)), np.append(y, 0.998 * np.sin(angle))])
         start *= 0.5 * optic.pupilSize
@@ -126,7 +127,7 @@ class ZernikeTracer:
         # Trace all rays through the misaligned telescope; the trace changes them in place.
         rays = self._rays.copy()
         misalign(self.optic, misalignment).trace(rays)
-        # A field that loses a ray is refused: its wavefront would be that of another pupil.
+        # A field angle that loses a ray is an error: its wavefront would be of another pupil.
         is_stopped = (rays.vignetted | rays.failed).reshape(len(self.field_rad), -1)
         if is_stopped.any():
             is_vignetted = is_stopped.any(axis=1)
@@ -137,7 +138,7 @@ class ZernikeTracer:
                 f"{is_stopped.shape[1]} rays are vignetted; {int(is_vignetted.sum())} of "
                 f"{len(is_stopped)} fields are"
             )
-        # Landing point, direction and path of the rays of the pupil, those at its rim left out.
+        # Landing point, direction and path of the rays of the pupil, without the rays at its rim.
         pupil = slice(0, self._weights.size)
         landing, velocity = (a.reshape(*is_stopped.shape, 3)[:, pupil] for a in (rays.r, rays.v))
         path = rays.t.reshape(is_stopped.shape)[:, pupil]
@@ -149,8 +150,8 @@ class ZernikeTracer:
         along = (offset * direction).sum(-1)
         excess = (offset**2).sum(-1) - self.optic.sphereRadius**2
         path = path - along - np.sqrt(along**2 - excess)
-        # Lead of every ray on the mean of its field, in waves, positive where its path is short.
-        # The fit's first coefficients, piston and tilts, are left out.
+        # Lead of every ray over the mean of its field angle, in waves, positive for short paths.
+        # The first coefficients of the fit, piston and tilts, are left out.
         lead = (path @ self._weights[:, None] - path) / self.wavelength_m
         return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
 
@@ -161,7 +162,7 @@ def annulus_points(
     """Return points and weights that integrate products of Zernike polynomials over an annulus.
 
     Gauss–Legendre in r², and at least as many spokes as the highest product
-    needs; a multiple of 8, so that mirror symmetries hold to rounding.
+    needs. Their number is a multiple of 8, so that mirror symmetries are exact up to rounding.
 
     Parameters
     ----------
@@ -173,7 +174,7 @@ def annulus_points(
     Returns
     -------
     x, y, weights : ndarray, shape (n,)
-        In pupil radii; the weights sum to 1.
+        Points in pupil radii, and weights of sum 1.
     """
     # A product of two polynomials of order n has the order 2n in r, n in r², and 2n cycles.
     order = noll_to_nm(highest_noll)[0]
@@ -192,35 +193,35 @@ def build_optic(
 ) -> CompoundOptic:
     """Build the aligned telescope, a batoid.CompoundOptic.
 
-    Its items are M1, M2 and lenses if any, and the detector D, `defocus_m` beyond best focus.
-    batoid is imported only here and where rays are launched: no other scene depends on it.
+    Its items are M1, M2 and lenses if any, and the detector D, `defocus_m` behind best focus.
+    batoid is imported only here and where rays are launched: other scenes do not need it.
 
     Parameters
     ----------
     prescription : Prescription
         Surfaces and glass.
     telescope : Telescope
-        Gives the diameter and the linear central obscuration of the pupil.
+        Telescope with the diameter and the linear central obscuration of the pupil.
     defocus_m : float
-        Distance of the detector beyond best focus, along the light.
+        Distance of the detector behind best focus along the light, in metres.
     """
     import batoid
 
-    # Parts of batoid's: a plane at a height, an aperture that blocks light beyond a radius, and
-    # surfaces. All are centred on the axis.
-    def at(z: float) -> Any:
+    # Elements of batoid: a plane at a height, an aperture that blocks light outside of a radius,
+    # and surfaces. All are centred on the axis.
+    def place_at(z: float) -> Any:
         return batoid.CoordSys().shiftLocal([0.0, 0.0, z])
 
     def clear(radius: float) -> Any:
         return batoid.ObscNegation(batoid.ObscCircle(radius))
 
     def mirror(settings: Mirror, name: str, aperture: Any) -> Any:
-        # batoid's Quadric finds no point of a paraboloid on the axis.
+        # batoid's Quadric does not find the point of a paraboloid on the axis.
         if settings.conic == -1.0:
             surface = batoid.Paraboloid(settings.radius_m)
         else:
             surface = batoid.Quadric(settings.radius_m, settings.conic)
-        place = at(settings.vertex_m)
+        place = place_at(settings.vertex_m)
         return batoid.Mirror(surface, name=name, coordSys=place, obscuration=aperture)
 
     def lens(name: str, settings: Lens) -> Any:
@@ -231,7 +232,7 @@ def build_optic(
             batoid.RefractiveInterface(
                 batoid.Sphere(radius),
                 name=f"{name} {side}",
-                coordSys=at(vertex),
+                coordSys=place_at(vertex),
                 obscuration=clear(settings.clear_radius_m),
                 inMedium=in_medium,
                 outMedium=out_medium,
@@ -252,7 +253,7 @@ def build_optic(
         annulus = batoid.ObscAnnulus(telescope.obscuration * radius, radius)
         aperture = batoid.ObscNegation(annulus)
     items = [mirror(prescription.primary, "M1", aperture)]
-    # A single mirror sends the light up, a second one down: the detector moves along it.
+    # A single mirror reflects the light up, a second one down: the detector moves along it.
     light_direction = 1.0
     if prescription.secondary:
         light_direction = -1.0
@@ -260,10 +261,10 @@ def build_optic(
         items.append(mirror(prescription.secondary, "M2", aperture))
     items += [lens(*item) for item in prescription.ordered_lenses]
     # Detector and entrance pupil, planes across the axis.
-    detector = at(prescription.best_focus_m + light_direction * defocus_m)
+    detector = place_at(prescription.best_focus_m + light_direction * defocus_m)
     items.append(batoid.Detector(batoid.Plane(), name="D", coordSys=detector, obscuration=None))
     entrance_pupil = batoid.Interface(
-        batoid.Plane(), name="entrance pupil", coordSys=at(prescription.entrance_pupil_m)
+        batoid.Plane(), name="entrance pupil", coordSys=place_at(prescription.entrance_pupil_m)
     )
     return batoid.CompoundOptic(
         items,

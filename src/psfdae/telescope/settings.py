@@ -1,7 +1,7 @@
-"""Settings of a telescope: aperture, band and detector, and what a user's own telescope adds.
+"""Settings of a telescope: aperture, band and detector; for a user's telescope also its optics.
 
-A telescope of one's own has a field, static aberrations with a prior, and seeing. Its YAML file
-is read by `read_telescope`.
+A user's telescope has a field, static aberrations with a prior, and seeing. `read_telescope` reads
+its YAML file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from psfdae.telescope.aberrations import Jitter, OmitsLateKeys, Raytraced, Seide
 class Telescope(Group):
     """Telescope by its aperture, band and detector.
 
-    The pupil is an annulus; the image is that of one wavelength.
+    The pupil is an annulus; the image is monochromatic.
     """
 
     name: Name
@@ -59,7 +59,7 @@ class Seeing(Group):
 
     @model_validator(mode="after")
     def check_beta(self) -> Seeing:
-        """Require the exponent of a Moffat profile, and refuse one of a Gaussian."""
+        """Raise ValueError if a Moffat profile has no exponent, or a Gaussian has one."""
         # Wings fall as r^−2β: a Gaussian has none.
         if (self.kind == "moffat") != (self.beta is not None):
             raise ValueError(
@@ -70,12 +70,12 @@ class Seeing(Group):
 
 
 class Prior(Group):
-    """Prior of a telescope: how far it may be from its file, as `psfdae wavefront` assumes."""
+    """Prior of `psfdae wavefront`: how far a telescope may differ from its file."""
 
     fraction: Annotated[float, Field(ge=0, le=10)] = 0.1
     """Relative standard deviation of every term."""
     waves: Jitter | None = None
-    """Standard deviation in waves besides; null: jitter_waves."""
+    """Standard deviation in waves, added in quadrature; null: jitter_waves."""
     defocus_m: Positive = 1e-4
     """Standard deviation of the detector's defocus (ray trace)."""
     decentre_m: Positive = 1e-3
@@ -89,9 +89,9 @@ class Prior(Group):
 def aberrations_by_kind(tree: Any) -> Any:
     """Check aberrations by the class of their `kind`.
 
-    The class is chosen beforehand, so that messages name no member of a union.
+    The class is chosen first, so that messages of pydantic do not name members of a union.
     """
-    # A value that is no mapping, or of no class, is refused with the kinds that there are.
+    # A value that is not a mapping is left to pydantic; a wrong kind is an error with all kinds.
     classes: dict[str, type[Group]]
     classes = {"seidel": Seidel, "zernike": Zernike, "raytraced": Raytraced}
     if not isinstance(tree, Mapping):
@@ -103,7 +103,7 @@ def aberrations_by_kind(tree: Any) -> Any:
 
 
 class OwnTelescope(OmitsLateKeys, Telescope):
-    """Telescope of one's own, with its field and aberrations (config/dataset/_telescope.yaml)."""
+    """Telescope of a user, with its field and aberrations (config/dataset/_telescope.yaml)."""
 
     late_keys = ("seeing", "prior")
     field_edge_deg: Annotated[float, Field(gt=0, le=45)]
@@ -111,7 +111,7 @@ class OwnTelescope(OmitsLateKeys, Telescope):
     aberrations: Annotated[Seidel | Zernike | Raytraced, BeforeValidator(aberrations_by_kind)]
     """Static aberrations over the field."""
     seeing: Seeing | None = None
-    """Null: a telescope above the air."""
+    """Null: a telescope above the atmosphere."""
     prior: Prior = Prior()
     """Prior of the telescope's state."""
 
@@ -120,14 +120,14 @@ class OwnTelescope(OmitsLateKeys, Telescope):
         """Profile of the seeing, in λ/D."""
         if self.seeing is None:
             return None
-        # The seeing on the sky in the units of pixels.
+        # Angle on the sky in units of λ/D, as for pixels.
         fwhm = pixel_width(self.seeing.fwhm_arcsec, self.diameter_m, self.wavelength_m)
         return Profile(fwhm, self.seeing.beta)
 
 
 def has_own_aberrations(tree: object) -> bool:
-    """Return True if a telescope, checked or not yet, brings aberrations of its own."""
-    # Any of these keys makes it one: those that are missing are then named.
+    """Return True if a telescope, checked or not yet, has aberrations of its own."""
+    # One of these keys is enough: an error then names the missing ones.
     keys = {"aberrations", "field_edge_deg", "seeing", "prior"}
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(keys & set(tree)))
 
@@ -135,8 +135,9 @@ def has_own_aberrations(tree: object) -> bool:
 def telescope_by_keys(tree: Any) -> Any:
     """Check a telescope by its class: with aberrations of its own, or without.
 
-    As for aberrations, the class is chosen beforehand for the sake of the messages.
+    As for aberrations, the class is chosen first for the sake of the messages.
     """
+    # A value that is not a mapping is left to pydantic.
     if not isinstance(tree, Mapping):
         return tree
     return (OwnTelescope if has_own_aberrations(tree) else Telescope).model_validate(tree)
@@ -147,10 +148,10 @@ AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(telescope_by_
 
 @check_arguments
 def read_telescope(path: str | Path) -> OwnTelescope:
-    """Read a telescope of one's own from its YAML file.
+    """Read a user's telescope from its YAML file.
 
-    Its list `defaults` may name other files, as those in `config/telescope` do: NAME is one of the
-    same folder, `/GROUP@KEY: NAME` one of the folder GROUP beside it, whose content becomes KEY.
+    Its list `defaults` may name other files, as in `config/telescope`: NAME is a file of the same
+    folder, `/GROUP@KEY: NAME` a file of the sibling folder GROUP, whose content becomes KEY.
 
     Raises
     ------
@@ -163,8 +164,8 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     >>> f"{telescope.name}: a pixel is {telescope.pixel:.2f} λ/D wide"
     'refractor: a pixel is 1.76 λ/D wide'
     """
-    # Errors of files that it includes name those.
-    tree = composed_tree(Path(path))
+    # Errors in included files name these files.
+    tree = compose_tree(Path(path))
     try:
         return parse_settings(OwnTelescope, tree)
     except ConfigError as error:
@@ -173,32 +174,33 @@ def read_telescope(path: str | Path) -> OwnTelescope:
         raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
 
 
-def composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the content of a file with that of the files in its list `defaults`, as Hydra does.
+def compose_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the content of a file, merged with the files of its list `defaults` as in Hydra.
 
     Parameters
     ----------
     path : Path
+        The YAML file.
     including : tuple of Path
-        Files on the way to this one, each of which names the next.
+        Chain of files that includes this one, the outermost first.
 
     Raises
     ------
     ConfigError
-        If the list has an entry that is no name, or names a file that includes this one.
+        If an entry of the list is not a name, or names a file that includes this one.
     ProductError
         If a file is missing or damaged.
     """
     if path.resolve() in including:
         raise ConfigError(f"{path}: defaults: it names itself")
-    # The file without the list of those that it includes.
+    # Content of the file without its list of included files.
     tree = read_yaml(path)
     entries = tree.pop("defaults", [])
     if not isinstance(entries, list):
         raise ConfigError(f"{path}: defaults = {entries!r}: must be a list")
-    # As in Hydra, later entries overrule earlier ones; `_self_`, the file's own content, is the
-    # last one unless it stands elsewhere.
-    composed: dict[str, Any] = {}
+    # As in Hydra, later entries override earlier ones; `_self_`, the file's own content, is the
+    # last entry unless the list contains it.
+    content: dict[str, Any] = {}
     for entry in [*entries, *([] if "_self_" in entries else ["_self_"])]:
         text = "".join(f"{k}: {v}" for k, v in entry.items()) if isinstance(entry, dict) else entry
         pattern = r"(?:/(?P<group>\w+)(?:@(?P<key>[\w.]+))?: )?(?P<name>\w+)"
@@ -208,23 +210,23 @@ def composed_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any
         # Content of the entry: the file itself, or another file, under its key if it has one.
         part = tree
         if text != "_self_":
-            # Groups are folders side by side.
+            # Groups are sibling folders.
             folder = path.parent / ".." / match["group"] if match["group"] else path.parent
-            part = composed_tree(folder / f"{match['name']}.yaml", (*including, path.resolve()))
+            part = compose_tree(folder / f"{match['name']}.yaml", (*including, path.resolve()))
             for key in reversed(match["key"].split(".") if match["key"] else []):
                 part = {key: part}
-        composed = merged(composed, part)
-    return composed
+        content = merge_trees(content, part)
+    return content
 
 
-def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two trees, key by key; where both have a value, that of the second one counts.
+def merge_trees(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge two trees key by key; values of the second one override values of the first one.
 
-    Lists are values: they are not joined. Neither tree is changed.
+    Lists are values: they are not concatenated. Neither tree is changed.
     """
-    # Groups that both trees have are merged in turn.
+    # Groups that both trees have are merged recursively.
     subtrees = {
-        key: merged(first[key], value)
+        key: merge_trees(first[key], value)
         for key, value in second.items()
         if isinstance(value, Mapping) and isinstance(first.get(key), Mapping)
     }

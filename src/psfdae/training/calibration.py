@@ -269,7 +269,7 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
         return float(np.median(sigma) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
     # The errors of the flux, of the sky, and of the centre, both axes together.
-    fitted_flux, *growth = method_fit.fitted_flux_error()
+    fitted_flux, *growth = method_fit.estimate_flux_error()
     flux = compute_excess((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
     # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
     sky = compute_excess(prediction.background[usable], prediction.background_error[usable])
@@ -313,8 +313,12 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     # Noise as the photometry estimates it, and factors, at each node; the last axis is the node.
     errors, rng = model.bundle.errors, stream(seed, "noise", "calibration", "scales")
     nodes = errors.noise
-    by_node = [_scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)]
-    noise, scale, flux_scale = (np.stack(values, axis=-1) for values in zip(*by_node, strict=True))
+    node_results = [
+        _scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)
+    ]
+    noise, scale, flux_scale = (
+        np.stack(values, axis=-1) for values in zip(*node_results, strict=True)
+    )
     # Where a star has light that the photometry does not know, its noise estimate is too large: the
     # factors are given at the estimates.
     noise = np.maximum.accumulate(noise, axis=-1)
@@ -396,7 +400,7 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
     if errors.outlier_limit is None or (bright := stars.bright) is None:
         return errors
     # The stars as they are in the image, framed, with the flux 1.
-    images, is_measured = bright.framed(model.info.stamp_px)
+    images, is_measured = bright.cut_frames(model.info.stamp_px)
     images = np.where(is_measured, images, 0.0) / bright.flux[:, None, None]
     noise = bright.noise / bright.flux
     prediction = model.predict(images, noise=noise, background=0.0, position=bright.place)

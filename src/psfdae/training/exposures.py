@@ -174,7 +174,7 @@ def adapt_to_stars(model: Model, stars: ImageStars) -> Model:
         Bright stars of the other image.
     """
     model, train = model.to_image_frame(stars.observation)[0], stars.split.train
-    bright = stars.candidates.bright.of(np.flatnonzero(~stars.held_out))
+    bright = stars.candidates.bright.select(np.flatnonzero(~stars.held_out))
     adapted_model = _adapt(model, stars.observation, bright, stars.name)
     # The checksum of the stars that were learnt from shows a test that it saw no other.
     training_sha256 = checksum(
@@ -190,7 +190,7 @@ def _adapt(model: Model, observation: Observation, bright: BrightStars, name: st
     assert isinstance(field, FieldMixture)
     # New coefficients of the field; all other arrays, and errors, stay those of the training.
     sky = bright.sky_photons(observation.gain, field.noise.background)
-    arrays, _ = field.of_exposure(bright, sky).pack(info.stamp_px, info.noise_min)
+    arrays, _ = field.refit_exposure(bright, sky).export(info.stamp_px, info.noise_min)
     weights = dict(model.bundle.weights)
     for key in ("coefficients", "listed"):
         weights[key] = arrays[key].astype(weights[key].dtype)

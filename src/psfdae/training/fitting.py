@@ -8,14 +8,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psfdae.base.errors import needed_by
+from psfdae.base.errors import require_extra
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
-from psfdae.base.threads import fixed_threads
+from psfdae.base.threads import fix_threads
 from psfdae.denoise.star_model import StarModel
-from psfdae.methods import groups_of
+from psfdae.methods import list_groups
 from psfdae.methods import method as method_of
-from psfdae.methods.fit_files import described_by
+from psfdae.methods.fit_files import describe_fit
 from psfdae.methods.interface import Method
 from psfdae.photometry.image_photometry import measure_stars
 from psfdae.photometry.photon_noise import with_measured_gain
@@ -90,7 +90,7 @@ def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = No
     """
     # The stars as the method takes them: of the image, without those that are held out.
     data = stars.training_set(kind, checkpoint=checkpoint)
-    with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
+    with fix_threads(kind.threads(stars.settings)), require_extra(f"the method {kind.name}"):
         return kind.fit(data, **kind.settings(stars.settings))
 
 
@@ -103,8 +103,8 @@ def described(stars: ImageStars, kind: type[Method]) -> dict[str, Any]:
     kind : type of Method
         The fitted method, whose groups of settings count beside split and truth.
     """
-    group_settings = stars.settings.model_dump(include={*groups_of(kind.name)})
-    return described_by(kind, group_settings, ImageStars.split_kind, ImageStars.reference)
+    group_settings = stars.settings.model_dump(include={*list_groups(kind.name)})
+    return describe_fit(kind, group_settings, ImageStars.split_kind, ImageStars.reference)
 
 
 def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
@@ -131,7 +131,7 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
     for name, method_fit in fits.items():
         judged_fit, kind = method_fit, type(method_fit)
         data = stars.training_set(kind)
-        with fixed_threads(kind.threads(settings)):
+        with fix_threads(kind.threads(settings)):
             # A method without a need of validation stars has learnt from them as well: what is
             # judged is a fit without them. One that needs them, to stop, has not.
             if not kind.needs.validation:
@@ -166,7 +166,7 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
     # Calibrate the errors of the fit on held-out stars.
     settings = stars.settings
     description = described(stars, type(method_fit))
-    with fixed_threads(settings.evaluation.threads):
+    with fix_threads(settings.evaluation.threads):
         model = build_model(
             method_fit, stars.product, ImageStars.reference, settings, description, name, licence
         )

@@ -210,7 +210,7 @@ def packed(
 
     @cache
     def pack_at_step(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        return method_fit.pack(stamp_px, float(noises[step]))
+        return method_fit.export(stamp_px, float(noises[step]))
 
     def is_small(step: int) -> bool:
         return sum(array.nbytes for array in pack_at_step(step)[0].values()) <= largest

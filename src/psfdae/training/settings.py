@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 
 from pydantic import Field, create_model, model_validator
 
+from psfdae.base.entry_points import find_entry_points
 from psfdae.base.errors import did_you_mean, keyword
-from psfdae.base.joined import joined
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import (
     CalibrationStars,
@@ -28,7 +28,7 @@ from psfdae.base.settings import (
     Parts,
     Seed,
     Stamp,
-    keys_of,
+    list_keys,
     parse_settings,
 )
 from psfdae.methods import MethodNames, all_methods
@@ -124,9 +124,9 @@ def from_words(words: Sequence[str] = ()) -> Settings:
             # former, and its message on the latter is better.
             if any(argument.lstrip("+").startswith("framing.stamp_px=") for argument in words):
                 words = ("++calibration_stars.light_min=0", *words)
-            for point in joined("settings"):
+            for point in find_entry_points("settings"):
                 return make_settings(point.load()(groups, (DATASET_CHOICE, *words)))
-            names, hint = ", ".join(groups), did_you_mean(key, keys_of(settings_model()))
+            names, hint = ", ".join(groups), did_you_mean(key, list_keys(settings_model()))
             raise ConfigError(f"{word}: expected group.key=value, the group one of {names}{hint}")
         try:
             value = yaml.safe_load(text)

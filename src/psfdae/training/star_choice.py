@@ -65,7 +65,9 @@ def choose_bright_stars(
         ]
         relaxed_settings, candidates = collect_enough(observations, settings)
     # The user learns that stars below the stated S/N take part.
-    least_snr, stated_snr = (s.calibration_stars.least_snr for s in (relaxed_settings, settings))
+    least_snr, stated_snr = (
+        s.calibration_stars.effective_snr_min for s in (relaxed_settings, settings)
+    )
     if least_snr < stated_snr:
         notes.append(
             f"few stars: those of S/N {least_snr:g} and above are used, because fewer than 20 have "
@@ -113,7 +115,7 @@ def collect_enough(
         """Return the number of bright stars of a selection."""
         return sum(len(candidates.bright) for candidates in selection[1])
 
-    selection = collect_all(snr_min=calibration.least_snr)
+    selection = collect_all(snr_min=calibration.effective_snr_min)
     # In an image of galaxies, fainter stars cannot be told from galaxies.
     verdicts = np.concatenate([image_candidates.verdict for image_candidates in selection[1]])
     has_galaxies = np.count_nonzero(verdicts == Verdict.EXTENDED) > max(9, bright_count(selection))
@@ -121,7 +123,7 @@ def collect_enough(
         return selection
     # Fainter stars: three times as many as needed while their S/N is above 20. Of two selections
     # with as many stars, the first one stays.
-    for snr in calibration.lower_snr():
+    for snr in calibration.list_lower_snr():
         selection = max(selection, collect_all(snr_min=snr), key=bright_count)
         if bright_count(selection) >= (ENOUGH_STARS if snr <= 20.0 else 3 * ENOUGH_STARS):
             return selection
@@ -131,7 +133,7 @@ def collect_enough(
     # has little light.
     for ratio in (0.05, 0.1, 0.2, 0.4) if crowded >= ENOUGH_STARS else ():
         if bright_count(selection) < ENOUGH_STARS:
-            limits = {"snr_min": calibration.least_snr, "neighbour_ratio": ratio}
+            limits = {"snr_min": calibration.effective_snr_min, "neighbour_ratio": ratio}
             selection = max(selection, collect_all(True, **limits), key=bright_count)
     return selection
 

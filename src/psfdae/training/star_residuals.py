@@ -13,11 +13,11 @@ import numpy as np
 
 from psfdae.image.selection import Candidates, Verdict
 from psfdae.image.stamps import cut
-from psfdae.methods.field import stars_of_fit
-from psfdae.methods.field_fit import FieldFitter
-from psfdae.methods.field_law import FieldSettings
-from psfdae.methods.field_residuals import MARGIN_PX
-from psfdae.methods.field_search import fit_field
+from psfdae.methods.field import select_fit_stars
+from psfdae.methods.field.fit import FieldFitter
+from psfdae.methods.field.prior import FieldSettings
+from psfdae.methods.field.residuals import MARGIN_PX
+from psfdae.methods.field.search import fit_field
 from psfdae.training.settings import Settings
 
 
@@ -51,16 +51,16 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
         return candidates
     # Stars that the fit of the method would take, too.
     frame_px = side + 2 * MARGIN_PX
-    rows = stars_of_fit(bright.snr, frame_px**2, settings.seed)
-    stars, field = bright.of(rows), getattr(settings, "field", None) or FieldSettings()
+    rows = select_fit_stars(bright.snr, frame_px**2, settings.seed)
+    stars, field = bright.select(rows), getattr(settings, "field", None) or FieldSettings()
     # The highest order, up to 4, of which each of the (o + 1)(o + 2)/2 terms has four stars.
     order = max(o for o in range(5) if o == 0 or 2 * (o + 1) * (o + 2) <= len(stars))
     photons = stars.sky_photons(gain, settings.noise.background_photons)
     fit = fit_field(stars, photons, frame_px, side, [order], field.spacing_px, field.smoothness)
     # Light of the fitted stars, and variance; 0 where nothing was measured.
-    fitter = FieldFitter.of(stars, photons, frame_px, side)
-    light = np.where(fitter.measured, fitter.images / fit.flux[:, None, None] - fit.residual, 0.0)
-    variance = np.where(fitter.measured, fitter.pixel_variance(fit.flux, light), 0.0)
+    fitter = FieldFitter.build(stars, photons, frame_px, side)
+    light = np.where(fitter.is_valid, fitter.images / fit.flux[:, None, None] - fit.residual, 0.0)
+    variance = np.where(fitter.is_valid, fitter.pixel_variance(fit.flux, light), 0.0)
     light, variance, residual = (cut(a, side) for a in (light.clip(0.0), variance, fit.residual))
     # d², and its standard error by noise, as r² has the variance 2 σ⁴.
     norm = (light**3).sum(axis=(1, 2))
@@ -74,5 +74,5 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
         return candidates
     verdict = candidates.verdict.copy()
     verdict[stars.row[is_misfit]] = Verdict.MISFIT
-    kept_stars = bright.of(np.delete(np.arange(len(bright)), rows[is_misfit]))
+    kept_stars = bright.select(np.delete(np.arange(len(bright)), rows[is_misfit]))
     return reject_misfits(replace(candidates, verdict=verdict, bright=kept_stars), settings, gain)

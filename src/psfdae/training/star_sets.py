@@ -15,7 +15,7 @@ import numpy as np
 from psfdae.base.files import Product, ProductError, read_product
 from psfdae.base.rng import stream
 from psfdae.base.settings import Config, OfFit, WithNoise
-from psfdae.methods.fit_files import learnt
+from psfdae.methods.fit_files import get_training_reference
 from psfdae.methods.interface import Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars, places
 from psfdae.stars.noise import NoiseModel, OwnNoise, noise_equivalent_px
@@ -276,9 +276,7 @@ class ModelStars:
     @property
     def bright(self) -> BrightStars | None:
         """The training stars of an image with the pixels around them; None if simulated."""
-        return (
-            BrightStars.of_product(self.product).of(self.stars) if of_image(self.product) else None
-        )
+        return BrightStars.read(self.product).select(self.stars) if of_image(self.product) else None
 
 
 def training_set(
@@ -311,12 +309,12 @@ def training_set(
     if of_image(stars):
         fields["own_noise"] = star_noise
         if kind.knows_field:
-            fields |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
+            fields |= {"bright": BrightStars.read(stars), "star": stars["field_index"]}
     else:
         fields["simulation"] = stars.config
     return TrainingSet(
         images=stars["realisation"],
-        references=stars[learnt(kind, reference)],
+        references=stars[get_training_reference(kind, reference)],
         fit=parts.fit,
         validation=parts.validation,
         levels=np.asarray(config.noise.levels),

@@ -229,7 +229,7 @@ def select_stars(
     bright = candidates.bright
     # A single star stands twice: the model is trained on it and tested on it.
     if len(bright) == 1:
-        bright = bright.of(np.array([0, 0]))
+        bright = bright.select(np.array([0, 0]))
         candidates = replace(candidates, bright=bright)
     # Median offset (x, y) between stars and list; a large one is refused unless accepted.
     offset = (bright.centre - bright.listed)[:, ::-1]
@@ -301,7 +301,7 @@ def degrade_levels(settings: Settings, bright: BrightStars, sky_photons: float) 
         Photons of the sky in a pixel.
     """
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
-    degraded_snr = settings.calibration_stars.degraded()
+    degraded_snr = settings.calibration_stars.list_degraded_snr()
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in degraded_snr]
     # Levels ascend where S/N descend; nine digits, so that a file has the same number.
     noise = Noise(

@@ -25,7 +25,7 @@ from torch import nn
 from psfdae.base.rng import stream
 from psfdae.methods.networks.training import Row, Training
 from psfdae.methods.networks.weights import channels_last
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.stars.noise import NoiseModel, draw_levels
 from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
 from psfdae_paper.configuration.alignment import Cnn, NetworkTrain, Perceptron
 
@@ -256,7 +256,7 @@ class TrainingStates:
         if self.noise is None:
             return stamps
         # A level for each state, the same for its stamps at all fields.
-        levels = mixed_levels(np.asarray(self.levels), len(stamps), rng)
+        levels = draw_levels(np.asarray(self.levels), len(stamps), rng)
         return self.noise.draw_gaussian(stamps, levels, rng)
 
 

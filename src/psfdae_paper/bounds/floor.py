@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.methods.metrics import clustered_mean
+from psfdae.methods.metrics import cluster_mean
 
 
 def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ class Comparison:
         cls, errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = tolerance
     ) -> Comparison:
         """Compare squared errors and bounds of the same stars, which lie in `field`, all (n,)."""
-        difference, stderr = clustered_mean(errors - bounds, field)
+        difference, stderr = cluster_mean(errors - bounds, field)
         return cls(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)
 
     @property

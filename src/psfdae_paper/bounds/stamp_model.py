@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 
 from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
-from psfdae.optics.propagation import Precision, StampPropagator, in_batches
+from psfdae.optics.propagation import Precision, StampPropagator, run_grids
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
 from psfdae.telescope.settings import Telescope
@@ -107,7 +107,7 @@ class StampModel:
 
         # Draws that need the same pupil grid are propagated together.
         samples = self._operators["complex64"].samples(coefficients, offset)
-        in_batches(samples, self.optics.batch, 1, prepare)
+        run_grids(samples, self.optics.batch, 1, prepare)
         return stamps
 
     def derivatives(

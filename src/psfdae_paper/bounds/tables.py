@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.base.files import Product, ProductError
 from psfdae.methods import method as method_named
-from psfdae.methods.metrics import clustered_mean, mse
+from psfdae.methods.metrics import cluster_mean, mse
 from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.bounds.estimates import (
@@ -115,7 +115,7 @@ class Tables:
         # A row for each metric: mean, standard error clustered by field, and confidence interval.
         for metric in [name for name in ("mse", "p_right") if name in values]:
             value = values[metric][has_estimate]
-            mean, stderr = clustered_mean(value, field) if value.size else (np.nan, np.nan)
+            mean, stderr = cluster_mean(value, field) if value.size else (np.nan, np.nan)
             half = 1.959964 * stderr  # standard errors to either side of a 95 % interval
             row = {"metric": metric, "value": mean, "stderr": stderr}
             row |= {"ci_low": mean - half, "ci_high": mean + half}

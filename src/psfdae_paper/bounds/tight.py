@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.methods.metrics import clustered_mean
+from psfdae.methods.metrics import cluster_mean
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,6 @@ def calibration(error: np.ndarray, variance: np.ndarray, field: np.ndarray) -> f
     if not difference.any():
         return 0.0
     # Stars of one field are not independent: the standard error is clustered.
-    mean, stderr = clustered_mean(difference, field)
+    mean, stderr = cluster_mean(difference, field)
     with np.errstate(divide="ignore"):
         return float(np.divide(mean, stderr))

@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from psfdae.base.errors import did_you_mean
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae_paper.configuration.aligners import ESTIMATORS, swept_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir
@@ -313,7 +313,7 @@ def point_groups(model: str) -> tuple[str, ...]:
     """
     if model in swept_networks():
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
-    return (*groups_of(model), "evaluation")
+    return (*list_groups(model), "evaluation")
 
 
 def sweep_names() -> list[str]:

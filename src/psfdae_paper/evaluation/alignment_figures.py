@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.base.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.evaluation import drawing
@@ -28,7 +28,7 @@ def parameter_label(parameter: str) -> str:
     return parameter.replace("decenter", "decentre").replace("_", " ")
 
 
-@styled
+@apply_style
 def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) -> Figure:
     """Draw stamps at all fields, one row per treatment, in groups with a title.
 
@@ -68,7 +68,7 @@ def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> None:
     axes.set_yticks([])
 
 
-@styled
+@apply_style
 def draw_predictions(
     truth: np.ndarray, estimates: Mapping[str, Mapping[float, np.ndarray]]
 ) -> Figure:
@@ -115,7 +115,7 @@ def compute_size(states: np.ndarray) -> np.ndarray:
     return size
 
 
-@styled
+@apply_style
 def draw_errors_by_size(
     curves: Mapping[float, Mapping[str, tuple[np.ndarray, np.ndarray]]], title: str
 ) -> Figure:
@@ -171,7 +171,7 @@ def bin_errors(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndar
     return mean_size, mean_error, stderr
 
 
-@styled
+@apply_style
 def draw_twins(
     curves: pd.DataFrame, stamps: Sequence[tuple[str, np.ndarray]], state: np.ndarray
 ) -> Figure:
@@ -220,7 +220,7 @@ def draw_twins(
     return figure
 
 
-@styled
+@apply_style
 def draw_correlations(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> Figure:
     """Draw matrices of correlations; cells that are NaN stay empty.
 

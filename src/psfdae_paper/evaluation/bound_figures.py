@@ -16,10 +16,10 @@ from psfdae.base.figures import (
     SERIES_COLORS,
     WIDTH_IN,
     StripRow,
+    add_axes_in,
+    apply_style,
     draw_row,
-    in_inches,
     new_figure,
-    styled,
 )
 from psfdae.methods import method
 from psfdae.methods.interface import Method
@@ -43,7 +43,7 @@ MEANS: dict[str, Style] = {
 """Looks of both posterior means; a marker is open where the bank has too few similar stars."""
 
 
-@styled
+@apply_style
 def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
     """Draw the MSE of every method against the noise level, with both bounds.
 
@@ -87,7 +87,7 @@ def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) ->
     return figure
 
 
-@styled
+@apply_style
 def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """Draw bound over MSE of every method against the noise level, one panel per reference.
 
@@ -128,7 +128,7 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """Draw the error of the posterior mean against the size of the bank.
 
@@ -214,7 +214,7 @@ def _shade_below(axes: Axes, floor: pd.DataFrame, bottom: float) -> str:
     return color
 
 
-@styled
+@apply_style
 def draw_headline(
     rows: Sequence[StripRow],
     methods: Sequence[type[Method]],
@@ -242,7 +242,7 @@ def draw_headline(
     cell_width, cell_height = 0.395 / columns, (top - bottom) / len(rows)
     # Rows of stamps from the top; each is on the colour scale of the truth below it.
     cell = (cell_width * WIDTH_IN, cell_height * figure.get_figheight())
-    peak, stamps = rows[-1].images.max(axis=(1, 2)), in_inches(figure)
+    peak, stamps = rows[-1].images.max(axis=(1, 2)), add_axes_in(figure)
     for number, row in enumerate(rows, 1):
         row_bottom = top * figure.get_figheight() - number * cell[1]
         draw_row(stamps, row, (left_edge * WIDTH_IN, row_bottom), cell, peak)

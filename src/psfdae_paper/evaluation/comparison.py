@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from psfdae.methods.metrics import clustered_mean, clustered_ratio
+from psfdae.methods.metrics import cluster_mean, cluster_ratio
 from psfdae_paper.evaluation.measure import CELL
 
 SIGNIFICANT = 3.0
@@ -110,7 +110,7 @@ def compare_evaluations(
     """Compare the mean errors of two evaluations, with the significance of their difference.
 
     Paired star by star where both saw the same noisy images, else as independent
-    samples; standard errors are clustered by field (`clustered_mean`). Two trainings of one
+    samples; standard errors are clustered by field (`cluster_mean`). Two trainings of one
     setting differ by their seeds, too: `seed_stderr`.
 
     Parameters
@@ -159,11 +159,11 @@ def _compare_means(
         # Mean of the differences of the same stars.
         first, second = (table.sort_values("star") for table in (first, second))
         change = second[metric].to_numpy() - first[metric].to_numpy()
-        difference, stderr = clustered_mean(change, first["field"].to_numpy())
+        difference, stderr = cluster_mean(change, first["field"].to_numpy())
     else:
         # Difference of two independent means: their variances add.
         means = [
-            clustered_mean(table[metric].to_numpy(), table["field"].to_numpy())
+            cluster_mean(table[metric].to_numpy(), table["field"].to_numpy())
             for table in (first, second)
         ]
         difference = means[1][0] - means[0][0]
@@ -311,7 +311,7 @@ def measure_held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
         )
         if len(pairs):
             held_out_mse, random_mse = pairs.mse_held_out.to_numpy(), pairs.mse_random.to_numpy()
-            ratio, stderr = clustered_ratio(held_out_mse, random_mse, pairs.field.to_numpy())
+            ratio, stderr = cluster_ratio(held_out_mse, random_mse, pairs.field.to_numpy())
             means = (random_mse.mean(), held_out_mse.mean())
             rows.append((*key, *means, ratio, stderr, len(pairs), pairs.field.nunique()))
     columns = [*keys, "mse_random", "mse_held_out", "ratio", "stderr", "n", "fields"]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.base.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Style
 from psfdae_paper.evaluation.paper import read_paper_names
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@styled
+@apply_style
 def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     """Draw training and validation error of each network of a dataset.
 
@@ -66,7 +66,7 @@ def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> F
     return figure
 
 
-@styled
+@apply_style
 def draw_errors(metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric: str) -> Figure:
     """Draw a metric of every method against the noise level.
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from psfdae.base.figures import STAMP_MAP, new_figure, styled
+from psfdae.base.figures import STAMP_MAP, apply_style, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +77,7 @@ def make_mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarra
     return canvas
 
 
-@styled
+@apply_style
 def draw_templates(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
     """Draw all templates (F, d, d) at their field positions, as one mosaic.
 
@@ -96,7 +96,7 @@ def draw_templates(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: 
     return figure
 
 
-@styled
+@apply_style
 def draw_energy(energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int) -> Figure:
     """Draw the fraction of a star's light inside its stamp, shape (F,), over the field.
 
@@ -119,7 +119,7 @@ def draw_energy(energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_p
     return figure
 
 
-@styled
+@apply_style
 def draw_field(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> Figure:
     """Draw a mosaic of all stamps, and maps of the light in the stamp and of the FWHM.
 

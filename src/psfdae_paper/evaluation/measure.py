@@ -17,7 +17,7 @@ import pandas as pd
 from psfdae.base.files import Product
 from psfdae.base.reading import read_table
 from psfdae.methods.interface import Estimate
-from psfdae.methods.metrics import quality, summarised
+from psfdae.methods.metrics import quality, summarise_metrics
 from psfdae.training.star_sets import field_positions
 
 CELL = ["dataset", "split", "reference", "noise_level"]
@@ -104,4 +104,4 @@ class MeasuredStars:
         # Metrics of every star; their means have standard errors clustered by field.
         metrics = quality(estimate, self.truth, data_range)
         per_star = pd.DataFrame({**row, "star": self.star, "field": self.field, **metrics})
-        return summarised(row, metrics, self.field), per_star
+        return summarise_metrics(row, metrics, self.field), per_star

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.base.figures import SERIES_COLORS, StripRow, new_figure, restoration_strip, styled
+from psfdae.base.figures import SERIES_COLORS, StripRow, apply_style, new_figure, restoration_strip
 from psfdae.base.files import ProductError
 from psfdae.base.reading import read_table
 from psfdae.image.tables import html_table
@@ -123,7 +123,7 @@ def read_times(night: DataFrame) -> tuple[Any, str]:
     return night.index, "number of the image"
 
 
-@styled
+@apply_style
 def draw_telescope_numbers(night: DataFrame, names: Sequence[str]) -> Figure:
     """Draw numbers of the telescope, columns of the night's table, with their errors against time.
 
@@ -144,7 +144,7 @@ def draw_telescope_numbers(night: DataFrame, names: Sequence[str]) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def draw_night(night: DataFrame) -> Figure:
     """Draw FWHM and ellipticity at five positions, and the brightness of stars, against time."""
     figure = new_figure(6.5, layout="constrained")

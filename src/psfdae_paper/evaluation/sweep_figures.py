@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from psfdae.base.figures import SERIES_COLORS, new_figure, styled
+from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae_paper.evaluation.drawing import Style, make_entry
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ class SweepPoints:
         return "noise level λ"
 
 
-@styled
+@apply_style
 def draw_parallel_coordinates(points: SweepPoints) -> Figure:
     """Draw every point as a line over the axes of the sweep, coloured by its validation metric."""
     from matplotlib import colormaps
@@ -268,7 +268,7 @@ def draw_parallel_coordinates(points: SweepPoints) -> Figure:
     return figure
 
 
-@styled
+@apply_style
 def draw_response_curves(points: SweepPoints) -> Figure:
     """Draw validation and test metric against each axis of the sweep.
 

@@ -191,12 +191,12 @@ class PcaSom(Method):
         }
         columns = {
             name: Column(values[name], *unit_and_meaning)
-            for name, unit_and_meaning in self.stored().items()
+            for name, unit_and_meaning in self.list_arrays().items()
         }
         write_product(place, self.name, columns, described)
 
     @classmethod
-    def restored(
+    def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Make the fits from the arrays that `save` has written."""

@@ -49,7 +49,7 @@ class Wavefront(Method):
         Importance samples of each star.
     """
 
-    look = Look("optics of the telescope", "#e69f00", "*", drawn=False)
+    look = Look("optics of the telescope", "#e69f00", "*", is_drawn=False)
     needs = Needs(level=True)
     storage = None
     packing = None
@@ -155,7 +155,7 @@ class Wavefront(Method):
             fields = None if position is None else position[has_no_mode]
             fallback = self.mixture.estimate(noisy[has_no_mode], level, fields)
             psf[has_no_mode], sigma[has_no_mode] = fallback.psf, fallback.sigma
-        return Estimate(psf, sigma, explained=is_explained)
+        return Estimate(psf, sigma, is_explained=is_explained)
 
     def modes(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None

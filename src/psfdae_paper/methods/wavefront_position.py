@@ -14,6 +14,6 @@ from psfdae_paper.methods.wavefront import Wavefront
 class PlacedWavefront(Wavefront):
     """Estimator `Wavefront` for stars whose field is given."""
 
-    look = Look("optics of the telescope", "#b8860b", "p", drawn=False)
+    look = Look("optics of the telescope", "#b8860b", "p", is_drawn=False)
     needs = Needs(level=True, position=True)
     fallback: ClassVar = PlacedMixture

@@ -30,12 +30,12 @@ from psfdae.base.options import AboveZero, File, Folder
 from psfdae.base.progress import steps
 from psfdae.base.reading import from_tree, read_yaml
 from psfdae.base.rng import stream
-from psfdae.base.settings import deciding, parse_settings
+from psfdae.base.settings import dump_deciding, parse_settings
 from psfdae.base.threads import limit_threads
 from psfdae.methods.dae import Dae
 from psfdae.methods.fit_files import store
 from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
-from psfdae.stars.noise import mixed_levels
+from psfdae.stars.noise import draw_levels
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.aligners import (
@@ -195,7 +195,7 @@ def train_network(
     # A checkpoint is resumed only if settings and stamps are the same.
     with progress(settings.epochs) as report:
         # The fingerprint covers stamps, and all settings that can change the result.
-        identity = fingerprint(network_config | deciding(config), data.stamps)
+        identity = fingerprint(network_config | dump_deciding(config), data.stamps)
         training = train(lambda _: begin(), checkpoint, identity, report)
     # Weights first: a folder with a configuration is complete.
     save_weights(out / Estimator.weights_file, training.result, network_config)
@@ -224,14 +224,14 @@ def denoise_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> 
     TrainingStates
         States without noise, with stamps of shape (draws, n, F, d, d).
     """
-    from psfdae.methods.networks.training import half_precision
+    from psfdae.methods.networks.training import use_half_precision
 
     assert data.noise is not None
     # A stream of the network's name: all draws of one network are different.
     rng = stream(config.seed, "cnn", "noise", kind)
     count = getattr(config, f"train_{kind}").noise_draws
     # Each state has one noise level, which is the same in all draws.
-    level = mixed_levels(np.asarray(data.levels), len(data.states), rng)
+    level = draw_levels(np.asarray(data.levels), len(data.states), rng)
     dae_stamps = np.empty((count, *data.stamps.shape), np.float32)
     for draw in dae_stamps:
         # 1000 states at a time limit the memory.
@@ -239,7 +239,7 @@ def denoise_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> 
             part = slice(start, start + 1000)
             noisy = data.noise.draw(data.stamps[part], level[part], rng)
             # Errors of the states are the same as in single precision (studies/training).
-            with half_precision():
+            with use_half_precision():
                 draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
     return replace(data, stamps=dae_stamps, noise=None)
 
@@ -332,7 +332,7 @@ def load_predictor(
     """
     import torch
 
-    from psfdae.methods.networks.weights import with_weights
+    from psfdae.methods.networks.weights import load_network
     from psfdae_paper.alignment.networks import make_network, predict_states
     from psfdae_paper.alignment.telescope import mirror_symmetries
 
@@ -353,7 +353,7 @@ def load_predictor(
     settings = from_tree(path, tree, training.network, make=partial(parse_settings, kind))
     # The number of threads can change the last digits.
     torch.set_num_threads(config.evaluation.threads)
-    model = with_weights(
+    model = load_network(
         lambda: make_network(settings, fields, side), folder / Estimator.weights_file
     )
     # The field points are a centre and a circle of points; a mirror image permutes these.
@@ -575,7 +575,7 @@ def fit_alignment_method(
         # Deviance −2 ln L, with ln L = 0 for a perfect fit.
         fits["deviance"].append(-2.0 * final_fit.height)
         fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
-        fits["converged"].append(final_fit.converged)
+        fits["converged"].append(final_fit.has_converged)
         fits["twin_tried"].append(twin_tried)
         fits["twin_won"].append(best_fit.parameters[:, 0] != first_fit.parameters[:, 0])
     # A column for each of them, with its description.

@@ -132,11 +132,11 @@ def _fit_config(
             )
     # A fit is a folder or one file.
     file = fit_path / CONFIG if fit_path.is_dir() else fit_path
-    fit_config = method_class.described(fit_path)
+    fit_config = method_class.read_config(fit_path)
     # Its configuration says how it was trained: the groups of the method, and the split of the
     # stars; also the reference, if there is a fit for each.
     required_keys = {*SEEN_BY_TRAINING, *method_class.groups, "split"}
-    required_keys |= {"reference"} if fits.storage_of(method_class).per_reference else set()
+    required_keys |= {"reference"} if fits.get_storage(method_class).per_reference else set()
     if missing := required_keys - set(fit_config):
         raise BundleError(f"{file}: key {min(missing)!r} is missing")
     # Errors are measured with the noise and on the parts of the training, hence they must agree.

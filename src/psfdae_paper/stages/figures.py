@@ -180,7 +180,7 @@ def make_strip_rows(
     ):
         kind = method(name)
         # Noisy images have their own colour scale: noise exceeds the PSF.
-        if kind.look.drawn:
+        if kind.look.is_drawn:
             errors, is_noisy = mse(images[stars], truth), not kind.look.restores
             rows[kind] = StripRow(kind.look.label, images[stars], errors, is_noisy)
     return rows

@@ -16,7 +16,7 @@ from psfdae.base.options import File, Folder
 from psfdae.base.settings import Reference, SplitKind
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import all_groups
@@ -35,7 +35,7 @@ def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
     **options
         The other options of the command, which are not used.
     """
-    return groups_of(name) if name else ("seed", "noise", "parts", *all_groups())
+    return list_groups(name) if name else ("seed", "noise", "parts", *all_groups())
 
 
 @command("paper fit", reads=groups_read)
@@ -81,7 +81,7 @@ def fit(
     method_class = method(name)
     limit_threads(method_class.threads(config))
     # Stars of the split with their noise; the training state is saved next to the fit.
-    product = read_stars(stars, fits.learnt(method_class, reference))
+    product = read_stars(stars, fits.get_training_reference(method_class, reference))
     checkpoint_path = checkpoint or fits.path_beside(method_class, out, "checkpoint.pt")
     data = training_set(config, method_class, product, split, reference, checkpoint=checkpoint_path)
     # Warm start: a fit to templates begins with the result of a fit to the realisations.
@@ -93,7 +93,7 @@ def fit(
         fits.require_fit(method_class, start, product, config, split, "realisation")
         data = replace(data, start=method_class.load(start))
     # Fit, save with its configuration, and delete the state of the training.
-    fit_config = fits.described_by(method_class, config.model_dump(), split, reference)
+    fit_config = fits.describe_fit(method_class, config.model_dump(), split, reference)
     # The same call as for an astronomer's own stars.
     estimator = method_class.fit(data, **method_class.settings(config))
     fits.store(estimator, out, fit_config, product)

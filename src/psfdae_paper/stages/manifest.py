@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from psfdae.base.files import sha256_of, write_text
+from psfdae.base.files import compute_sha256, write_text
 from psfdae.base.options import Folder
 from psfdae_paper.configuration.command import command
 
@@ -33,5 +33,5 @@ def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
         is_hidden = any(part.startswith(".") for part in name.parts)
         is_product = not is_hidden and name.parts[0] not in no_products
         if path.is_file() and is_product and other_runs.isdisjoint(path.parents):
-            lines.append(f"{sha256_of(path)}  {name.as_posix()}\n")
+            lines.append(f"{compute_sha256(path)}  {name.as_posix()}\n")
     write_text(results / "SHA256SUMS", "".join(lines))

@@ -13,7 +13,7 @@ from psfdae.base.files import read_product
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
 from psfdae.methods import fit_files as fits
-from psfdae.methods import groups_of, method
+from psfdae.methods import list_groups, method
 from psfdae.methods.interface import HISTORY
 from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.configuration.compose import part
@@ -54,18 +54,16 @@ def measure(config: Config, task: Task, model: str) -> Measurement:
         If the training cannot continue: its errors are not finite, or all its starts have failed.
     """
     method_class = method(model)
-    settings = part(groups_of(model), config)
+    settings = part(list_groups(model), config)
     stars, out = task.data["stars"], locate_fit(method_class, task.folder)
     limit_threads(method_class.threads(settings))
     # Errors on validation stars need a fit without them. Some methods leave them out, or use
     # them only to stop the training; the others are fitted to them in the main workflow.
     validation_fit = None
     if not method_class.needs.validation:
-        product = read_stars(stars, fits.learnt(method_class, task.reference))
+        product = read_stars(stars, fits.get_training_reference(method_class, task.reference))
         data = training_set(settings, method_class, product, task.split, task.reference)
-        validation_fit = method_class.fit(
-            data.without_validation(), **method_class.settings(settings)
-        )
+        validation_fit = method_class.fit(data.drop_validation(), **method_class.settings(settings))
     # The fit of the main workflow, with its cost.
     start_s, start_cpu_s = time.monotonic(), time.process_time()
     key = task.split, task.reference
@@ -76,10 +74,10 @@ def measure(config: Config, task: Task, model: str) -> Measurement:
     estimator = method_class.load(out, task.reference, config.evaluation)
     metrics = measure_images(config, task, model, validation_fit or estimator, estimator)
     # Settings of the fit; the start that succeeded is a result.
-    fit_config = method_class.described(out)
+    fit_config = method_class.read_config(out)
     attempt = fit_config.pop("attempt", 0)
     epochs, is_stopped = None, False
-    if HISTORY in fits.storage_of(method_class).diagnostics:
+    if HISTORY in fits.get_storage(method_class).diagnostics:
         # The history has the duration of the training, with all parts of an interrupted one.
         last_epoch = read_table(fits.path_beside(method_class, out, HISTORY)).iloc[-1]
         seconds, cpu_seconds = float(last_epoch["seconds"]), float(last_epoch["cpu_seconds"])

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from psfdae.base.errors import Error
-from psfdae.base.files import as_csv, as_yaml, sha256_of, write_text
+from psfdae.base.files import as_csv, as_yaml, compute_sha256, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
 from psfdae.base.version import __version__
@@ -377,7 +377,7 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
     if run.data is not None and run.data.is_file():
         source = json.dumps({"uri": run.data.resolve().as_uri()})
         # Sixteen digits of the checksum identify a dataset.
-        data = Dataset(run.dataset, sha256_of(run.data)[:16], "local", source)
+        data = Dataset(run.dataset, compute_sha256(run.data)[:16], "local", source)
         training = [InputTag("mlflow.data.context", "training")]
         client.log_inputs(run_id, [DatasetInput(data, training)])
         origin = {"dataset_name": data.name, "dataset_digest": data.digest}

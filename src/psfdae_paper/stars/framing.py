@@ -13,13 +13,13 @@ import numpy as np
 
 from psfdae.base.errors import Error
 from psfdae.base.files import Product
-from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
+from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, run_grids
 from psfdae.optics.pupil import (
     Pupil,
     SamplingError,
     annular_pupil,
     choose_samples,
-    required_samples,
+    count_samples,
 )
 from psfdae.optics.seeing import BlurredPropagator
 from psfdae.optics.wavefronts import WavefrontSource
@@ -214,7 +214,7 @@ class Propagation:
                 )
         # The smallest pupil grid without aliasing within ± edge, from the wavefront's slopes.
         slopes = source.slopes()
-        min_samples = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
+        min_samples = count_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(min_samples, tuple(optics.pupil_samples))
         self._centre, self._reach = search_windows(slopes, pixel, search_px)
         self._pupils: dict[int, Pupil] = {}
@@ -409,7 +409,7 @@ class Propagation:
         """Process wavefronts in batches of one grid size, by the function from `prepare`."""
         # torch has threads of its own, inside every product.
         threads = 1 if self.optics.backend == "torch" else self.optics.threads
-        in_batches(self.samples[stars], self.optics.batch, threads, prepare)
+        run_grids(self.samples[stars], self.optics.batch, threads, prepare)
 
     def _propagator(
         self, pupil: Pupil, stamp_px: int, precision: Precision, extra: int = EXTRA_POINTS

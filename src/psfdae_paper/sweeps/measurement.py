@@ -18,7 +18,7 @@ from psfdae.base.files import write_csv
 from psfdae.base.reading import from_tree, read_json
 from psfdae.base.rng import stream
 from psfdae.base.settings import Reference, SplitKind
-from psfdae.methods.fit_files import storage_of
+from psfdae.methods.fit_files import get_storage
 from psfdae.methods.interface import Method
 from psfdae.training.star_sets import noise_model, noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.schema import Config
@@ -190,4 +190,4 @@ def locate_fit(kind: type[Method], folder: Path) -> Path:
 
     A method with several files, such as a network, has a folder; one with a product has a file.
     """
-    return folder if storage_of(kind).files else folder / f"{kind.name}.h5"
+    return folder if get_storage(kind).files else folder / f"{kind.name}.h5"

@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 
 
 class SingleChannelConv(nn.Conv2d):
-    """Convolution to one channel, its kernel of an odd side k and its padding k // 2.
+    """Convolution to one channel, with a kernel of odd side k and the padding k // 2.
 
-    oneDNN vectorises over output channels and is slow for one. On the CPU, one strided convolution
-    computes blocks of output pixels, with a channel for each pixel of a block. The gradients come
-    from the transposed convolution, from one channel to many, which is fast.
+    oneDNN vectorises over output channels and is slow for a single one. On the CPU, one strided
+    convolution computes blocks of output pixels, with a channel for each pixel of a block.
+    Gradients are computed by the transposed convolution, from one channel to many, which is fast.
     """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        # Always float32: the result is the PSF, of which bfloat16 rounds pixels by up to 0.2 %.
+        # Always float32: the result is the PSF, whose pixels bfloat16 would round by up to 0.2 %.
         with torch.autocast("cpu", enabled=False):
             output: torch.Tensor = _ToOneChannel.apply(x.float(), self.weight, self.bias)  # type: ignore[no-untyped-call]
         return output
@@ -59,35 +59,35 @@ class _ToOneChannel(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.save_for_backward(x, weight)
         (height, width), side = x.shape[-2:], weight.shape[-1]
-        # Blocks of 4 x 4 output pixels, so that there are 16 channels for vector instructions.
+        # Blocks of 4 x 4 output pixels give 16 channels for vector instructions.
         block = 4
-        # All pixels of a block together see s + block − 1 pixels along an axis. The kernel of one
-        # of them is the weight, shifted within a window of that side; elsewhere it is zero.
+        # All pixels of a block together depend on s + block − 1 pixels along an axis. The kernel of
+        # one pixel is the weight, shifted within a window of this side; elsewhere it is 0.
         window_px = side + block - 1
-        padded = nn.functional.pad(weight[0], (block - 1,) * 4)
-        # Window i of the padded weight is that of pixel block − 1 − i of a block.
-        windows = padded.unfold(1, window_px, 1).unfold(2, window_px, 1).flip(1, 2)
+        padded_weight = nn.functional.pad(weight[0], (block - 1,) * 4)
+        # Window i of the padded weight belongs to pixel block − 1 − i of a block.
+        windows = padded_weight.unfold(1, window_px, 1).unfold(2, window_px, 1).flip(1, 2)
         kernels = windows.permute(1, 2, 0, 3, 4).flatten(0, 1)
-        # Zeros fill up the last blocks of an image whose side is no multiple of theirs.
+        # Zeros complete the last blocks of an image whose side is not a multiple of the block.
         if width % block or height % block:
             x = nn.functional.pad(x, (0, -width % block, 0, -height % block))
-        # The bias is that of every pixel.
+        # Every pixel has the same bias.
         blocks = nn.functional.conv2d(
             x, kernels, bias.expand(block**2), stride=block, padding=side // 2
         )
-        # From block² channels, one for each pixel of a block, to one channel; without the filling.
+        # From block² channels, one for each pixel of a block, to one channel; zeros are cut off.
         return nn.functional.pixel_shuffle(blocks, block)[..., :height, :width]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        # The adjoint of a correlation with an odd kernel is that with the flipped kernel. The
-        # gradient by the weight is the correlation of images and gradient; both are computed for
-        # exchanged channels, from one to many.
+        # The adjoint of a correlation with an odd kernel is the correlation with the flipped
+        # kernel. The gradient with respect to the weight is the correlation of images and gradient.
+        # Both are computed with exchanged channels, from one to many.
         x, weight = ctx.saved_tensors
-        flipped, padding = weight.flip(2, 3).transpose(0, 1), weight.shape[-1] // 2
-        by_image = nn.functional.conv2d(grad, flipped, padding=padding)
-        by_weight = conv2d_weight(grad, flipped.shape, x, padding=padding)
+        flipped_weight, padding = weight.flip(2, 3).transpose(0, 1), weight.shape[-1] // 2
+        by_image = nn.functional.conv2d(grad, flipped_weight, padding=padding)
+        by_weight = conv2d_weight(grad, flipped_weight.shape, x, padding=padding)
         return by_image, by_weight.flip(2, 3).transpose(0, 1), grad.sum().view(1)
 
 
@@ -106,7 +106,7 @@ class DaeNetwork(nn.Module):
         super().__init__()
         self.kernels, self.widths = tuple(kernels), tuple(widths)
         self.layers = nn.ModuleList()
-        # One channel enters, one leaves; the padding keeps the side of the images.
+        # One input and one output channel; the padding keeps the side of the images.
         channels = pairwise([1, *widths, 1])
         for (inputs, outputs), kernel in zip(channels, kernels, strict=True):
             layer_class = nn.Conv2d if outputs > 1 else SingleChannelConv
@@ -114,12 +114,12 @@ class DaeNetwork(nn.Module):
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
-        """Layers as convolutions; the type of torch's list is that of any modules."""
+        """Layers as convolutions; torch's list has the type of any modules."""
         return [layer for layer in self.layers if isinstance(layer, nn.Conv2d)]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled star images (B, 1, d, d) to scaled PSFs of the same shape."""
-        # The last ReLU, too: a PSF is not negative.
+        # ReLU after the last layer, too: a PSF is not negative.
         for layer in self.layers:
             x = torch.relu(layer(x))
         return x
@@ -131,7 +131,7 @@ def build_dae(
     init: Literal["linear", "he", "default"],
     generator: torch.Generator,
 ) -> DaeNetwork:
-    """Return a fresh network whose weights come from `generator` alone.
+    """Return a new network with random weights from `generator`.
 
     Parameters
     ----------
@@ -142,11 +142,12 @@ def build_dae(
         `begin_linear` then changes the latter. "default" is PyTorch's uniform distribution
         between ±1/√fan_in for weights and biases.
     generator : torch.Generator
+        Source of all random numbers.
 
     Returns
     -------
     DaeNetwork
-        With the weights in the order in memory that makes convolutions fastest.
+        Network whose weights are in the order in memory that makes convolutions fastest.
     """
     model = channels_last(DaeNetwork(kernels, widths))
     # In the order of the layers, weights before biases, because the draws depend on it.
@@ -154,7 +155,7 @@ def build_dae(
         for layer in model.layers:
             weight, bias = layer.parameters()
             if init == "default":
-                # fan_in: how many numbers of the layer's input make one of its output.
+                # fan_in: number of inputs of a layer that contribute to one output.
                 bound = float(weight[0].numel()) ** -0.5
                 weight.uniform_(-bound, bound, generator=generator)
                 bias.uniform_(-bound, bound, generator=generator)
@@ -173,31 +174,31 @@ def begin_linear(
     weight: np.ndarray,
     pixels: np.ndarray,
 ) -> None:
-    """Turn a freshly drawn network into about the best linear estimator that its kernels allow.
+    """Initialise a random network as nearly the best linear estimator that its kernels allow.
 
-    A training from there needs fewer epochs than one from random weights. The first layer projects
-    on the pixel itself and on the leading eigenpatches of the stars, each with both signs, because
-    the ReLU keeps the positive part alone: v = ReLU(v) − ReLU(−v). Inner layers copy each channel,
-    with a tenth of the random draw, so that their channels differ. The last layer is the least
-    squares solution from there to the references.
+    A training then needs fewer epochs than with random weights. The first layer projects on the
+    pixel itself and on the leading eigenpatches of the stars, each with both signs, because the
+    ReLU keeps only the positive part: v = ReLU(v) − ReLU(−v). Inner layers copy each channel, plus
+    a tenth of the random weights, so that their channels differ. The last layer is the least
+    squares solution for the references.
 
     Parameters
     ----------
     model : DaeNetwork
         Network of `build_dae`; its weights are changed in place.
     noisy, references : ndarray, shape (n, d, d)
-        Images as the network sees them, and the noise-free images that it is to return.
+        Images in the scale of the network, and the noise-free images that are its targets.
     weight : ndarray, shape (n,)
         Weight of each star in the sum of squares.
     pixels : ndarray of int, shape (n, m)
-        Pixels of each star, counted along its rows, that enter the sum of squares.
+        Pixels of each star in the sum of squares, counted along its rows.
 
     Raises
     ------
     TrainingError
         If an image or reference is not finite.
     """
-    # Before any product, as one NaN would spread to all weights.
+    # Checked before any product, because one NaN would spread to all weights.
     if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
         raise TrainingError("training stars that are not finite")
     first, *inner_layers, _ = model.convolutions
@@ -220,7 +221,7 @@ def begin_linear(
         middle = layer.kernel_size[0] // 2
         for channel in range(min(layer.in_channels, layer.out_channels)):
             layer.weight[channel, channel, middle, middle] += 1.0
-    # Given these layers, the last one follows from a linear system.
+    # For given other layers, the last layer is the solution of a linear system.
     fit_last_layer(model, images, references.reshape(len(references), -1), weight, pixels)
 
 
@@ -233,15 +234,15 @@ def fit_last_layer(
 ) -> None:
     """Fit the weights and the bias of the last layer to the references by least squares.
 
-    Minimises Σ w (aᵀ x − y)² over the chosen pixels of all stars: x are the values that the last
-    layer sees of a pixel and a 1 for the bias, y is the reference, w the weight of the star.
+    Minimises Σ w (aᵀ x − y)² over the chosen pixels of all stars: x are the inputs of the last
+    layer for a pixel and a 1 for the bias, y is the reference, and w the weight of the star.
 
     Parameters
     ----------
     model : DaeNetwork
         Network whose other layers are set; the last one is changed in place.
     images : torch.Tensor, shape (n, 1, d, d)
-        Images as the network sees them.
+        Images in the scale of the network.
     references : ndarray, shape (n, d²)
         Noise-free images.
     weight, pixels : ndarray
@@ -260,7 +261,7 @@ def fit_last_layer(
         x = images[block].to(memory_format=torch.channels_last)
         for layer in leading_layers:
             x = torch.relu(layer(x))
-        # Patches about all pixels, then those of the chosen pixels, with 1 for the bias.
+        # Patches about all pixels, then only about the chosen pixels, with 1 for the bias.
         x = nn.functional.pad(x, (side // 2,) * 4).unfold(2, side, 1).unfold(3, side, 1)
         row, column = np.divmod(pixels[block], x.shape[3])
         x = x[np.arange(len(x))[:, None], :, row, column].flatten(2)
@@ -280,7 +281,7 @@ def fit_last_layer(
 
 
 def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
-    """Return the factor from images of sum 1 to those that the network sees.
+    """Return the factor from images of sum 1 to inputs of the network.
 
     "mean" is d² for stamps of d × d pixels, which makes their mean 1; "none" is 1.
     """
@@ -288,28 +289,27 @@ def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
 
 
 def middle_px(stamp_px: int, part: float, reference: str) -> int:
-    """Return the side of the middle of stamps that a training sees, in px.
+    """Return the side of the middle of stamps that a training uses, in px.
 
-    Most of a star's light is there, and all that a convolution has to learn but the border. The
-    side is even if that of the stamps is, and odd if that is odd, so that the middle stays.
+    Most of a star's light is there, and a convolution can be trained on it except for the border.
+    The side is even for even stamps and odd for odd ones, so that the middle is the same.
 
     Parameters
     ----------
     stamp_px : int
         Side of the stamps.
     part : float
-        Index of the epoch, from 0, over the number of epochs that see the middle alone.
+        Index of the epoch, from 0, over the number of epochs with the middle only.
     reference : str
-        "realisation": half of the side at first, then more and more, and whole stamps from 1 on. A
-        "template" depends on more of the stamp: three quarters of the side, and whole stamps from
-        2/3 on.
+        "realisation": half of the side at first, growing to whole stamps at part = 1. A "template"
+        depends on more of the stamp: three quarters of the side, and whole stamps from part = 2/3.
     """
-    # Part of the side that is seen, and the same number of pixels less on either edge.
+    # Fraction of the side that is used.
     if reference == "realisation":
         middle = 0.5 + 0.5 * min(part, 1.0) ** 2
     else:
         middle = 0.75 if part < 2 / 3 else 1.0
-    # As many pixels less on either edge: the brightest pixel stays in the middle.
+    # The same number of pixels is cut off at both edges: the brightest pixel stays in the middle.
     return stamp_px - 2 * round(0.5 * (1.0 - middle) * stamp_px)
 
 
@@ -328,36 +328,36 @@ def run_network(
     factor : float
         Result of `image_scale`.
     batch : int, optional
-        Images per forward pass; by default as many as make 2^18 numbers, or 1 MB, between two
-        layers, which stay in a core's cache.
+        Images per forward pass; by default 2^18 numbers (1 MB) between two layers, which fit into a
+        core's cache.
 
     Returns
     -------
     ndarray, shape (n, d, d), float32
         PSFs of about sum 1, neither clipped nor renormalised.
     """
-    # In batches, 64 images of 16 × 16 pixels with 16 channels: those of a thousand, whose channels
-    # leave the cache, take up to twice the time (docs/benchmark.md).
+    # Small batches, such as 64 images of 16 × 16 pixels with 16 channels: batches of a thousand,
+    # which do not fit into the cache, take up to twice the time (docs/benchmark.md).
     batch = batch or max(1, 2**18 // (max(model.widths) * noisy.shape[-1] ** 2))
     model.eval()
     psf = np.empty(noisy.shape, dtype=np.float32)
     for start in range(0, len(noisy), batch):
         images = torch.from_numpy(np.ascontiguousarray(noisy[start : start + batch], np.float32))
-        scaled = (images[:, None] * factor).to(memory_format=torch.channels_last)
-        psf[start : start + batch] = (model(scaled)[:, 0] / factor).numpy()
+        network_images = (images[:, None] * factor).to(memory_format=torch.channels_last)
+        psf[start : start + batch] = (model(network_images)[:, 0] / factor).numpy()
     return psf
 
 
 class DaeTraining(Training):
-    """Training on noisy images, with noise that is drawn anew in every epoch, or once.
+    """Training on noisy images, with new noise in every epoch or the same noise in all epochs.
 
     It may begin with the middle of the stamps, where an epoch takes less time. The history
-    has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
+    has MSEs of flux-normalised images. Another attempt uses other initial weights and noise.
 
     Parameters
     ----------
     data : TrainingSet
-        Stars with their references, and the network to go on from if there is one.
+        Stars with their references, and the network of a warm start if there is one.
     dae : DaeSettings
         Shape of the network and its initial weights.
     settings : Train
@@ -371,7 +371,7 @@ class DaeTraining(Training):
     model: DaeNetwork
     settings: Train
     linear_px = 24_000
-    """Number of random pixels to which the last layer of a network that begins linear is fitted."""
+    """Number of random pixels in the fit of the last layer of a linear start."""
 
     def __init__(
         self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
@@ -380,7 +380,7 @@ class DaeTraining(Training):
         # The last digits of the linear start depend on the number of threads, too.
         torch.set_num_threads(settings.threads)
         self.factor = image_scale(dae.scale, data.images.shape[-1])
-        # Initial weights: random, those of a fit to realisations, or about a linear estimator.
+        # Initial weights: random, from a fit to realisations, or nearly a linear estimator.
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
@@ -388,8 +388,8 @@ class DaeTraining(Training):
             start: Any = data.start  # a `psfdae.methods.dae.Dae`, of a layer above this one
             model.load_state_dict(start.network.state_dict())
         elif dae.init == "linear":
-            # 1500 noisy stars, and about `linear_px` random pixels of them, are enough for a start
-            # from which the training goes on.
+            # 1500 noisy stars, and about `linear_px` random pixels of them, are enough for the
+            # start of a training.
             rng = stream(seed, "dae", "linear", attempt)
             stars = rng.permutation(data.fit)[:1500]
             noisy, level = data.draw(stars, rng)
@@ -404,24 +404,24 @@ class DaeTraining(Training):
         # The last batch of an epoch may be smaller.
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
-        # One noisy image of every star for all epochs, if the settings ask for that.
-        self.fixed: tuple[np.ndarray, ...] | None = None
+        # One noisy image of every star for all epochs, with the setting "fixed".
+        self.constant_draw: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
-            self.fixed = data.draw(stars, stream(seed, "dae", "fixed noise"))
+            self.constant_draw = data.draw(stars, stream(seed, "dae", "fixed noise"))
 
     def begin(self, lr: float) -> torch.optim.Optimizer:
         """Return the optimiser: Muon for the weights of the inner layers, Adam for the others.
 
-        With the setting "adam", all weights are Adam's. Muon is meant for the matrices between
-        hidden layers, not for the first and the last layer (K. Jordan et al. 2024).
+        With the setting "adam", Adam is used for all weights. Muon is meant for the matrices
+        between hidden layers, not for the first and the last layer (K. Jordan et al. 2024).
         """
         if self.settings.optimiser == "adam":
             return Adam(self.model.parameters(), lr=lr, fused=True)
         matrices = [layer.weight for layer in self.model.convolutions[1:-1]]
-        # By identity, as "in" would compare the values of tensors.
+        # By identity, because "in" would compare the values of tensors.
         by_adam = [p for p in self.model.parameters() if all(p is not w for w in matrices)]
-        # First and last layer, and all biases, are left to Adam.
+        # Adam for the first and the last layer, and for all biases.
         groups: list[dict[str, Any]] = [
             {"params": by_adam},
             {"params": matrices, "orthogonal": True},
@@ -436,7 +436,7 @@ class DaeTraining(Training):
         noisy, reference : torch.Tensor, shape (B, 1, d, d)
             Noisy and noise-free images in the scale of the network, or the middle of them.
         weight : torch.Tensor, shape (B, 1, 1, 1)
-            Weight of each star's squared error, 1/λ^p of its noise level λ over the mean of this
+            Weight of each star's squared error, 1/λ^p of its noise level λ over the mean of 1/λ^p
             over all levels.
         """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
@@ -449,23 +449,23 @@ class DaeTraining(Training):
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
             stars = order[start : start + self.settings.batch]
-            if self.fixed is None:
+            if self.constant_draw is None:
                 noisy, level = self.data.draw(stars, rng)
             else:
-                noisy, level = (fixed[stars] for fixed in self.fixed)
-            # Squared errors grow with λ: without weights, the faintest stars would decide alone.
-            # 1/λ^p over its mean, so that the loss is about as large for any power p.
+                noisy, level = (arrays[stars] for arrays in self.constant_draw)
+            # Squared errors grow with λ: without weights, the faintest stars would dominate. 1/λ^p
+            # is divided by its mean, so that the loss is about as large for any power p.
             power = -self.settings.level_weight
             weight = level**power / np.mean(self.data.levels**power)
-            weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
+            star_weight = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
             references = self.data.references[stars]
-            yield self._tensor(noisy, edge), self._tensor(references, edge), weighted
+            yield self._tensor(noisy, edge), self._tensor(references, edge), star_weight
 
     def _tensor(self, images: np.ndarray, edge: int) -> torch.Tensor:
         """Return images (B, d, d) without `edge` pixels on each side, in the network's scale."""
         middle = slice(edge, images.shape[-1] - edge)
-        scaled = torch.from_numpy(images[:, middle, middle])[:, None] * self.factor
-        return scaled.to(memory_format=torch.channels_last)
+        network_images = torch.from_numpy(images[:, middle, middle])[:, None] * self.factor
+        return network_images.to(memory_format=torch.channels_last)
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the weighted mean squared error of a batch.
@@ -473,11 +473,11 @@ class DaeTraining(Training):
         Raises
         ------
         DeadNetworkError
-            If all outputs are zero, which is looked for every `dead_check_steps` steps.
+            If all outputs are zero, which is checked every `dead_check_steps` steps.
         """
         noisy, target, weight = batch
         output: torch.Tensor = self.model(noisy)
-        # Not at every step, because the look at the values waits for the computation.
+        # Not at every step, because reading the values waits for the computation.
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         # (1/n) Σ w (f(z) − y)² over the pixels of all stars.
@@ -486,8 +486,8 @@ class DaeTraining(Training):
     def validate(self, epoch: int) -> float:
         """Return the mean squared error of the validation stars, of sum 1.
 
-        It is computed every `validate_every` epochs and after the last one; NaN after others. The
-        noise is the same each time, so that errors of epochs can be compared.
+        It is computed every `validate_every` epochs and after the last one; NaN after other epochs.
+        The noise is the same each time, so that errors of epochs can be compared.
 
         Raises
         ------
@@ -498,7 +498,7 @@ class DaeTraining(Training):
         """
         if epoch % self.settings.validate_every and epoch != self.settings.epochs:
             return float("nan")
-        # Every star with several draws of noise, which are the same in all epochs.
+        # Every star with several draws of noise, the same draws in all epochs.
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = run_network(self.model, noisy, self.factor)
@@ -515,8 +515,8 @@ class DaeTraining(Training):
         return error
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
-        """Return a row of the history; the learning rate is that at the epoch's start."""
-        # The network sees images times a factor: errors are over its square.
+        """Return a row of the history, with the learning rate at the start of the epoch."""
+        # Images of the network are multiplied by a factor: errors are divided by its square.
         return {
             "epoch": epoch,
             "step": epoch * self.steps,
@@ -527,10 +527,10 @@ class DaeTraining(Training):
             "cpu_seconds": round(self.cpu_seconds, 3),
         }
 
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Return True if all epochs are done, or `patience` validations were not better."""
         scores = [row["validation_mse"] for row in self.history]
         scores = [score for score in scores if np.isfinite(score)]
-        # Only the epochs that were validated. Of these, the number since the smallest error.
+        # Number of validations since the smallest error; NaN marks epochs without validation.
         stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
-        return super().finished() or 0 < self.settings.patience <= stale
+        return super().is_finished() or 0 < self.settings.patience <= stale

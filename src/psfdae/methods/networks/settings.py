@@ -27,7 +27,7 @@ class DaeSettings(Group):
 
     @model_validator(mode="after")
     def check_shape(self) -> DaeSettings:
-        """Refuse kernels without a middle pixel, and widths that do not fit between kernels."""
+        """Raise ValueError for even kernels, or a wrong number of widths."""
         if any(k % 2 == 0 for k in self.kernels):
             raise ValueError(f"kernels = {self.kernels}: must be odd")
         if len(self.widths) != len(self.kernels) - 1:
@@ -48,9 +48,9 @@ class Train(Group):
     lr: Annotated[float, Field(gt=0, le=1)] = 6.0e-3
     """Adam's learning rate (its maximum if one-cycle)."""
     optimiser: Literal["adam", "muon"] = "muon"
-    """Optimiser of the inner layers' weights; all else is Adam's."""
+    """Optimiser of the inner layers' weights; all other weights use Adam."""
     level_weight: Annotated[float, Field(ge=0, le=2)] = 1.0
-    """Power p by which the squared error of a star counts 1/λ^p; 0: all alike."""
+    """Power p of the weight 1/λ^p of a star's squared error; 0: equal weights."""
     schedule: Literal["onecycle", "constant"] = "onecycle"
     """Course of the learning rate."""
     grad_clip: Annotated[float, Field(ge=0)] = 1.0
@@ -62,18 +62,18 @@ class Train(Group):
     validation_draws: Count = 1
     """Noise draws per validation star."""
     dead_check_steps: Count = 50
-    """Steps between looks for a dead network."""
+    """Steps between checks for a dead network."""
     restarts: Annotated[int, Field(ge=0)] = 3
-    """New starts from another seed if the network dies."""
+    """Restarts with another seed if the network dies."""
     checkpoint_seconds: CheckpointSeconds = 20.0
-    """Least time between checkpoints; repeats nothing."""
+    """Minimum time between checkpoints; a new value repeats no job."""
     noise: Literal["fresh", "fixed"] = "fresh"
     """Noise drawn anew every epoch, or once for all epochs."""
     crop_epochs: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """First part of the epochs, which sees the middle of stamps alone (two thirds of it where
-    templates are learnt); 0: none."""
+    """First fraction of the epochs, in which only the middle of stamps is used (two thirds of it
+    for templates); 0: none."""
     continued_epochs: Annotated[float, Field(ge=0, le=2)] = 1.0
-    """Epochs, of those of the realisations, in which a network of templates goes on from theirs; 0:
-    as many, from a start of its own."""
+    """Fine-tuning epochs on templates, as a fraction of the epochs on realisations; 0: as many
+    epochs as for realisations, with new initial weights."""
     patience: Annotated[int, Field(ge=0)] = 0
     """Stop after this many validations without a better one; 0 never stops."""

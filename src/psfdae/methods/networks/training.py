@@ -1,7 +1,7 @@
-"""The training loop of every network, which can be interrupted and keeps the best state.
+"""The training loop of all networks, which can be interrupted and keeps the best state.
 
-An epoch draws its order, noise levels and noise from a stream of its own, so a training that
-resumes after epoch e continues with exactly the numbers of an uninterrupted one.
+Each epoch draws its order, noise levels and noise from its own random stream, so that a training
+that resumes after epoch e continues with exactly the numbers of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Row = dict[str, float]
 
 
 class TrainingError(FitError):
-    """Failure of a training; the message says why and what to change."""
+    """Failure of a training; the message gives the reason and a remedy."""
 
 
 class DeadNetworkError(Error, RuntimeError):
-    """Zero output for all stars, or most: such a network has no gradient that could revive it."""
+    """Zero output for all or most stars; the gradient of such a network is 0, too."""
 
 
 class Adam(torch.optim.Adam):
-    """Adam without the decorators that serve torch's compiler, whose import takes a second."""
+    """Adam without the decorators of torch's compiler, whose import takes a second."""
 
     add_param_group = unwrap(torch.optim.Adam.add_param_group)
     zero_grad = unwrap(torch.optim.Adam.zero_grad)
@@ -84,7 +84,7 @@ class Muon(Adam):
 
 
 def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """Return about the semi-orthogonal factors of the polar decompositions of matrices.
+    """Return approximate semi-orthogonal factors of the polar decompositions of matrices.
 
     The singular values of the results are between 0.7 and 1.2.
 
@@ -100,21 +100,20 @@ def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """
     if not matrices:
         return []
-    # Rows are not more than columns, and singular values not above 1, where the iteration
-    # converges.
-    scaled = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
+    # The iteration converges for singular values up to 1. Tall matrices are transposed.
+    unit_matrices = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
     # A Newton–Schulz step is X ← f(G) X with f(G) = a + b G + c G² and the Gram matrix G = X Xᵀ,
-    # so that G ← f G f. Only the small Gram matrices are iterated, all together, padded to one
-    # size; the product of all f then multiplies each matrix once.
-    side = max(len(m) for m in scaled)
-    gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in scaled])
+    # so that G ← f G f. Only the small Gram matrices are iterated, all together and padded to the
+    # same size; then each matrix is multiplied once by the product of all f.
+    side = max(len(m) for m in unit_matrices)
+    gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in unit_matrices])
     identity = torch.eye(side).expand_as(gram)
     product = identity
     for _ in range(5):
         factor = 3.4445 * identity - 4.7750 * gram + 2.0315 * gram @ gram
         product, gram = factor @ product, factor @ gram @ factor
-    # Without the padding, and tall matrices upright again.
-    results = [p[: len(m), : len(m)] @ m for p, m in zip(product, scaled, strict=True)]
+    # Remove the padding, and transpose tall matrices back.
+    results = [p[: len(m), : len(m)] @ m for p, m in zip(product, unit_matrices, strict=True)]
     return [r if r.shape == m.shape else r.T for r, m in zip(results, matrices, strict=True)]
 
 
@@ -122,28 +121,37 @@ class Course(Protocol):
     """Settings that every training has: learning rate and its schedule, epochs, threads."""
 
     @property
-    def lr(self) -> float: ...
+    def lr(self) -> float:
+        """Learning rate, or its maximum for one-cycle."""
+
     @property
-    def schedule(self) -> str: ...
+    def schedule(self) -> str:
+        """Schedule of the learning rate, "onecycle" or "constant"."""
+
     @property
-    def epochs(self) -> int: ...
+    def epochs(self) -> int:
+        """Number of epochs."""
+
     @property
-    def threads(self) -> int: ...
+    def threads(self) -> int:
+        """Number of threads."""
+
     @property
-    def checkpoint_seconds(self) -> float: ...
+    def checkpoint_seconds(self) -> float:
+        """Minimum time between checkpoints."""
 
 
-def half_precision(enabled: bool = True) -> torch.autocast:
-    """Return a context in which convolutions and products of matrices take bfloat16 numbers.
+def use_half_precision(is_enabled: bool = True) -> torch.autocast:
+    """Return a context in which convolutions and products of matrices use bfloat16 numbers.
 
-    These have the range of float32 and 8 significant bits; weights stay float32, and sums are
-    float32. Processors that have instructions for them (AVX-512 BF16) need less time; with others,
-    or if it is not enabled, the context changes nothing.
+    These have the range of float32 and 8 significant bits; weights and sums remain float32.
+    Processors with instructions for them (AVX-512 BF16) need less time; for others, or if it is not
+    enabled, the context has no effect.
     """
-    # Older versions of torch say nothing about the processor.
+    # Older versions of torch have no function for the capabilities of the processor.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    supported = bool(capabilities.get("avx512_bf16"))
-    return torch.autocast("cpu", torch.bfloat16, enabled=enabled and supported)
+    has_bfloat16 = bool(capabilities.get("avx512_bf16"))
+    return torch.autocast("cpu", torch.bfloat16, enabled=is_enabled and has_bfloat16)
 
 
 class Training(ABC):
@@ -162,25 +170,25 @@ class Training(ABC):
     key : str
         Config group of the settings, for messages.
     rate : callable
-        Learning rate of an epoch, counted from 0, over `settings.lr`; one-cycle has its own.
+        Learning rate of an epoch, counted from 0, over `settings.lr`; not used for one-cycle.
 
     Attributes
     ----------
     history : list of Row
-        A row for each epoch that is done.
+        A row for each completed epoch.
     seconds, cpu_seconds : float
-        Time of these epochs, and that of the processor.
+        Elapsed time of these epochs, and time of the processor.
     best_mse : float
-        Smallest validation error, infinite before any.
+        Smallest validation error; infinite before the first validation.
     best_state : dict of str to torch.Tensor
         Weights of the network with this error.
     """
 
     grad_clip = float("inf")
     state_dicts = ("model", "optimiser", "scheduler")
-    """Attributes of which a checkpoint holds torch's `state_dict`."""
+    """Attributes whose `state_dict` a checkpoint contains."""
     plain_fields = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
-    """Attributes that a checkpoint holds as they are."""
+    """Attributes that a checkpoint contains unchanged."""
 
     def __init__(
         self,
@@ -227,16 +235,16 @@ class Training(ABC):
         Parameters
         ----------
         epoch : int
-            Number of epochs that are done.
+            Number of completed epochs.
         rate, loss, error : float
             Learning rate at the epoch's start, mean loss, and result of `validate`.
         """
 
     def validate(self, epoch: int) -> float:
-        """Return the mean squared error that chooses the best state; NaN if none is due."""
+        """Return the validation error, which selects the best state; NaN without a validation."""
         return float("nan")
 
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Return True if all epochs are done."""
         return len(self.history) >= self.settings.epochs
 
@@ -247,7 +255,7 @@ class Training(ABC):
 
     @property
     def result(self) -> dict[str, torch.Tensor]:
-        """Weights with the smallest validation error; the last ones without any validation."""
+        """Weights with the smallest validation error; without any validation the last ones."""
         return self.best_state or self.model.state_dict()
 
     def run_epoch(self) -> Row:
@@ -260,14 +268,14 @@ class Training(ABC):
         DeadNetworkError
             If the outputs of the network are zero.
         """
-        # Times of epochs add up over interruptions, so they are part of the state.
-        started, started_cpu = time.monotonic(), time.process_time()
+        # Times of epochs are summed over interruptions, so that they are part of the state.
+        start_time, start_cpu_time = time.monotonic(), time.process_time()
         epoch, rate = len(self.history), self.rate
         losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
             losses.append(self.take_step(batch, epoch * self.steps + len(losses)))
-        # The state with the least validation error is the result.
+        # The state with the smallest validation error is the result.
         error = self.validate(epoch + 1)
         if error < self.best_mse:
             # A copy, because the next steps change the weights in place.
@@ -276,21 +284,21 @@ class Training(ABC):
                 key: value.detach().clone(memory_format=torch.contiguous_format)
                 for key, value in self.model.state_dict().items()
             }
-        self.seconds += time.monotonic() - started
-        self.cpu_seconds += time.process_time() - started_cpu
+        self.seconds += time.monotonic() - start_time
+        self.cpu_seconds += time.process_time() - start_cpu_time
         self.history.append(self.row(epoch + 1, rate, float(np.mean(losses)), error))
         return self.history[-1]
 
     def take_step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
         """Make a step of the optimiser with a batch, and return the loss before it."""
-        # With half precision from the first epoch on, errors grow by up to 2 %, but not if the last
-        # epochs alone have it (studies/training).
-        with half_precision(2 * len(self.history) >= self.settings.epochs):
+        # Half precision in all epochs increases errors by up to 2 %, but not in the second half of
+        # the epochs alone (studies/training).
+        with use_half_precision(2 * len(self.history) >= self.settings.epochs):
             loss = self.loss(batch, step)
         value = self._finite("loss", loss, step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        # Clipping returns the norm before it.
+        # Clipping returns the norm before clipping.
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
         self._finite("gradient's norm", norm, step)
         # The learning rate changes after every step, not after every epoch.
@@ -309,8 +317,8 @@ class Training(ABC):
         return value
 
     def state(self) -> dict[str, Any]:
-        """Return all that `restore` needs, as tensors and plain values."""
-        # The learning rate is part of the scheduler's state, moments are part of the optimiser's.
+        """Return the state for `restore`, as tensors and plain values."""
+        # The learning rate is part of the scheduler's state, moments of the optimiser's state.
         state = {name: getattr(self, name).state_dict() for name in self.state_dicts}
         return state | {name: getattr(self, name) for name in self.plain_fields}
 
@@ -334,13 +342,13 @@ def train(
     Parameters
     ----------
     begin : callable
-        Makes the training of an attempt from its number.
+        Function that makes the training of an attempt from its number.
     checkpoint : Path
         File of the state; the caller removes it when the result is written.
     fingerprint : str
         Hash of configuration and data; a checkpoint with another one is ignored.
     report : callable
-        Takes the row of the history after each epoch.
+        Function that is called with the row of the history after each epoch.
     restarts : int
         Attempts after the first.
 
@@ -352,29 +360,29 @@ def train(
     Raises
     ------
     TrainingError
-        If something is not finite, or if every attempt died.
+        If loss, gradient or error is not finite, or if the network died in all attempts.
     """
-    # A training that was interrupted goes on in the attempt in which it was.
-    saved, log_epoch = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
-    for attempt in range(saved["attempt"] if saved else 0, restarts + 1):
+    # An interrupted training continues in the same attempt.
+    saved_state, log_epoch = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
+    for attempt in range(saved_state["attempt"] if saved_state else 0, restarts + 1):
         training = begin(attempt)
         torch.set_num_threads(training.settings.threads)
-        if saved:
-            training.restore(saved)
-            saved = None
+        if saved_state:
+            training.restore(saved_state)
+            saved_state = None
         last_saved = time.monotonic()
         try:
-            while not training.finished():
+            while not training.is_finished():
                 row = training.run_epoch()
                 report(row)
                 log_epoch(row)
-                # Writing takes time: only every few seconds, and after whole epochs.
+                # Writing takes time: only every few seconds, and after complete epochs.
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
             return training
         except DeadNetworkError as death:
-            # Other initial weights and other noise may give a network that lives.
+            # Another network may live with other initial weights and other noise.
             print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
     raise TrainingError(
         f"the network died in all {restarts + 1} attempts: "
@@ -383,21 +391,22 @@ def train(
 
 
 def listener(checkpoint: Path) -> Callable[[Row], None]:
-    """Return a function that logs each epoch elsewhere, such as in MLflow, or that does nothing.
+    """Return a function that logs each epoch elsewhere, such as in MLflow, or has no effect.
 
-    The environment variable PSFDAE_EPOCHS names a function as "module:function". It takes the path
-    of the checkpoint, and returns the function that takes the row of the history of each epoch.
+    The environment variable PSFDAE_EPOCHS names a function as "module:function". This function
+    takes the path of the checkpoint and returns a function of the row of each epoch.
     """
     module, _, function = os.environ.get("PSFDAE_EPOCHS", "").partition(":")
     if not function:
         return lambda row: None
-    # By name, because a log decides no result: a change of its code must not repeat trainings.
+    # By name, because a log does not change results: a change of its code must not repeat
+    # trainings.
     log_epoch: Callable[[Row], None] = getattr(import_module(module), function)(checkpoint)
     return log_epoch
 
 
 def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
-    """Return the SHA-256 of the data of a training and of the settings that decide its result."""
+    """Return the SHA-256 of the data and settings that determine the result of a training."""
     # Settings by their JSON with sorted keys, arrays by their bytes.
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in arrays:
@@ -407,7 +416,7 @@ def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
 
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
-    """Provide the function that a training calls with the errors of each epoch."""
+    """Yield the function that a training calls with the errors of each epoch."""
     headings = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
 
     def report(row: Row) -> None:

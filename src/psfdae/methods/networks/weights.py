@@ -1,4 +1,4 @@
-"""Files of a network that notice damage: its weights, and an interrupted training's state."""
+"""Files of a network with checksums: its weights, and the state of an interrupted training."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ if TYPE_CHECKING:
 Network = TypeVar("Network", bound="Module")
 
 METADATA_KEY = "psfdae"
-"""Only key of the metadata of a file of weights: safetensors writes several in random order."""
+"""Only key of the metadata of a file of weights: safetensors writes several keys in random
+order."""
 
 CHECKPOINT_HEADER = b"psfdae checkpoint, sha256 "
 """First bytes of a checkpoint; the checksum of the content and a line feed follow."""
 
 
-def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
+def compute_digest(arrays: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 of the names, types, shapes and values of arrays, sorted by name."""
-    # With names, types and shapes, because equal bytes may be arrays of another network.
+    # Names, types and shapes are included, because equal bytes may belong to another network.
     digest = hashlib.sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name])
@@ -53,43 +54,43 @@ def save_weights(path: Path, state: Mapping[str, Tensor], config: Mapping[str, A
     from safetensors.numpy import save
 
     arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in state.items()}
-    # The checksum is that of the arrays, which is the same whatever the file's header is.
-    metadata = json.dumps({"config": config, "sha256": digest_of(arrays)})
+    # The checksum of the arrays does not depend on the header of the file.
+    metadata = json.dumps({"config": config, "sha256": compute_digest(arrays)})
     with atomic_path(path) as temporary:
-        # safetensors' own function for files does not give them the usual permissions.
+        # The file function of safetensors itself does not set the usual permissions.
         temporary.write_bytes(save(arrays, {METADATA_KEY: metadata}))
 
 
-def with_weights(build: Callable[[], Network], path: Path) -> Network:
+def load_network(build: Callable[[], Network], path: Path) -> Network:
     """Return a network with weights from a file, ready to predict.
 
     Parameters
     ----------
     build : callable
-        Makes the network that the file's configuration describes.
+        Function that makes the network that the file's configuration describes.
     path : Path
         File of the weights.
 
     Raises
     ------
     ProductError
-        If `load_weights` refuses the file, or if the tensors are not those of the network.
+        As `load_weights`, or if the tensors do not agree with the network.
     """
     import torch
 
     state = {name: torch.from_numpy(array) for name, array in load_weights(path).items()}
-    # On the device "meta", a network has shapes, but no memory: a wrong size in the configuration
-    # is refused before it fills the memory.
+    # On the device "meta", a network has shapes but takes no memory: a wrong size in the
+    # configuration is an error before it fills the memory.
     try:
         with torch.device("meta"):
-            needed = {name: value.shape for name, value in build().state_dict().items()}
+            needed_shapes = {name: value.shape for name, value in build().state_dict().items()}
     except (RuntimeError, ValueError, TypeError, OverflowError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: its config.yaml describes no network ({line})") from None
-    # A tensor that is missing, one too many, or one of another shape.
-    for name in sorted(needed.keys() | state.keys()):
+    # A tensor may be missing, unexpected, or of another shape.
+    for name in sorted(needed_shapes.keys() | state.keys()):
         shape = tuple(state[name].shape) if name in state else "none"
-        needed_shape = tuple(needed[name]) if name in needed else "none"
+        needed_shape = tuple(needed_shapes[name]) if name in needed_shapes else "none"
         if shape != needed_shape:
             raise ProductError(
                 f"{path}: shape of {name} is {shape}, but {needed_shape} in the network of its "
@@ -105,9 +106,9 @@ def channels_last(network: Network) -> Network:
     """Return the network with weights in the order in memory that makes convolutions fastest."""
     import torch
 
-    # torch's own types know this argument of tensors only.
-    converted: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return converted
+    # The types of torch have this argument only for tensors.
+    reordered: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return reordered
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:
@@ -116,7 +117,7 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
     Raises
     ------
     ProductError
-        If the file is missing, not a safetensors file, or not what was written.
+        If the file is missing, not a safetensors file, or has changed since it was written.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -129,8 +130,8 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
         raise ProductError(no_such_file(path)) from None
     except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
-    # Weights of another program have no checksum, and nothing to compare with.
-    if metadata.get("sha256", digest_of(arrays)) != digest_of(arrays):
+    # Weights of another program have no checksum to compare.
+    if metadata.get("sha256", compute_digest(arrays)) != compute_digest(arrays):
         raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return arrays
 
@@ -149,7 +150,7 @@ def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> N
     """
     import torch
 
-    # In memory first, as the checksum stands before the content.
+    # In memory first, because the checksum precedes the content.
     content = io.BytesIO()
     torch.save({"fingerprint": fingerprint, **state}, content)
     digest = hashlib.sha256(content.getbuffer()).hexdigest().encode()
@@ -167,12 +168,12 @@ def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
 
     if not path.is_file():
         return None
-    # A checkpoint is only a saving of time: whatever is wrong with it, the training begins anew.
+    # A checkpoint only saves time: if anything is wrong with it, the training begins anew.
     head, _, content = path.read_bytes().partition(b"\n")
     if head != CHECKPOINT_HEADER + hashlib.sha256(content).hexdigest().encode():
         print(f"{path}: damaged checkpoint ignored (wrong checksum)", flush=True)
         return None
-    # weights_only: a file must not be able to run code.
+    # weights_only, so that a file cannot run code.
     try:
         state: dict[str, Any] = torch.load(io.BytesIO(content), weights_only=True)
     except Exception as error:  # written by another version of torch

@@ -1,15 +1,15 @@
 """The PSF as splines whose coefficients are polynomials in the position in the field.
 
-What a detector shows of a star whose centre lies at u from a pixel is f(u; q), pixel included
-(Anderson & King 2000, PASP 112, 1360),
+The light of a star on a pixel at the distance u from its centre is f(u; q), the effective PSF,
+which includes the pixel (Anderson & King 2000, PASP 112, 1360),
 
     f(u; q) = Σ_k p_k(q) Σ_ij c_kij B(u_row/h − i) B(u_col/h − j),
 
 a sum of cubic B-splines B with the distance h of their knots. The terms p_k are monomials of the
-position q in the field, and of magnitude and colour of the star. Here are the model itself
-(`FieldModel`), least squares for its coefficients c and for flux and centre of stars, which
-`psfdae.methods.field_fit` puts together, and the deformations by which exposures differ.
-Equations are numbered as on the page docs/field_model.md.
+position q in the field, and of magnitude and colour of the star. This module has the model
+(`FieldModel`), the least squares for its coefficients c and for flux and centre of stars, which
+`psfdae.methods.field.fit` combines, and the deformations by which exposures differ. Equations are
+numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ import numpy as np
 from psfdae.stars.moments import cubic_splines
 
 STAR_TERMS = 2
-"""Number of terms, powers from the first on, of the magnitude and of the colour."""
+"""Number of powers, beginning with the first, of the magnitude and of the colour."""
 
 
 @dataclass(frozen=True)
 class FieldModel:
-    """A PSF at every place of a field (eq. 1).
+    """PSF at every position in a field (eq. 1).
 
     Attributes
     ----------
     coefficients : ndarray, shape (K, N, N)
         Coefficients c of the N × N splines, for each of the K terms of the polynomial.
     low, high : ndarray, shape (2,) to (4,)
-        Range of x and y, and then of magnitude and colour: the PSF does not change with one that
-        has the same ends, or is not there. Beyond a range the PSF is that of its end.
+        Range of x and y, and then of magnitude and colour. The PSF does not change with a
+        coordinate of zero range, or without a range. Outside of a range, the PSF of its end is
+        used.
     spacing : float
         Distance h of the knots, in pixels.
     """
@@ -47,48 +48,49 @@ class FieldModel:
 
     @property
     def order(self) -> int:
-        """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
+        """Order of the polynomial in the position, with (order + 1)(order + 2)/2 terms."""
         # K = (o + 1)(o + 2)/2, solved for the order o.
         place_terms = len(self.coefficients) - STAR_TERMS * len(self.star_coordinates)
         return (isqrt(8 * place_terms + 1) - 3) // 2
 
     @property
     def star_coordinates(self) -> np.ndarray:
-        """Coordinates beyond x and y with which the PSF changes: 2 magnitude, 3 colour."""
+        """Coordinates after x and y with which the PSF changes: 2 magnitude, 3 colour."""
         return np.asarray(2 + np.flatnonzero(self.high[2:] > self.low[2:]))
 
     def terms(self, position: np.ndarray) -> np.ndarray:
         """Return the terms p_k of the polynomial at positions, shape (n, K).
 
-        Positions (n, 4) are x, y, magnitude and colour, of which the last ones may be left out of
-        a model that does not change with them.
+        Positions (n, 4) are x, y, magnitude and colour; the last ones may be left out for a model
+        that does not change with them.
         """
         return field_terms(position, self.low, self.high, self.order)
 
     def images(
         self, terms: np.ndarray, centre: np.ndarray, side: int, oversampling: int = 1
     ) -> np.ndarray:
-        """Return the field with stars `centre` (n, 2) (row, column) px off the middle, (n, m, m).
+        """Return images (n, m, m) of stars at `centre` (n, 2) (row, column) px from the middle.
 
-        Pixels are every 1/oversampling, that at m//2 = oversampling · (side//2) is the middle;
-        m is side, and one more if oversampled, so that both edges are there. Values are
-        those of whole pixels. A star has the same light at every phase of the pixel grid.
+        The distance of pixels is 1/oversampling; index m//2 = oversampling · (side//2) is the
+        middle. m = side without oversampling, else oversampling · side + 1, which includes both
+        edges. Values are the light of whole pixels. Stars have the same light at every phase of the
+        pixel grid.
         """
         # Coordinates of the pixels, and coefficients Σ_k p_k c_k at each position (eq. 1).
         count = side if oversampling == 1 else oversampling * side + 1
         axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
         splines = np.tensordot(terms, self.coefficients, 1)
-        # Pixels that are whole pixels apart have the same phase, and the same factor (eq. 1a).
+        # Pixels at integer distances have the same phase, and the same factor (eq. 1a).
         light = compute_relative_light(splines, axis[:oversampling], centre, self.spacing)
         phase = np.arange(count) % oversampling
         images = draw_splines(splines, axis, centre, self.spacing)
         return np.asarray(images / light[:, phase[:, None], phase])
 
-    def on_lattice(
+    def draw_lattice(
         self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
     ) -> np.ndarray:
         """Return images (n, r c, m, m) of stars at all pairs of rows (r,) and columns (c,)."""
-        # B-splines of all rows and of all columns: their products are the images on the lattice.
+        # Products of B-splines of all rows and of all columns are the images on the lattice.
         splines = np.tensordot(terms, self.coefficients, 1)
         axis = np.arange(side) - side // 2
         down, across = (
@@ -100,13 +102,13 @@ class FieldModel:
         images = images.transpose(2, 0, 3, 1, 4)
         return np.asarray(images.reshape(len(terms), -1, side, side))
 
-    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
-        """Return which stars are brighter, fainter, bluer or redder than all training stars, (n,).
+    def is_outside_range(self, position: np.ndarray) -> np.ndarray:
+        """Return True for stars (n,) brighter, fainter, bluer or redder than all training stars.
 
-        `position` has x, y, magnitude and colour (n, 4). Those count with which the PSF changes,
-        and 2 % of the range beyond its ends are allowed: a training star may be measured there.
+        `position` has x, y, magnitude and colour (n, 4). Only coordinates with which the PSF
+        changes are compared, with a tolerance of 2 % of the range for errors of measurement.
         """
-        # Beyond the ends by more than the slack, in any coordinate with which the PSF changes.
+        # Outside of the range by more than the tolerance, in any of these coordinates.
         columns = self.star_coordinates
         value, low, high = (a[..., columns] for a in (position, self.low, self.high))
         slack = 0.02 * (high - low)
@@ -133,39 +135,41 @@ class FieldModel:
         return facts
 
 
-def knots_of(frame_px: int, spacing: float) -> int:
-    """Return the number of knots along a side of a frame, the outermost ½ pixel beyond its edge."""
+def count_knots(frame_px: int, spacing: float) -> int:
+    """Return the number of knots along a side of a frame, the outermost ½ pixel outside."""
+    # At least four knots, on which a cubic spline depends.
     return max(round((frame_px + 1) / spacing), 3) + 1
 
 
-def spacing_of(frame_px: int, knots: int) -> float:
-    """Return the distance of the knots in pixels if a side of a frame has so many."""
+def compute_spacing(frame_px: int, knots: int) -> float:
+    """Return the distance in pixels of this number of knots along a side of a frame."""
+    # The knots span the frame and ½ pixel on each side.
     return (frame_px + 1) / (knots - 1)
 
 
 def field_terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
     """Return monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
 
-    Powers of other coordinates whose range has two ends are the last terms. What is not known is
-    taken for the middle of its range.
+    Powers of the other coordinates with a range above 0 are the last terms. An unknown coordinate
+    is set to the middle of its range.
     """
-    # Coordinates −1 … 1 over the range; beyond it, those of its ends. The middle is 0.
+    # Coordinates −1 … 1 over the range, clipped outside; the middle is 0.
     width = np.where(high > low, high - low, 1.0)
-    scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
-    scaled = np.nan_to_num(scaled)
+    unit_position = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
+    unit_position = np.nan_to_num(unit_position)
     # Monomials by their total power, then the powers of magnitude and of colour.
-    x, y, *star_columns = scaled.T
+    x, y, *star_columns = unit_position.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
     terms = [x**a * y**b for a, b in powers]
-    counted = (column for column, ends in zip(star_columns, (high > low)[2:], strict=True) if ends)
-    terms += [column**power for column in counted for power in range(1, STAR_TERMS + 1)]
+    varying = (column for column, ends in zip(star_columns, (high > low)[2:], strict=True) if ends)
+    terms += [column**power for column in varying for power in range(1, STAR_TERMS + 1)]
     return np.stack(terms, axis=1)
 
 
 def draw_splines(
     splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
 ) -> np.ndarray:
-    """Return images (n, m, m) on an axis (m,) of coefficients (n, N, N) with centres (n, 2)."""
+    """Return images (n, m, m) of splines (n, N, N) with centres (n, 2) on an axis (m,)."""
     # The image is R c Cᵀ, with the B-splines R of its rows and C of its columns (eq. 1).
     rows, columns = (
         cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
@@ -176,11 +180,11 @@ def draw_splines(
 def compute_relative_light(
     splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float
 ) -> np.ndarray:
-    """Return the light of a star that has whole pixels at some phases, over that in the middle.
+    """Return the light of a star on pixels at some phases, over its light in the middle phase.
 
-    Splines whose knots are not a whole number in a pixel follow undersampled stars, but not their
-    light: it changes with the phase by some per cent. The PSF divided by this factor has the same
-    light at every phase (eq. 1a).
+    Splines whose knots do not divide a pixel follow undersampled stars, but their total light
+    changes with the phase by some per cent. The PSF divided by this factor has the same light at
+    every phase (eq. 1a).
 
     Parameters
     ----------
@@ -196,11 +200,11 @@ def compute_relative_light(
     Returns
     -------
     ndarray, shape (n, a, a)
-        1 for a star in the middle of its pixel.
+        Factor of each phase; 1 for a star in the middle of its pixel.
     """
-    # All pixels that are whole pixels apart and in the frame, at their distances from the star,
-    # under a window w that moves with the star, so that no light crosses an edge: 1, and falling to
-    # 0 as cos² in the outer 3 px, where light changes little within a pixel.
+    # Sum over all pixels of the frame at integer distances, under a window w that moves with the
+    # star, so that no light crosses an edge: w is 1, and falls to 0 as cos² in the outer 3 px,
+    # where the light changes little within a pixel.
     knots = splines.shape[-1]
     reach = spacing * (knots - 1) / 2 - 1.0
     pixels = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
@@ -226,12 +230,12 @@ def adjust_stars(
     steps: int,
     sky: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit flux, centre (n, 2) and, if asked for, sky of stars by Gauss–Newton steps (eq. 4).
+    """Fit flux, centre (n, 2) and optionally sky of stars by Gauss–Newton steps (eq. 4).
 
     Parameters
     ----------
     splines : ndarray, shape (n, N, N)
-        Coefficients of the field at the places of the stars.
+        Coefficients of the field at the positions of the stars.
     data, weight : ndarray, shape (n, s, s)
         Images and 1/variance of their pixels.
     centre : ndarray, shape (n, 2)
@@ -243,23 +247,25 @@ def adjust_stars(
     steps : int
         Number of steps.
     sky : bool
-        A constant is fitted as well.
+        Fit a constant as well.
 
     Returns
     -------
     flux : ndarray, shape (n,)
+        Flux in the unit of the images.
     centre : ndarray, shape (n, 2)
+        Centres (row, column) in pixels.
     residual : ndarray, shape (n, s, s)
-        In units of the flux.
+        Image minus model, in units of the flux.
     """
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
         # Weighted least squares (A w Aᵀ) θ = A w d for θ = (F, F δ_row, F δ_col, sky), with the
-        # rows A of the design; the centre moves by δ, at most by 0.3 px in a step, in which an
-        # image is nearly linear, and no farther than 1.5 px from the brightest pixel.
+        # rows A of the design; the centre moves by δ, at most by 0.3 px in a step, where an image
+        # is nearly linear, and by at most 1.5 px from the brightest pixel.
         design = image_design(splines, centre, axis, spacing, sky)
-        weighted = design * weight.reshape(count, 1, -1)
-        parameters = np.linalg.solve(weighted @ design.transpose(0, 2, 1), weighted @ flat)[..., 0]
+        adjoint = design * weight.reshape(count, 1, -1)
+        parameters = np.linalg.solve(adjoint @ design.transpose(0, 2, 1), adjoint @ flat)[..., 0]
         flux = parameters[:, 0]
         move = np.clip(parameters[:, 1:3] / flux[:, None], -0.3, 0.3)
         centre = np.clip(centre + move, -1.5, 1.5)
@@ -272,9 +278,9 @@ def adjust_stars(
 def image_design(
     splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
 ) -> np.ndarray:
-    """Return the change A of images, (n, 3 or 4, P), with flux, row, column and, if asked, sky."""
+    """Return derivatives A of images, (n, 3 or 4, P), by flux, row, column and optionally sky."""
     # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
-    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves (eq. 4).
+    # C' give its derivatives −R' c Cᵀ and −R c C'ᵀ with respect to the centre (eq. 4).
     place, knots = axis - centre[..., None], splines.shape[-1]
     rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
     down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
@@ -303,7 +309,7 @@ def solve_splines(
     Parameters
     ----------
     terms : ndarray, shape (n, K)
-        Terms of the field at the places of the stars.
+        Terms of the field at the positions of the stars.
     data, weight : ndarray, shape (n, s, s)
         Images d of flux 1, and 1/variance w of their pixels.
     splines : (ndarray, ndarray), shape (n, s, N)
@@ -313,25 +319,25 @@ def solve_splines(
     ridge : ndarray, shape (K, N, N)
         Weight ρ of the squared coefficients.
     start : ndarray, shape (K, N, N), or None
-        First coefficients of the iterations; 0 without.
+        Coefficients at which the iterations begin; None for 0.
     tolerance : float
-        Residual, over the right-hand side, at which the conjugate gradients stop.
+        Residual, relative to the right-hand side, at which the conjugate gradients stop.
     """
     from scipy.sparse.linalg import LinearOperator, cg
 
-    # |D c|² = tr(cᵀ B c) + tr(c B cᵀ) with B = DᵀD; its slope by c is 2 (B c + c B).
+    # |D c|² = tr(cᵀ B c) + tr(c B cᵀ) with B = DᵀD; its gradient is 2 (B c + c B).
     shape, knots = ridge.shape, ridge.shape[-1]
     difference = np.diff(np.eye(knots), 2, axis=0)
     bend = difference.T @ difference
     # Normal equations (Σ Tᵀ w T + penalty) c = Σ Tᵀ w d, solved by conjugate gradients, with the
-    # linear map T from coefficients to images: T c = R (Σ_k p_k c_k) Cᵀ. The gradients stop at a
-    # part of 1e-4: single precision is enough for their products.
+    # linear map T from coefficients to images: T c = R (Σ_k p_k c_k) Cᵀ. The tolerance is 1e-4 or
+    # more: single precision is enough for the products.
     single = (terms, data, weight, *splines)
     terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
     rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
 
     def normal(flat: np.ndarray) -> np.ndarray:
-        # T c, then Tᵀ w T c, then the slope of the penalties, all over 2.
+        # T c, then Tᵀ w T c, then half of the gradient of the penalties.
         c = flat.reshape(shape)
         fields = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
         image = rows @ fields @ columns_t
@@ -340,8 +346,8 @@ def solve_splines(
         return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
 
     projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
-    # Preconditioner: the terms of a knot are solved for together, as they are far from orthogonal.
-    # Knots count as independent of each other: the diagonals of RᵀwC and of B, which is 6 inside.
+    # Preconditioner: the terms of a knot are solved together, as they are far from orthogonal.
+    # Knots are treated as independent: the diagonals of RᵀwC and of B, which is 6 inside.
     curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
     pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
     blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
@@ -371,9 +377,9 @@ def deform_splines(
     splines: tuple[np.ndarray, np.ndarray],
     deformation_sigma: float = 0.3,
 ) -> np.ndarray:
-    """Return splines of another exposure, stretched and blurred as its stars show it (eq. 5).
+    """Return splines of another exposure, with a stretch and a blur fitted to its stars (eq. 5).
 
-    Their fluxes may be wrong: what is proportional to a star says nothing of its shape.
+    Fluxes may be wrong: differences proportional to a star are ignored, as they are not its shape.
 
     Parameters
     ----------
@@ -387,10 +393,11 @@ def deform_splines(
     Returns
     -------
     ndarray, shape (K, N, N)
+        Coefficients of the deformed field.
     """
     rows, columns_t = splines[0], splines[1].transpose(0, 2, 1)
 
-    def in_sigma(coefficients: np.ndarray) -> np.ndarray:
+    def scale_by_noise(coefficients: np.ndarray) -> np.ndarray:
         # Pixels √w T c of all stars, in standard deviations.
         image = rows @ np.tensordot(terms, coefficients, 1) @ columns_t
         return np.asarray((image * np.sqrt(weight)).reshape(len(terms), -1))
@@ -399,10 +406,10 @@ def deform_splines(
     coefficients = prior.coefficients
     # Three Gauss-Newton steps c ← c + Σ_l α_l Δ_l c.
     for _ in range(3):
-        # Images of the deformations and the data, all without their part along the star itself.
-        changes, star = deformations(coefficients, prior.spacing), in_sigma(coefficients)
+        # Images of the deformations and the data, all without their component along the star.
+        changes, star = deformations(coefficients, prior.spacing), scale_by_noise(coefficients)
         star /= np.linalg.norm(star, axis=1, keepdims=True)
-        shapes = np.stack([*map(in_sigma, changes), scaled_data])
+        shapes = np.stack([*map(scale_by_noise, changes), scaled_data])
         shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
         shapes = shapes.reshape(len(shapes), -1)
         # Normal equations for α with the prior N(0, σ²); the last column is the data.
@@ -415,7 +422,7 @@ def deform_splines(
 
 
 def deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
-    """Return changes of splines (K, N, N) by stretching and blurring them, (6, K, N, N) (eq. 5).
+    """Return changes (6, K, N, N) of splines (K, N, N) by stretches and blurs (eq. 5).
 
     They are x ∂/∂x, y ∂/∂y and x ∂/∂y + y ∂/∂x, which stretch an image, and ∂²/∂x², ∂²/∂y² and
     ∂²/∂x∂y, which blur it.
@@ -424,7 +431,7 @@ def deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
     place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
 
     def slope(values: np.ndarray, axis: int) -> np.ndarray:
-        """Return the slope of a polynomial through five knots."""
+        """Return the slope of the polynomial through five knots."""
         one_apart, two_apart = (
             np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2)
         )
@@ -433,5 +440,5 @@ def deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
     along_y, along_x = (slope(coefficients, axis) for axis in (1, 2))
     yy, xy, xx = slope(along_y, 1), slope(along_y, 2), slope(along_x, 2)
     x, y = place, place[:, None]
-    stretched = (x * along_x, y * along_y, x * along_y + y * along_x)
-    return np.stack([*stretched, xx, yy, xy])
+    stretches = (x * along_x, y * along_y, x * along_y + y * along_x)
+    return np.stack([*stretches, xx, yy, xy])

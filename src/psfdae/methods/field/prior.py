@@ -1,22 +1,22 @@
-"""Law of the stars of a field: the PSF at their place, residuals about it, and their centres.
+"""Prior distribution of the stars of a field: PSF at their position, residuals, and centres.
 
-Bright stars give the PSF at every place of the field (`psfdae.methods.field_spline`). What this
-model leaves of them gives the covariance by which real stars differ from it
-(`psfdae.methods.field_residuals`). The centre of a star in its stamp is a node of a square lattice
-that is finer than a pixel (`psfdae.methods.field_nodes`). In each node, a stamp x of a star of flux
+Bright stars determine the PSF at every position in the field (`psfdae.methods.field.spline`). Their
+residuals give the covariance by which real stars differ from this model
+(`psfdae.methods.field.residuals`). The centre of a star in its stamp is a node of a square lattice
+that is finer than a pixel (`psfdae.methods.field.nodes`). In each node, a stamp x of a star of flux
 F is (eq. 6)
 
     x = F (a m + Lᵀ t + e) + noise,   e ~ N(0, C),   t ~ N(0, diag(σ²)),
 
-with the field's PSF m (sum 1) at this place and centre, the factor a ~ N(1, 0.2²) of a guessed
+with the field's PSF m (sum 1) at this position and centre, the factor a ~ N(1, 0.2²) of a guessed
 flux, and the three nuisance parameters t: sky over flux, row and column of the centre within the
-cell of its node. The rows of L are the derivatives of the image with respect to these. C is the
-covariance of the training stars' residuals at this centre, of low rank beside a diagonal.
+cell of its node. The rows of L are the derivatives of the image with respect to t. C is the
+covariance of the training stars' residuals at this centre, of low rank plus a diagonal.
 
-Equations are numbered as on the page docs/field_model.md, which derives them. Where no position is
-known, m is the mean over the field, and its variation over the field is part of C. A centre that
-is known is one node at exactly that place. The posterior of stars by this law is in
-`psfdae.methods.field_posterior`.
+Equations are numbered as on the page docs/field_model.md, which derives them. Where the position is
+unknown, m is the mean over the field, and its variation over the field is part of C. A known centre
+is a single node at exactly this position. `psfdae.methods.field.posterior` computes the posterior
+of stars under this prior.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from psfdae.base.settings import Count, Fraction, Group, Positive
-from psfdae.methods.field_nodes import Node, NodeAxes, Residuals, lattice_nodes
-from psfdae.methods.field_residuals import MARGIN_PX, phase_of, phases_of
-from psfdae.methods.field_spline import STAR_TERMS, FieldModel, spacing_of
+from psfdae.methods.field.nodes import Node, NodeAxes, Residuals, build_nodes
+from psfdae.methods.field.residuals import MARGIN_PX, find_phase, list_phases
+from psfdae.methods.field.spline import STAR_TERMS, FieldModel, compute_spacing
 from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True)
 class PosteriorLimits:
-    """Limits of the posterior of a star, which save time and memory where more hardly counts.
+    """Limits of the posterior of a star, which save time and memory with little loss of accuracy.
 
     Attributes
     ----------
     min_nodes : int
-        Number of nodes per star of which the likelihood is computed at least.
+        Minimum number of nodes whose likelihood is computed for a star.
     max_node_area_px2 : float
-        Area in px² of the nodes of which the likelihood of one star is computed at most.
+        Maximum area in px² of the nodes whose likelihood is computed for a star.
     min_axes : int
-        Number of principal axes of the residual covariance that are kept at each node, at least.
+        Minimum number of principal axes of the residual covariance at each node.
     outlier_axes : int
-        Number of leading axes that enter the outlier score: the others do not distinguish outliers
-        from training stars.
+        Number of leading axes in the outlier score: the others do not distinguish outliers from
+        training stars.
     stars_at_once : int
-        Number of stars that are restored together at most, which limits the memory.
+        Maximum number of stars that are processed together, which limits the memory.
     """
 
     min_nodes: int = 9
@@ -67,55 +67,58 @@ class PosteriorLimits:
 class FieldSettings(Group):
     """Mixture about a model of the field.
 
-    Models that were packed before a setting was there have its default.
+    Models that are older than a setting have its default.
     """
 
     orders: Annotated[list[Annotated[int, Field(ge=0, le=10)]], Field(min_length=1)] = Field(
         [0, 1, 2, 3, 4, 6, 8]
     )
-    """Orders of the polynomial in the position, tried upwards until the next one predicts stars
-    that were left out no better."""
+    """Orders of the polynomial in the position, tried upwards until the next one does not improve
+    the prediction of left-out stars."""
     spacing_px: Annotated[float, Field(gt=0.1, le=2)] = 0.5
-    """Distance of the knots of the field's splines, at least."""
+    """Minimum distance of the knots of the field's splines."""
     smoothness: Positive = 100.0
     """Smoothness of the splines: weight of their second differences."""
     step_px: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Distance of two nodes, at most; less where stars are undersampled."""
+    """Maximum distance of two nodes; smaller where stars are undersampled."""
     reach_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = 1.75
     """Distance, per axis, of the outermost nodes from the stamp's middle."""
     centring_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = 1.5
-    """Distance, per axis, from the middle that centres may have."""
+    """Largest distance, per axis, of centres from the stamp's middle."""
     modes: Count = 40
     """Leading modes of the residuals."""
     diagonal: Fraction = 0.2
-    """Part of their variance that no mode knows."""
+    """Fraction of their variance that is assigned to single pixels."""
     threads: Count = 1
     """Threads of the linear algebra."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FieldLaw:
+class FieldPrior:
     """Distribution of the stars of an image: the PSF over the field, and residuals about it.
 
     Attributes
     ----------
     coefficients, low, high : ndarray
-        Those of the `FieldModel`.
+        Arrays of the `FieldModel`.
     mean_terms, terms_covariance : ndarray, shape (K,) and (K, K)
         Mean and covariance of the terms of the field over the training stars.
     offset : ndarray, shape (f², w²)
         Mean residual at the f phases of a pixel along rows and columns, in frames of
-        w = d + 2 `MARGIN_PX` pixels whose middle pixel has the star.
+        w = d + 2 `MARGIN_PX` pixels per side with the star in the middle pixel.
     modes : ndarray, shape (f², r, w²)
         Principal modes of the residuals in each phase, each times its standard deviation.
     diagonal : ndarray, shape (f², w²)
-        Variance of the residuals beyond their modes.
-    listed : ndarray, shape (2, 2)
-        Mean and RMS of fitted less listed centres (row, column), in pixels; NaN if there
-        was no list.
+        Variance of the residuals in addition to their modes.
+    list_error : ndarray, shape (2, 2)
+        Mean and RMS of fitted minus listed centres (row, column), in pixels; NaN without a
+        list.
     noise : NoiseModel
+        Noise of the training.
     settings : FieldSettings
+        Settings of the fit, with the distance and reach of the nodes.
     limits : PosteriorLimits
+        Limits of time and memory.
     """
 
     coefficients: np.ndarray
@@ -126,7 +129,7 @@ class FieldLaw:
     offset: np.ndarray
     modes: np.ndarray
     diagonal: np.ndarray
-    listed: np.ndarray
+    list_error: np.ndarray
     noise: NoiseModel
     settings: FieldSettings
     limits: PosteriorLimits = PosteriorLimits()
@@ -138,10 +141,10 @@ class FieldLaw:
 
     @cached_property
     def model(self) -> FieldModel:
-        """The PSF at every place of the field (eq. 1)."""
+        """The PSF at every position in the field (eq. 1)."""
         # Knots cover the frame, a stamp with its margin.
         coefficients = self.coefficients.astype(np.float64)
-        spacing = spacing_of(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
+        spacing = compute_spacing(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
         return FieldModel(coefficients, self.low, self.high, spacing)
 
     @property
@@ -157,8 +160,8 @@ class FieldLaw:
     def terms(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the terms of the field for each star, and whether its position is known.
 
-        Terms of an unknown position, magnitude or colour are their mean over the training stars. A
-        star counts as one of unknown position if anything is unknown that changes its PSF.
+        Terms of an unknown position, magnitude or colour are their mean over the training stars.
+        The position of a star is unknown if any coordinate on which the PSF depends is unknown.
 
         Parameters
         ----------
@@ -168,9 +171,11 @@ class FieldLaw:
         Returns
         -------
         terms : ndarray, shape (n, K)
+            Terms of the polynomial.
         position_known : ndarray of bool, shape (n,)
+            True if all coordinates on which the PSF depends are known.
         """
-        # What is left out of the position is not known.
+        # Coordinates that are left out are unknown.
         coordinates = np.full((len(position), 4), np.nan)
         coordinates[:, : position.shape[1]] = position
         # Terms of x and y first, then two of each star property that changes the PSF.
@@ -188,35 +193,37 @@ class FieldLaw:
         return np.where(term_known, terms, self.mean_terms), position_known
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """Return the field's PSFs at positions, as `FieldModel.images` draws them.
+        """Return the field's PSFs at positions, drawn by `FieldModel.images`.
 
-        The star lies at its sub-pixel phase in the middle pixel. Its flux is that for which a star
-        in the middle of its pixel has the sum 1 in its stamp. It is the same at every phase (eq.
-        1a), though of a star with wings some light crosses the stamp's edge as it moves.
+        The star is at its sub-pixel phase in the middle pixel. Its flux is the same at every phase
+        (eq. 1a), and such that a star in the middle of its pixel has the sum 1 in its stamp. Light
+        of the wings may cross the edge of the stamp as the phase changes.
 
         Parameters
         ----------
         position : ndarray, shape (n, 2) to (n, 4)
             x, y, magnitude and colour, as in the star list of the training; the PSF is the mean
-            one with respect to what is NaN.
+            over coordinates that are NaN.
         oversampling : int
+            Values per pixel along each axis, ≥ 1.
 
         Returns
         -------
         ndarray, shape (n, m, m)
+            PSFs; m as in `FieldModel.images`.
         """
         terms = self.terms(position)[0]
         # The phase of (row, column) in a pixel, in the coordinates of the field's centres.
         phase = (position - np.floor(position + 0.5))[:, 1::-1]
         images = self.model.images(terms, phase + self.list_offset, self.side, oversampling)
-        centred = np.broadcast_to(self.list_offset, phase.shape)
-        total = self.model.images(terms, centred, self.side).sum(axis=(1, 2), keepdims=True)
+        centre = np.broadcast_to(self.list_offset, phase.shape)
+        total = self.model.images(terms, centre, self.side).sum(axis=(1, 2), keepdims=True)
         return np.asarray(images / total)
 
     def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
-        """Yield the conditions that any law fulfils: a mean star of sum 1, and smaller residuals.
+        """Yield conditions that any fit fulfils: a mean star of sum 1, and smaller residuals.
 
-        Each is the name of an array in files, what it must have, and whether it has it.
+        Each has the name of an array in files, the condition in words, and whether it is fulfilled.
         """
         terms, mean_terms, spread = len(self.coefficients), self.mean_terms, self.terms_covariance
         mean_star = self.model.images(mean_terms[None], np.zeros((1, 2)), self.side)
@@ -229,25 +236,25 @@ class FieldLaw:
         yield "modes", "squares below 1", np.square(self.modes, dtype=float).sum(axis=1) < 1
         yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
         yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
-        yield "listed", "an error above 0, if any", self.listed[1:] > 0
+        yield "listed", "an error above 0, if any", self.list_error[1:] > 0
 
-    def is_out_of_range(self, position: np.ndarray) -> np.ndarray:
-        """Return which stars (n, 4) have a magnitude or colour outside of the training range."""
-        return self.model.is_out_of_range(position)
+    def is_outside_range(self, position: np.ndarray) -> np.ndarray:
+        """Return True for stars (n, 4) with magnitude or colour outside of the training range."""
+        return self.model.is_outside_range(position)
 
     def facts(self) -> dict[str, str]:
-        """Return titles and sentences about the field: how the PSF changes, and with what."""
+        """Return titles and sentences on the dependence of the PSF on position and star."""
         return self.model.facts()
 
     # The nodes.
 
     @cached_property
     def step_px(self) -> float:
-        """Distance of two nodes in pixels, for which there are residuals."""
-        # The setting, or 1/n of a pixel where stars are undersampled (`node_step`): residuals have
-        # as many phases.
+        """Distance of two nodes in pixels, the distance of the phases of the residuals."""
+        # The setting, or 1/n of a pixel where stars are undersampled (`node_step`); the number of
+        # phases of the residuals decides.
         step, phases = self.settings.step_px, isqrt(len(self.offset))
-        return step if len(phases_of(step)) == phases else 1.0 / phases
+        return step if len(list_phases(step)) == phases else 1.0 / phases
 
     @property
     def axis_px(self) -> np.ndarray:
@@ -262,8 +269,8 @@ class FieldLaw:
         return np.stack([np.ravel(a) for a in rows_and_columns], axis=1)
 
     def residuals_at(self, centre: np.ndarray) -> Residuals:
-        """Return the training stars' residuals in a stamp whose star has this centre, (2,)."""
-        phase, window = phase_of(centre, phases_of(self.step_px), self.side)
+        """Return the residuals of training stars in a stamp whose star has this centre, (2,)."""
+        phase, window = find_phase(centre, list_phases(self.step_px), self.side)
         return (
             self.offset[phase, window],
             self.modes[phase][:, window],
@@ -275,14 +282,14 @@ class FieldLaw:
         """All nodes, in the order of `places`."""
         count, residuals = len(self.mean_terms), map(self.residuals_at, self.places)
         terms = self.mean_terms, self.terms_covariance.reshape(count, count)
-        return lattice_nodes(self.model, self.side, self.axis_px, *terms, residuals)
+        return build_nodes(self.model, self.side, self.axis_px, *terms, residuals)
 
     @cached_property
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
         """Matched filters m̄ of all nodes, (nodes, P), and the sum of squares of each, (nodes,).
 
-        A filter is the mean star of sum 1 less its average over the stamp, so that a flat sky
-        gives nothing (eq. 18).
+        A filter is the mean star of sum 1 minus its average over the stamp, so that its product
+        with a flat sky is 0 (eq. 18).
         """
         # m of the mean terms (eq. 7): the field's PSF, then the mean residual.
         parts = np.append(self.mean_terms, 0.0)
@@ -299,44 +306,46 @@ class FieldLaw:
         Parameters
         ----------
         k : int
+            Index of the node.
         terms : ndarray, shape (n, K)
             Terms of the field at the positions of the stars.
         centre : ndarray, shape (n, 2), or None
-            Centres of the stars if they are known; otherwise that of the node is theirs.
+            Centres of the stars if they are known; None for the centre of the node.
         """
         node = self.nodes[k]
-        # At a known centre, the field is drawn there; residuals are those of the node.
+        # At a known centre, the field is drawn there; residuals are taken from the node.
         if centre is None:
             return np.asarray(node.image_weights(terms) @ node.images)
         images = self.model.images(terms, centre, self.side).reshape(len(terms), -1)
         return np.asarray(images / images.sum(axis=1, keepdims=True) + node.images[-1])
 
     def node_axes(self, k: int, position_known: bool) -> NodeAxes:
-        """Return the principal axes of node k (eq. 8), which are computed once.
+        """Return the principal axes of node k (eq. 8); they are cached.
 
-        Where no position is known, C has the variation over the field as well.
+        Where the position is unknown, C includes the variation over the field.
         """
-        # Eigenvectors take far longer than all else that a star needs of a node.
+        # Eigenvectors take far more time than the other computations of a node.
         if (k, position_known) not in self._axes_cache:
             node = self.nodes[k]
             rows = [node.residual_modes, *[node.field_modes] * (not position_known)]
-            axes = NodeAxes.of(node, np.vstack(rows), self.limits.min_axes)
+            axes = NodeAxes.from_node(node, np.vstack(rows), self.limits.min_axes)
             self._axes_cache[k, position_known] = axes
         return self._axes_cache[k, position_known]
 
     @property
     def cell_sigma_px(self) -> float:
-        """σ of a centre about its node, along an axis: uniform in a cell of one step."""
+        """σ of a centre about its node along an axis, uniform in a cell of one step."""
+        # The variance of a uniform distribution of width h is h²/12.
         return float(self.step_px / np.sqrt(12.0))
 
     # The stars.
 
     @property
     def has_list_error(self) -> bool:
-        """True if the training stars had a list, of which offset and error are known."""
-        return bool(len(self.listed) and np.isfinite(self.listed).all())
+        """True if the offset and the error of the training stars' list are known."""
+        return bool(len(self.list_error) and np.isfinite(self.list_error).all())
 
     @cached_property
     def list_offset(self) -> np.ndarray:
-        """Offset of the field's centres from those of the training stars' list, shape (2,)."""
-        return np.asarray(self.listed[0] if self.has_list_error else np.zeros(2))
+        """Offset of the field's centres from the training stars' list, shape (2,)."""
+        return np.asarray(self.list_error[0] if self.has_list_error else np.zeros(2))

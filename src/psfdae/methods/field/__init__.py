@@ -1,8 +1,8 @@
-"""Method `field`: a model of the PSF over the field, and the posterior of stars given this model.
+"""Method `field`: a model of the PSF over the field, and the posterior of stars under this model.
 
-The distribution of the stars is in `psfdae.methods.field_law`, and the posterior of a star in
-`psfdae.methods.field_posterior`; here the distribution is fitted to bright stars, stored, and
-applied to stamps. The mathematics is on the page docs/field_model.md.
+The distribution of the stars is in `psfdae.methods.field.prior`, and the posterior of a
+star in `psfdae.methods.field.posterior`. The class of this module fits the distribution to bright
+stars, stores it and applies it to stamps. The mathematics is on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 
 from psfdae.base.errors import call
 from psfdae.base.rng import stream
-from psfdae.methods.field_errors import draw_field_stars, flux_error_over_field
-from psfdae.methods.field_fit import FieldFit, FieldUncertainty
-from psfdae.methods.field_law import FieldLaw, FieldSettings
-from psfdae.methods.field_nodes import node_step
-from psfdae.methods.field_pairs import FieldStamps
-from psfdae.methods.field_posterior import log_node_prior, posterior_of_stamps
-from psfdae.methods.field_residuals import MARGIN_PX, residual_covariance
-from psfdae.methods.field_search import fit_field, refit_field
+from psfdae.methods.field.errors import draw_field_stars, flux_error_over_field
+from psfdae.methods.field.fit import FieldFit, FieldUncertainty
+from psfdae.methods.field.nodes import node_step
+from psfdae.methods.field.pairs import FieldStamps
+from psfdae.methods.field.posterior import compute_posterior, log_node_prior
+from psfdae.methods.field.prior import FieldPrior, FieldSettings
+from psfdae.methods.field.residuals import MARGIN_PX, residual_covariance
+from psfdae.methods.field.search import fit_field, refit_field
 from psfdae.methods.interface import (
     Estimate,
     FitError,
     Look,
-    Measured,
+    Measurements,
     Method,
     Needs,
     Packing,
@@ -40,13 +40,13 @@ from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FieldMixture(FieldLaw, Method):
+class FieldMixture(FieldPrior, Method):
     """Fitted model of a field, with the residuals of its stars.
 
     Attributes
     ----------
     uncertainty : FieldUncertainty
-        Fields that are as likely as this one; none of a fit that was stored.
+        Fields that are as likely as this one; empty for a fit that was read from a file.
     measures_flux : bool
         `estimate` measures flux and sky; otherwise the flux is 1 and the sky 0.
     """
@@ -70,20 +70,22 @@ class FieldMixture(FieldLaw, Method):
         },
         per_reference=True,
     )
-    attributes: ClassVar = {"usual": "mean_terms", "spread": "terms_covariance"}
-    """Attributes of arrays that have another name in files."""
-    packing = Packing(together=4096, padded=False)
+    attributes: ClassVar = dict(usual="mean_terms", spread="terms_covariance", listed="list_error")
+    """Names of attributes by the older names of their arrays in files."""
+    packing = Packing(batch_size=4096, is_padded=False)
     knows_field = True
     groups: ClassVar = {"field": FieldSettings}
 
     @classmethod
     def fit(cls, data: TrainingSet, field: FieldSettings) -> Self:
-        """Fit the field to the training stars, and the covariance of what it leaves of them.
+        """Fit the field to the training stars, and the covariance of their residuals.
 
         Parameters
         ----------
         data : TrainingSet
+            Training set with bright stars of an image.
         field : FieldSettings
+            Settings of the field, its splines and its residuals.
 
         Raises
         ------
@@ -95,88 +97,89 @@ class FieldMixture(FieldLaw, Method):
                 "it learns from the bright stars of an image: "
                 + call("psfdae.Stars.from_image", "psfdae train")
             )
-        # The field is fitted in frames with a margin, so that residuals can be moved by 2 px.
-        bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
+        # The field is fitted in frames with a margin, so that residuals can be shifted by 2 px.
+        bright, side = data.bright.select(np.unique(data.star[data.train])), data.images.shape[-1]
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
         rng = stream(data.seed, "noise", "field")
-        bright = bright.of(stars_of_fit(bright.snr, sizes[0] ** 2, data.seed))
+        bright = bright.select(select_fit_stars(bright.snr, sizes[0] ** 2, data.seed))
         fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines, rng)
-        arrays = fitted_arrays(fit, bright, side, field)
+        arrays = compute_arrays(fit, bright, side, field)
         return cls(**arrays, noise=data.noise, settings=field, uncertainty=fit.uncertainty)
 
-    def of_exposure(self, bright: BrightStars, background: float) -> Self:
+    def refit_exposure(self, bright: BrightStars, background: float) -> Self:
         """Return this model for another exposure of the same field, refitted to its bright stars.
 
-        The residuals of stars about the field stay those of the training, and so does the error of
-        the star list if too few stars show that of the new one.
+        The residuals of the training stars are kept. The error of their star list is kept, too, if
+        the new stars are too few to measure the error of their list.
 
         Parameters
         ----------
         bright : BrightStars
+            Bright stars of the other exposure.
         background : float
-            Photons of the sky in a pixel.
+            Sky in photons per pixel, > 0.
         """
-        # Few stars say how the field differs from that of the training (eq. 5).
+        # Few stars determine the difference from the field of the training (eq. 5).
         sizes = (self.side + 2 * MARGIN_PX, self.side, self.settings.smoothness)
         fit = refit_field(self.model, bright, background, *sizes)
-        listed = fit.list_error(bright)
+        list_error = fit.list_error(bright)
         return replace(
             self,
             coefficients=fit.model.coefficients.astype(np.float32),
-            listed=listed if np.isfinite(listed).all() else self.listed,
+            list_error=list_error if np.isfinite(list_error).all() else self.list_error,
         )
 
     @classmethod
-    def restored(
+    def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """Return the method of a bundle; noise and settings are those of the configuration.
+        """Return the method of a bundle; the configuration has its noise and settings.
 
-        Settings that this release does not know are ignored: they affect the fit alone.
+        Settings that this release does not know are ignored: they only affect the fit.
         """
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
-        # Modes may be in half precision; two arrays have older names in files.
-        named: dict[str, Any] = {cls.attributes.get(n, n): array for n, array in arrays.items()}
-        named["modes"] = arrays["modes"].astype(np.float32)
-        supported = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
-        settings = FieldSettings.model_validate(supported)
-        return cls(**named, noise=noise, settings=settings)
+        # Modes may be in half precision; three arrays have older names in files.
+        fields: dict[str, Any] = {cls.attributes.get(n, n): array for n, array in arrays.items()}
+        fields["modes"] = arrays["modes"].astype(np.float32)
+        values = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
+        settings = FieldSettings.model_validate(values)
+        return cls(**fields, noise=noise, settings=settings)
 
-    def stored_arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of a fit by their names in files."""
-        return {name: getattr(self, self.attributes.get(name, name)) for name in self.stored()}
+        return {name: getattr(self, self.attributes.get(name, name)) for name in self.list_arrays()}
 
-    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def export(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return the arrays for a bundle, and fields of its `BundleInfo`.
 
-        Large stamps have fewer modes, in half precision; the variance of the others joins the
-        diagonal.
+        Bundles of large stamps have fewer modes, in half precision; the variance of the other modes
+        is added to the diagonal.
         """
-        arrays, info_fields = super().pack(stamp_px, noise)
-        # Modes have two bytes a number, and 3 MB at most.
+        arrays, info_fields = super().export(stamp_px, noise)
+        # Modes take two bytes per number, and at most 3 MB.
         phases, mode_count, pixels = self.modes.shape
         packed_count = min(mode_count, max(1, int(3e6 // (2 * phases * pixels))))
         arrays["diagonal"] = self.diagonal + np.square(self.modes[:, packed_count:]).sum(axis=1)
         arrays["modes"] = self.modes[:, :packed_count].astype(np.float16)
         # Bundles hold finite numbers: without a star list, its error is left out.
-        arrays["listed"] = self.listed if self.has_list_error else np.empty((0, 2))
+        arrays["listed"] = self.list_error if self.has_list_error else np.empty((0, 2))
         return arrays, info_fields
 
     def draw_stars(
         self, count: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw noise-free stars of flux 1 at random places of the field and of a pixel.
+        """Draw noise-free stars of flux 1 at random positions in the field and in a pixel.
 
         Returns images (n, d, d), positions (n, 2) to (n, 4), and centres (row, column) in a list;
-        see `psfdae.methods.field_errors.draw_field_stars`.
+        see `psfdae.methods.field.errors.draw_field_stars`.
         """
         images, position, centre = draw_field_stars(self, self.uncertainty, count, rng)
         return images, position, centre - self.list_offset
 
-    def fitted_flux_error(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the error of a flux on a known sky, and how its variance grows over the field.
+    def estimate_flux_error(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the error of a flux on a known sky, and the growth of its variance over the field.
 
-        See `psfdae.methods.field_errors.flux_error_over_field`.
+        See `psfdae.methods.field.errors.flux_error_over_field`.
         """
         return flux_error_over_field(self.model, self.uncertainty, self.side)
 
@@ -199,12 +202,13 @@ class FieldMixture(FieldLaw, Method):
         Parameters
         ----------
         noisy : ndarray, shape (n, d, d)
+            Images of stars with noise.
         level : float or ndarray, shape (n,)
             Noise level λ.
         position : ndarray, shape (n, 2) to (n, 4), optional
-            NaN where unknown.
+            Coordinates x, y, magnitude and colour in the field; NaN where unknown.
         with_sigma : bool
-            The standard deviations are there in either case: they cost little.
+            Ignored: standard deviations take little time and are always returned.
 
         Raises
         ------
@@ -212,7 +216,7 @@ class FieldMixture(FieldLaw, Method):
             If a pixel is not finite.
         """
         count, pixels = len(noisy), noisy[0].size
-        # A star's photons count as if they were spread evenly over the stamp.
+        # Noise of the star's photons as if they were spread evenly over the stamp.
         even_star = np.full(count, 1.0 / pixels)
         noise = np.sqrt(self.noise.variance(even_star, np.asarray(level)))
         flux = None if self.measures_flux else np.ones(count)
@@ -235,20 +239,20 @@ class FieldMixture(FieldLaw, Method):
         Parameters
         ----------
         stamps : ndarray, shape (n, d, d)
-            In any unit; the sky may be roughly subtracted.
+            Images in any unit; the sky may be roughly subtracted.
         noise : ndarray, shape (n,)
-            RMS of a pixel, all photons spread evenly.
+            RMS noise of a pixel, with all photons spread evenly over the stamp.
         position : ndarray, shape (n, 2) to (n, 4), optional
             (x, y) in the field, magnitude and colour; NaN where unknown.
         centre : ndarray, shape (n, 2), optional
-            (row, column) in a star list, from pixel (d//2, d//2); NaN where there is none.
+            (row, column) in a star list, from pixel (d//2, d//2); NaN where unknown.
         fixed : bool or ndarray of bool, shape (n,)
-            The listed centres of these stars are exact.
+            True where the centre of the list is exact.
         flux, sky : ndarray, shape (n,), optional
             Known values; NaN where they are to be measured.
         gain : ndarray, shape (n,), optional
-            Electrons per unit of the stamps, by which the errors have the star's photons where they
-            are; NaN where unknown.
+            Electrons per unit of the stamps, with which errors include the true distribution of the
+            star's photons; NaN where unknown.
 
         Raises
         ------
@@ -264,24 +268,24 @@ class FieldMixture(FieldLaw, Method):
         unknown = np.full(count, np.nan)
         flux, sky = (unknown if a is None else a for a in (flux, sky))
         terms, position_known = self.terms(unknown[:, None] if position is None else position)
-        # Centres of the list in the coordinates of the field's centres; those that are exact.
-        listed = (np.full((count, 2), np.nan) if centre is None else centre) + self.list_offset
-        exact = np.where(np.broadcast_to(fixed, count)[:, None], listed, np.nan)
+        # Centres of the list in the coordinates of the field, and the exact ones among them.
+        list_px = (np.full((count, 2), np.nan) if centre is None else centre) + self.list_offset
+        exact = np.where(np.broadcast_to(fixed, count)[:, None], list_px, np.nan)
         sky_level = np.nan_to_num(sky)
         stars = FieldStamps(
             images=images - sky_level[:, None],
             noise=np.broadcast_to(noise, count),
             terms=terms,
-            log_prior=log_node_prior(self, listed),
+            log_prior=log_node_prior(self, list_px),
             flux=flux,
             sky_known=np.isfinite(sky),
             unit_per_electron=np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
             cell_sigma_px=np.full(count, self.cell_sigma_px),
             unit=np.ones(count),
         )
-        posterior = posterior_of_stamps(self, stars, position_known, exact)
-        # Sky as it was in the stamps, and centres in the coordinates of the list.
-        measured = Measured(
+        posterior = compute_posterior(self, stars, position_known, exact)
+        # Sky of the original stamps, and centres in the coordinates of the list.
+        measurements = Measurements(
             flux=posterior.flux,
             background=posterior.sky + sky_level,
             centre=posterior.centre - self.list_offset,
@@ -291,28 +295,30 @@ class FieldMixture(FieldLaw, Method):
             psf=posterior.psf.reshape(stamps.shape).astype(np.float32),
             sigma=posterior.psf_sigma.reshape(stamps.shape).astype(np.float32),
             evidence=posterior.log_evidence,
-            measured=measured,
+            measurements=measurements,
             outlier_score=posterior.mahalanobis2,
         )
 
 
-def stars_of_fit(
+def select_fit_stars(
     snr: np.ndarray, frame_pixels: int, seed: int, most_pixels: float = 2e6
 ) -> np.ndarray:
-    """Return the rows of the stars that a field is fitted to: all, unless their frames are large.
+    """Return the indices of the stars for a fit of the field: all, unless their frames are large.
 
-    Time and memory of a fit grow with the pixels of all stars. Where stars are well sampled, some
-    hundred of them determine the field as well as thousands. They are drawn with chances that grow
-    with their S/N, so that each part of the field and each magnitude has some.
+    Time and memory of a fit are proportional to the pixels of all stars. Where stars are well
+    sampled, some hundred stars determine the field as well as thousands. They are drawn with a
+    probability proportional to their S/N, from all parts of the field and all magnitudes.
 
     Parameters
     ----------
     snr : ndarray, shape (n,)
+        S/N of the stars.
     frame_pixels : int
-        Pixels of the frame of a star.
+        Number of pixels in the frame of a star.
     seed : int
+        Seed of the draw, ≥ 0.
     most_pixels : float
-        Pixels of all frames together, of which the fit takes about 1 GB.
+        Largest number of pixels in all frames, for which a fit takes about 1 GB.
     """
     count = int(most_pixels / frame_pixels)
     if len(snr) <= count:
@@ -322,23 +328,25 @@ def stars_of_fit(
     return np.sort(rng.choice(len(snr), count, replace=False, p=chance / chance.sum()))
 
 
-def fitted_arrays(
+def compute_arrays(
     fit: FieldFit, bright: BrightStars, side: int, settings: FieldSettings
 ) -> dict[str, Any]:
-    """Return the arrays of a `FieldLaw` that follow from a fit of the field.
+    """Compute the arrays of a `FieldPrior` from a fit of the field.
 
     Parameters
     ----------
     fit : FieldFit
+        Model, residuals and centres of the fit.
     bright : BrightStars
         Stars of the fit.
     side : int
         Side of a stamp in pixels.
     settings : FieldSettings
+        Settings of nodes and residuals.
     """
-    # Mean star and variation over the field are those of the stars that count.
-    used = bright.of(fit.good)
-    terms = fit.model.terms(used.place)
+    # Mean star and variation over the field, from the stars that are not outliers.
+    used_stars = bright.select(fit.good)
+    terms = fit.model.terms(used_stars.place)
     mean_terms = terms.mean(axis=0)
     # Nodes are closer together where the mean star is narrow.
     mean_star = fit.model.images(mean_terms[None], np.zeros((1, 2)), side)
@@ -346,7 +354,7 @@ def fitted_arrays(
     residual, centre, flux = (a[fit.good] for a in (fit.residual, fit.centre, fit.flux))
     shape = settings.modes, settings.diagonal
     offset, modes, diagonal = residual_covariance(
-        residual, centre, used.noise / flux, step_px, *shape
+        residual, centre, used_stars.noise / flux, step_px, *shape
     )
     return {
         "coefficients": fit.model.coefficients.astype(np.float32),
@@ -357,5 +365,5 @@ def fitted_arrays(
         "offset": offset.astype(np.float32),
         "modes": modes.astype(np.float32),
         "diagonal": diagonal.astype(np.float32),
-        "listed": fit.list_error(bright),
+        "list_error": fit.list_error(bright),
     }

@@ -1,10 +1,10 @@
-"""Normal distributions with a covariance of low rank, seen through noise of any variance.
+"""Normal distributions with a covariance of low rank, with noise of any variance.
 
-A stamp with noise of variance s per pixel has the covariance G = C + s, where C is that of the
-stars without noise. Few directions have a variance that noise does not hide: C is diagonal along
-its leading axes V and a multiple of 1 beyond them, so that G⁻¹ is known for every s at once
-(`AxesInverse`, eq. 4 of docs/mixture.md). For one s alone, Woodbury's formula is faster
-(`WoodburyInverse`). For the field, `psfdae.methods.field_nodes.NodeAxes` has the same form of G.
+A stamp with noise of variance s per pixel has the covariance G = C + s, where C is the covariance
+of stars without noise. Few directions have a variance above the noise: C is approximated as
+diagonal along its leading axes V and a multiple of 1 beyond them, so that G⁻¹ is known for every s
+(`AxesInverse`, eq. 4 of docs/mixture.md). For a single s, Woodbury's formula is faster
+(`WoodburyInverse`). For the field, `psfdae.methods.field.nodes.NodeAxes` has the same form of G.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 class AxesInverse(NamedTuple):
     """G_k⁻¹ of a cluster for any noise variance s of a bin or above it (eq. 4).
 
-    Noise variances s of n stars are arrays of shape (n, 1). Rows are stars of the same n, or, where
-    it says so, all are seen with every noise variance.
+    Noise variances s of n stars are arrays of shape (n, 1). Rows are the same n stars, except where
+    all rows are combined with every noise variance.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class AxesInverse(NamedTuple):
     variance : ndarray, shape (a,)
         Variance λ along each axis.
     variance_beyond : float
-        Mean variance λ₀ beyond the axes in the m coordinates; infinite if nothing is beyond.
+        Mean variance λ₀ beyond the axes in the m coordinates; infinite if the axes are complete.
     """
 
     vectors: np.ndarray
@@ -45,13 +45,13 @@ class AxesInverse(NamedTuple):
         along, gain_beyond = self._inverse(s)
         axes = rows @ self.vectors
         # V (λ + s)⁻¹ Vᵀ of the rows, and their projection V Vᵀ, by one product with the axes.
-        weighted, projected = np.split(np.vstack([along * axes, axes]) @ self.vectors.T, 2)
-        return np.asarray(weighted + gain_beyond * (rows - projected))
+        product, projection = np.split(np.vstack([along * axes, axes]) @ self.vectors.T, 2)
+        return np.asarray(product + gain_beyond * (rows - projection))
 
     def mahalanobis2(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of each of the rows x (n, m), with its own noise, (n,)."""
         along, gain_beyond = self._inverse(s)
-        # |x|² is that along the axes and that beyond them.
+        # |x|² is the sum of the squares along the axes and beyond them.
         squares = np.square(rows @ self.vectors)
         squares_beyond = np.square(rows).sum(axis=1) - squares.sum(axis=1)
         return np.asarray((squares * along).sum(axis=1) + squares_beyond * gain_beyond[:, 0])
@@ -59,14 +59,14 @@ class AxesInverse(NamedTuple):
     def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
         along, gain_beyond = self._inverse(s)
-        # x V (λ + s)⁻¹ Vᵀ vᵀ, and (λ₀ + s)⁻¹ times the product of what is beyond the axes.
+        # x V (λ + s)⁻¹ Vᵀ vᵀ, plus (λ₀ + s)⁻¹ times the product beyond the axes.
         row_axes, vector_axes = rows @ self.vectors, vector @ self.vectors
         return np.asarray(
             (along * row_axes) @ vector_axes
             + gain_beyond[:, 0] * (rows @ vector - row_axes @ vector_axes)
         )
 
-    def mahalanobis2_of_all(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+    def mahalanobis2_pairs(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of every row x (r, m) for every noise variance, (n, r)."""
         along, gain_beyond = self._inverse(s)
         # As `mahalanobis2`, for all pairs of a noise variance and a row.
@@ -102,9 +102,9 @@ class ClusterAxes(NamedTuple):
     total_variance: float
 
     @classmethod
-    def of(cls, covariance: np.ndarray) -> ClusterAxes:
+    def from_covariance(cls, covariance: np.ndarray) -> ClusterAxes:
         """Return the eigenvectors of a covariance (w, w)."""
-        # By descending variance; rounding may make the least ones negative.
+        # By descending variance; rounding may make the smallest ones negative.
         variance, vectors = np.linalg.eigh(covariance)
         return cls(
             vectors=np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
@@ -114,7 +114,7 @@ class ClusterAxes(NamedTuple):
 
     def inverse(self, least_variance: float) -> AxesInverse:
         """Return G_k⁻¹ by the axes of a larger variance, with the mean of the others (eq. 4)."""
-        # λ₀: what the axes leave of the trace, over the number of dimensions beyond them.
+        # λ₀: the trace without the axes, over the number of dimensions beyond them.
         variance = self.variance[self.variance > least_variance]
         dimensions = len(self.variance) - len(variance)
         sum_beyond = self.total_variance - variance.sum()
@@ -123,9 +123,9 @@ class ClusterAxes(NamedTuple):
 
 
 class WoodburyInverse(NamedTuple):
-    """G_k⁻¹ for one noise variance, which takes far less to compute than axes (eq. 5).
+    """G_k⁻¹ for one noise variance, which takes far less time than the axes (eq. 5).
 
-    Methods are those of `AxesInverse`; their argument s only says how many results are wanted.
+    It has the methods of `AxesInverse`, whose argument s only determines the number of results.
 
     Attributes
     ----------
@@ -142,14 +142,14 @@ class WoodburyInverse(NamedTuple):
     half_log: float
 
     @classmethod
-    def of(cls, diagonal: np.ndarray, rows: np.ndarray) -> WoodburyInverse:
+    def build(cls, diagonal: np.ndarray, rows: np.ndarray) -> WoodburyInverse:
         """Return G⁻¹ of D + UᵀU with D (m,) and U (r, m) (eq. 5)."""
         # U D⁻¹, then L with L Lᵀ = 1 + U D⁻¹ Uᵀ, and ln det G = ln det D + 2 ln det L.
-        weighted = rows / diagonal
-        lower = np.linalg.cholesky(np.eye(len(rows)) + weighted @ rows.T)
+        weighted_rows = rows / diagonal
+        lower = np.linalg.cholesky(np.eye(len(rows)) + weighted_rows @ rows.T)
         half_log = 0.5 * np.log(diagonal).sum() + np.log(lower.diagonal()).sum()
-        solved = (np.linalg.inv(lower) @ weighted).astype(np.float32)
-        return cls(1.0 / diagonal, solved, float(half_log))
+        solution = (np.linalg.inv(lower) @ weighted_rows).astype(np.float32)
+        return cls(1.0 / diagonal, solution, float(half_log))
 
     def solve(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return the product of rows (n, m) with G⁻¹, (n, m)."""
@@ -159,9 +159,9 @@ class WoodburyInverse(NamedTuple):
 
     def mahalanobis2(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of each of the rows x (n, m), (n,)."""
-        # x D⁻¹ xᵀ less what the rows explain.
-        explained = np.square(rows @ self.rows.T).sum(axis=1)
-        return np.asarray(np.square(rows) @ self.diagonal.astype(rows.dtype) - explained)
+        # x D⁻¹ xᵀ minus the part along the rows.
+        explained_part = np.square(rows @ self.rows.T).sum(axis=1)
+        return np.asarray(np.square(rows) @ self.diagonal.astype(rows.dtype) - explained_part)
 
     def product(self, rows: np.ndarray, vector: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ vᵀ of the rows x (n, m) with one vector v (m,), (n,)."""
@@ -169,9 +169,9 @@ class WoodburyInverse(NamedTuple):
             rows @ (self.diagonal * vector) - (rows @ self.rows.T) @ (self.rows @ vector)
         )
 
-    def mahalanobis2_of_all(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+    def mahalanobis2_pairs(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Return x G⁻¹ xᵀ of every row x (r, m), the same for every s, (n, r)."""
-        # All noise variances are that for which this was computed.
+        # The noise variance is the same for all.
         distance = np.square(rows) @ self.diagonal - np.square(rows @ self.rows.T).sum(axis=1)
         return np.asarray(np.repeat(distance[None], len(s), axis=0))
 
@@ -181,4 +181,4 @@ class WoodburyInverse(NamedTuple):
 
 
 NoisyCovariance = AxesInverse | WoodburyInverse
-"""Covariance G = C + s of stars of a cluster with noise, of which the inverse is known."""
+"""Covariance G = C + s of stars of a cluster with noise, in the form of its inverse."""

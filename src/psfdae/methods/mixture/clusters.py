@@ -1,7 +1,8 @@
-"""Clusters of similar training stars: their normal distributions, and these with noise.
+"""Clusters of similar training stars: their normal distributions, without and with noise.
 
-Equations are numbered as on the page docs/mixture.md. `psfdae.methods.mixture_law` makes the
-clusters of a mixture; `psfdae.methods.gaussians` has the algebra of their covariances.
+Equations are numbered as on the page docs/mixture.md. `psfdae.methods.mixture.prior` makes
+the clusters of a mixture; `psfdae.methods.mixture.gaussians` has the algebra of their
+covariances.
 """
 
 from __future__ import annotations
@@ -12,17 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.methods.gaussians import AxesInverse, ClusterAxes, WoodburyInverse
+from psfdae.methods.mixture.gaussians import AxesInverse, ClusterAxes, WoodburyInverse
 
 
 class Cluster(NamedTuple):
-    """One cluster of a mixture with its covariances (all given the position).
+    """One cluster of a mixture with its covariances, all conditional on the position.
 
     Attributes
     ----------
     residuals, reference_residuals : ndarray, shape (r, P)
-        Residuals X_k in coordinates and Y_k in pixels, or rows of the same products if these are
-        fewer.
+        Residuals X_k in coordinates and Y_k in pixels, or fewer rows with the same products.
     reference_square : ndarray, shape (P,)
         Diagonal of YᵀY.
     slope, reference_slope : ndarray, shape (q, P)
@@ -43,30 +43,30 @@ class Cluster(NamedTuple):
     residual_factor: float
 
 
-def without_slope(
+def remove_slope(
     residuals: np.ndarray, position: np.ndarray, inverse: np.ndarray, shrinkage: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals that a linear change with the position leaves, and this slope (eq. 9).
+    """Return residuals without a linear change with the position, and its slope (eq. 9).
 
     Parameters
     ----------
     residuals : ndarray, shape (n, m)
-        Residuals X about the mean, without the slope that is common to all clusters.
+        Residuals X about the mean, without the common slope of all clusters.
     position : ndarray, shape (n, q)
         Whitened positions p about their mean.
     inverse : ndarray, shape (q, q)
         (pᵀp + ν)⁻¹.
     shrinkage : float
-        ν.
+        Weight ν of the common slope, as a number of stars.
 
     Returns
     -------
     rows : ndarray, shape (n + q, m)
         X − p B, and the rows √ν B.
     slope : ndarray, shape (q, m)
-        B, by how much the slope of the cluster differs from the common one.
+        B, the difference of the cluster's slope from the common one.
     """
-    # Ridge regression: B minimises |X − p B|² + ν |B|², and both terms are squares of rows.
+    # Ridge regression: B minimises |X − p B|² + ν |B|²; both terms are sums of squares of the rows.
     slope = (inverse @ (position.T @ residuals)).astype(np.float32)
     remaining = residuals - position.astype(np.float32) @ slope
     return np.vstack([remaining, np.float32(np.sqrt(shrinkage)) * slope]), slope
@@ -74,13 +74,14 @@ def without_slope(
 
 @dataclass
 class ClusterInverses:
-    """Inverses G_k⁻¹ of the covariances of clusters with noise; what is computed is kept.
+    """Inverses G_k⁻¹ of the covariances of clusters with noise, with a cache.
 
     Attributes
     ----------
     clusters : sequence of Cluster
+        Clusters of the mixture.
     variance : ndarray, shape (P,)
-        Eigenvalues of S, the covariance that all clusters have in common.
+        Eigenvalues of S, the common covariance of all clusters.
     """
 
     clusters: Sequence[Cluster]
@@ -90,19 +91,19 @@ class ClusterInverses:
         default_factory=dict, init=False
     )
 
-    def of_any_noise(self, k: int, width: int, least_variance: float) -> AxesInverse:
+    def invert_any(self, k: int, width: int, least_variance: float) -> AxesInverse:
         """Return G_k⁻¹ of cluster k in the leading coordinates for every noise variance (eq. 4).
 
-        Axes with no more than the least variance are not used one by one.
+        Axes with at most the least variance are replaced by their mean variance.
 
         Parameters
         ----------
         k : int
-            Number of the cluster.
+            Index of the cluster.
         width : int
             Number of leading coordinates.
         least_variance : float
-            Least noise variance of a pixel that the inverse will be asked for.
+            Minimum variance of an axis that is used individually.
         """
         if (k, width) not in self._axes:
             # C_k = (X_kᵀ X_k + ν S) / (n_k + ν), with S diagonal in these coordinates (eq. 2).
@@ -110,17 +111,17 @@ class ClusterInverses:
             rows = cluster.residuals[:, :width].astype(np.float64)
             covariance = cluster.residual_factor * (rows.T @ rows)
             covariance[np.diag_indices(width)] += cluster.common_factor * self.variance[:width]
-            self._axes[k, width] = ClusterAxes.of(covariance)
-        # The eigenvectors are those of every noise; how many of them matter depends on it.
+            self._axes[k, width] = ClusterAxes.from_covariance(covariance)
+        # The eigenvectors are the same for every noise; the number of relevant ones depends on it.
         return self._axes[k, width].inverse(least_variance)
 
-    def of_one_noise(self, k: int, width: int, s: float) -> WoodburyInverse:
+    def invert_one(self, k: int, width: int, s: float) -> WoodburyInverse:
         """Return G_k⁻¹ of cluster k in the leading coordinates for one noise variance s (eq. 5).
 
         Parameters
         ----------
         k : int
-            Number of the cluster.
+            Index of the cluster.
         width : int
             Number of leading coordinates.
         s : float
@@ -136,5 +137,5 @@ class ClusterInverses:
             cluster = self.clusters[k]
             diagonal = cluster.common_factor * self.variance[:width] + s
             rows = cluster.residuals[:, :width].astype(np.float64)
-            inverses[k] = WoodburyInverse.of(diagonal, rows * np.sqrt(cluster.residual_factor))
+            inverses[k] = WoodburyInverse.build(diagonal, rows * np.sqrt(cluster.residual_factor))
         return inverses[k]

@@ -1,8 +1,8 @@
-"""Fit of a Gaussian mixture to stars: their clusters, what is stored of them, and the search.
+"""Fit of a Gaussian mixture to stars: clusters, stored arrays, and search of K and ν.
 
-Equations are numbered as on the page docs/mixture.md. Where the training images have noise of their
-own, as bright stars do, its covariance is subtracted from S and every XᵀX, and eigenvalues that
-would be negative are 0 (eq. 3).
+Equations are numbered as on the page docs/mixture.md. Where the training images have their own
+noise, as bright stars do, its covariance is subtracted from S and every XᵀX, and negative
+eigenvalues are set to 0 (eq. 3).
 """
 
 from __future__ import annotations
@@ -30,29 +30,31 @@ def k_means(
     Parameters
     ----------
     x : ndarray, shape (n, P)
+        Noise-free images.
     position : ndarray, shape (n, q)
-        Positions, which join the components.
+        Positions, which are additional features; q may be 0.
     clusters, principal : int
         Number of clusters and of principal components.
     place : float
-        RMS of the positions over that of the components.
+        RMS of the positions over the RMS of the components.
     seed : int
+        Seed of the initial clusters, ≥ 0.
     """
     from sklearn.cluster import KMeans
     from sklearn.decomposition import PCA
 
     if clusters == 1:
         return np.zeros(len(x), int)
-    # Positions of zero mean and unit variance; what does not vary is 0.
+    # Positions of zero mean and unit variance; a constant coordinate becomes 0.
     spread = position.std(axis=0)
     standard = (position - position.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    # The positions weigh `place` times as much as all components together.
+    # The RMS of the positions is `place` times the RMS of all components together.
     components = PCA(min(principal, *x.shape), svd_solver="covariance_eigh").fit_transform(x)
     scale = np.sqrt(np.square(components).sum() / len(x) / max(position.shape[1], 1))
     features = np.hstack([components, scale * (place * standard)]).astype(np.float32)
-    # scikit-learn takes a number as seed.
+    # The seed of scikit-learn is a number, drawn from a named stream.
     draw = int(stream(seed, "gmm", "clusters").integers(2**31))
-    # With more clusters, k-means++ takes ten times as long as a random start, and is no better.
+    # With more clusters, k-means++ takes ten times as long as a random start and is not better.
     init = "k-means++" if clusters <= 512 else "random"
     means = KMeans(clusters, init=init, n_init=1, random_state=draw)
     return np.asarray(means.fit(features).labels_)
@@ -70,8 +72,8 @@ def whitening_matrix(p: np.ndarray) -> np.ndarray:
 
 
 def rows_without_noise(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return rows (n, P) whose products are xᵀx less that of noise (P, P), not negative (eq. 3)."""
-    # xᵀx − N = V λ Vᵀ has the rows √λ Vᵀ, of which no more than min(n, P) can be needed.
+    """Return rows (n, P) with the products xᵀx minus noise (P, P), not negative (eq. 3)."""
+    # xᵀx − N = V λ Vᵀ has the rows √λ Vᵀ, of which at most min(n, P) are needed.
     variance, axes = np.linalg.eigh(x.T @ x - noise)
     rank = min(x.shape)
     rows = np.zeros_like(x)
@@ -82,15 +84,16 @@ def rows_without_noise(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def mixture_arrays(
     data: TrainingSet, stars: np.ndarray, p: np.ndarray, cluster: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of the mixture of some stars, as `MixtureLaw` names them, but for ν.
+    """Return the arrays of the mixture of some stars, named as in `MixturePrior`, without ν.
 
     Parameters
     ----------
     data : TrainingSet
+        Images and references of the stars, and the noise of the images.
     stars : ndarray of int, shape (n,)
         Indices of the stars.
     p : ndarray, shape (n, q)
-        Their positions; q = 0 if they are not used.
+        Their positions; q = 0 if positions are not used.
     cluster : ndarray of int, shape (n,)
         Their clusters, from 0 on; each has a star.
     """
@@ -107,12 +110,12 @@ def mixture_arrays(
             np.subtract(rows, cluster_mean, out=rows)
         return mean, a
 
-    # Residuals of positions, images and references; where these are the images, they are one array.
+    # Residuals of positions, images and references; one array if the references are the images.
     no_references = np.array_equal(data.images[stars], data.references[stars])
     (mean_p, p), (mean_x, x) = about_means(p[order]), about_means(data.images[stars[order]])
     mean_y, y = (mean_x, x) if no_references else about_means(data.references[stars[order]])
-    # The change with whitened position that is common to all clusters, and the residuals that it
-    # leaves (eq. 9). At most 4096 stars at once: all would take as much memory again.
+    # The common change of all clusters with whitened position is subtracted from the residuals
+    # (eq. 9). At most 4096 stars at once, because all would double the memory.
     whitening = whitening_matrix(p)
     p = p @ whitening
     slope, slope_y = (p.T @ a / len(a) for a in (x, y))
@@ -120,7 +123,7 @@ def mixture_arrays(
     for rows in parts:
         x[rows] -= p[rows] @ slope
         y[rows] -= 0.0 if no_references else p[rows] @ slope_y
-    # S, less the noise of the images themselves (eq. 3), and its eigenvectors.
+    # S, minus the noise of the images themselves (eq. 3), and its eigenvectors.
     scatter = x.T @ x
     if data.own_noise is not None and no_references and not p.size:
         for a, b, mean in zip(start, start + count, mean_x, strict=True):
@@ -128,12 +131,12 @@ def mixture_arrays(
             scatter -= noise
             x[a:b] = rows_without_noise(x[a:b], noise)
     variance, axes = np.linalg.eigh(scatter / len(x))
-    # By descending variance, which the noise that is subtracted must not make negative.
+    # By descending variance; the subtraction of noise must not make it negative.
     variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
     # Coordinates: the images along the eigenvectors.
     for rows in parts:
         x[rows] = x[rows] @ axes
-    # In single precision, as images are. Without references of their own, their arrays are empty.
+    # In single precision, as the images. Arrays of references are empty if these are the images.
     none = np.empty((0, x.shape[1]), np.float32)
     return {
         "axes": axes.astype(np.float32),
@@ -154,20 +157,21 @@ def mixture_arrays(
     }
 
 
-def climbed(
+def climb(
     values: Sequence[Number], start: Number, error: Callable[[Number], float], pays: float = 0.0
 ) -> Number:
-    """Hill-climb from `start` over sorted values, up or else down, while the error falls.
+    """Climb from `start` over sorted values, upwards or else downwards, while the error falls.
 
     Parameters
     ----------
     values : sequence of numbers
+        Values of a setting, in any order.
     start : number
         One of the values.
     error : callable
-        Error of a value.
+        Function that returns the error for a value.
     pays : float
-        Part by which a step up must lower the error.
+        Fraction by which an upward step must lower the error.
     """
     ascending = sorted(values)
     place = ascending.index(start)
@@ -177,7 +181,7 @@ def climbed(
             if error(value) >= (1.0 - gain) * error(summit):
                 break
             summit = value
-        # Downwards only where no step up was better.
+        # Downwards only if no upward step was better.
         if summit != start:
             break
     return summit
@@ -194,33 +198,33 @@ def best_mixture(
     Parameters
     ----------
     error : callable
-        Error of a mixture with K, ν, and with the position used or not.
+        Function of K, ν, and whether the position is used, that returns the error of the mixture.
     sizes, shrinkages : sequence
         Values of K and ν; the search starts at the first ones.
     given_position : bool
-        Positions are given, and may be left aside.
+        True if positions are known; they need not be used.
     """
 
-    def search(k: int, nu: float, used: bool) -> tuple[float, int, bool, float]:
-        """Climb to the best ν, to the best K there, and on to the best ν of fewer clusters.
+    def search(k: int, nu: float, uses_position: bool) -> tuple[float, int, bool, float]:
+        """Climb to the best ν, to the best K for it, and again to the best ν if K is smaller.
 
-        More clusters take longer, and the same ν is best for them: they have to lower the error by
-        2 %.
+        More clusters take more time, and have the same best ν: they must lower the error by 2 %.
         """
         first = k
-        nu = climbed(shrinkages, nu, lambda value: error(k, value, used))
-        k = climbed(sizes, k, lambda value: error(value, nu, used), pays=0.02)
+        nu = climb(shrinkages, nu, lambda value: error(k, value, uses_position))
+        k = climb(sizes, k, lambda value: error(value, nu, uses_position), pays=0.02)
         if k < first:
-            nu = climbed(shrinkages, nu, lambda value: error(k, value, used))
-        return error(k, nu, used), k, used, nu
+            nu = climb(shrinkages, nu, lambda value: error(k, value, uses_position))
+        return error(k, nu, uses_position), k, uses_position, nu
 
     result = _, k, _, nu = search(sizes[0], shrinkages[0], given_position)
-    # Positions are left aside if that restores stars in other places better. This is searched only
-    # if the first K, whose mixtures take the least time, does not err 5 % more without them.
+    # Positions are not used if stars at other positions are restored better without them. This is
+    # only searched if the error at the first K, whose mixtures take the least time, is less than
+    # 5 % larger without them.
     if given_position and error(sizes[0], nu, False) < 1.05 * error(sizes[0], nu, True):
         result = min(result, search(k, nu, False))
-    _, k, used, nu = result
-    return k, nu, used
+    _, k, uses_position, nu = result
+    return k, nu, uses_position
 
 
 def best_on_validation(
@@ -236,17 +240,18 @@ def best_on_validation(
     Parameters
     ----------
     mixture : callable
-        Fits a mixture with K clusters, and with the position used or not.
+        Function of K and whether the position is used, that fits a mixture.
     data : TrainingSet
+        Images and references of all stars.
     judge : ndarray of int
-        Indices of the validation stars, from which no mixture learns.
+        Indices of the validation stars, to which no mixture is fitted.
     sizes, shrinkages : sequence
-        Values of K and ν that may be tried; the search starts at the first ones.
+        Values of K and ν; the search starts at the first ones.
     method_class : type
         Class of the mixtures.
     """
-    # The same noise for all mixtures, so that their errors can be compared. Of many λ, those
-    # between the least and the greatest stand for all.
+    # The same noise for all mixtures, so that their errors can be compared. If there are more than
+    # two λ, the smallest and the largest are left out.
     rng, levels = stream(data.seed, "noise", "gmm validation"), np.sort(data.levels)
     levels = levels[1:-1] if len(levels) > 2 else levels
     noisy = [data.noise.draw(data.images[judge], level, rng) for level in levels]
@@ -256,26 +261,26 @@ def best_on_validation(
     cached_mixture = cache(mixture)
 
     @cache
-    def error(k: int, nu: float, used: bool) -> float:
+    def error(k: int, nu: float, uses_position: bool) -> float:
         """Return the geometric mean of the squared error at these noise levels."""
-        # Another ν changes no array of a mixture but one.
-        fitted = replace(cached_mixture(k, used), shrinkage=np.array([nu]))
+        # Another ν changes only one array of a mixture.
+        trial = replace(cached_mixture(k, uses_position), shrinkage=np.array([nu]))
         advance(1)
         errors = [
-            np.square(fitted.estimate(images, level, position, False).psf - truth).mean()
+            np.square(trial.estimate(images, level, position, False).psf - truth).mean()
             for images, level in zip(noisy, levels, strict=True)
         ]
         return float(np.exp(np.mean(np.log(errors))))
 
     with task("mixture", len(sizes) + len(shrinkages)) as advance:
-        k, nu, used = best_mixture(error, sizes, shrinkages, given_position)
-    # Values at an end of their range: a better one may lie beyond it. One cluster is the fewest.
+        k, nu, uses_position = best_mixture(error, sizes, shrinkages, given_position)
+    # Values at an end of their range are reported, because a better one may be outside.
     last = [f"K = {k}"] * (len(sizes) > 1 and 1 < k == max(sizes))
     last += [f"ν = {nu:g}"] * (len(shrinkages) > 1 and nu in (min(shrinkages), max(shrinkages)))
     print(
         f"{method_class.look.title}: K = {k} clusters, ν = {nu:g}"
-        + (", without positions" if given_position > used else "")
+        + (", without positions" if given_position > uses_position else "")
         + (f"; {', '.join(last)}: last that were tried" if last else ""),
         flush=True,
     )
-    return k, nu, used
+    return k, nu, uses_position

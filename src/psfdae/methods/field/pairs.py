@@ -1,10 +1,10 @@
 """Fits of stars in the nodes of the lattice of centres: flux, sky and centre in each pair.
 
-In go stamps with what is known of each star (`FieldStamps`) and the `FieldLaw`. `project_pairs`
-reduces each pair of a star and a node to products along the axes of the node, once for noise of any
-variance (eq. 8); `fit_pairs` has the marginal likelihood and the flux in each pair for the noise of
-the star, with sky and centre marginalised (eq. 9 to 11). Equations are numbered as on the page
-docs/field_model.md.
+Inputs: stamps with the known quantities of each star (`FieldStamps`), and the `FieldPrior`.
+`project_pairs` reduces each pair of a star and a node to products along the axes of the node, which
+are valid for noise of any variance (eq. 8). `fit_pairs` computes the marginal likelihood and the
+flux in each pair for the noise of the star, with sky and centre marginalised (eq. 9 to 11).
+Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.methods.field_law import FieldLaw
+from psfdae.methods.field.prior import FieldPrior
 from psfdae.methods.mixing import FLUX_SIGMA
 
 
 class FieldStamps(NamedTuple):
-    """Stamps of n stars, with what is known of each star; see `FieldMixture.measure`.
+    """Stamps of n stars, with the known quantities of each star; see `FieldMixture.measure`.
 
     Attributes
     ----------
@@ -30,10 +30,11 @@ class FieldStamps(NamedTuple):
     terms : ndarray, shape (n, K)
         Terms of the field at the positions of the stars.
     log_prior : ndarray, shape (n, nodes)
-        ln of the probability of each node; −inf where no centre is.
+        ln of the probability of each node; −inf for impossible nodes.
     flux : ndarray, shape (n,)
         Known fluxes; NaN where the flux is measured.
     sky_known : ndarray of bool, shape (n,)
+        True where the sky is exactly subtracted.
     unit_per_electron : ndarray, shape (n,)
         Value of an electron in units of the images; 0 where unknown.
     cell_sigma_px : ndarray, shape (n,)
@@ -41,7 +42,7 @@ class FieldStamps(NamedTuple):
     unit : ndarray, shape (n,)
         Guess of the flux, by which stars are divided in their fit.
     position_known : bool
-        The positions of all stars are known; otherwise that of none is.
+        True if the positions of all stars are known, False if they are all unknown.
     centre : ndarray, shape (n, 2), or None
         (row, column) from the middle pixel if all centres are exactly known.
     """
@@ -65,25 +66,26 @@ class FieldStamps(NamedTuple):
     def prior_sigma(self) -> np.ndarray:
         """Return the prior σ of t: sky (over flux), row and column, (n, 3) (eq. 6).
 
-        A sky that is not known has 1: the whole flux in each pixel. What is known has 0.
+        It is 1 for an unknown sky, the whole flux in each pixel, and 0 for known quantities.
         """
+        # In the order of the derivatives of a node.
         return np.stack([~self.sky_known * 1.0, self.cell_sigma_px, self.cell_sigma_px], axis=1)
 
-    def psfs(self, law: FieldLaw, k: int, stars: np.ndarray) -> np.ndarray:
+    def psfs(self, prior: FieldPrior, k: int, stars: np.ndarray) -> np.ndarray:
         """Return the field's PSFs m, (n, P), for some of the stars in node k (eq. 7)."""
         centre = None if self.centre is None else self.centre[stars]
-        return law.node_psfs(k, self.terms[stars], centre)
+        return prior.node_psfs(k, self.terms[stars], centre)
 
     def flux_known(self) -> np.ndarray:
-        """Return which fluxes are known, (n,)."""
+        """Return True where the flux is known, (n,)."""
         return np.asarray(np.isfinite(self.flux) & (self.flux > 0))
 
     def flux_precision(self) -> np.ndarray:
-        """Return 1/τ², the prior precision of the factor a, (n,): of a known flux, τ = 1e-6."""
+        """Return 1/τ², the prior precision of the factor a, (n,); τ = 1e-6 for a known flux."""
         return np.asarray(np.where(self.flux_known(), 1e-6, FLUX_SIGMA) ** -2.0)
 
     def noise_variance(self) -> np.ndarray:
-        """Return s = (noise/F)², the variance of a pixel by noise at the guessed flux, (n, 1)."""
+        """Return s = (noise/F)², the noise variance of a pixel at the guessed flux, (n, 1)."""
         return np.asarray(np.square(self.noise / self.unit)[:, None])
 
 
@@ -93,24 +95,25 @@ class Pairs(NamedTuple):
     Attributes
     ----------
     star, node : ndarray of int, shape (N,)
+        Indices of the star and the node of each pair.
     along : ndarray, shape (N, 2, m)
         x and m along the axes of the node.
-    beyond : ndarray, shape (N, 2, 5)
+    products_beyond : ndarray, shape (N, 2, 5)
         Products of x and m with x, m and the three derivatives, beyond the axes.
     """
 
     star: np.ndarray
     node: np.ndarray
     along: np.ndarray
-    beyond: np.ndarray
+    products_beyond: np.ndarray
 
     def select(self, mask: np.ndarray) -> Pairs:
-        """Return the pairs for which a mask is true."""
+        """Return the pairs for which a mask is True."""
         return Pairs._make(a[mask] for a in self)
 
-    def by_node(self) -> Iterator[tuple[int, slice]]:
-        """Yield the number of each node, and which pairs are with it."""
-        # Pairs of a node stand side by side.
+    def iterate_nodes(self) -> Iterator[tuple[int, slice]]:
+        """Yield the index of each node, and the slice of its pairs."""
+        # Pairs of a node are neighbours.
         nodes, first = np.unique(self.node, return_index=True)
         for k, start, stop in zip(nodes.tolist(), first, [*first[1:], len(self.node)], strict=True):
             yield k, slice(start, stop)
@@ -128,11 +131,11 @@ class PairFit(NamedTuple):
     variance : ndarray, shape (N,)
         Variance of a.
     precision : ndarray, shape (N, 3, 3)
-        Inverse covariance Λ of the nuisance parameters t/σ, of known a (eq. 9).
+        Inverse covariance Λ of the nuisance parameters t/σ for given a (eq. 9).
     covariance : ndarray, shape (N, 3, 3)
         Λ⁻¹.
     nuisance : ndarray, shape (N, 2, 3)
-        Mean of t/σ in a fit to x and in one to m; that of x − a m is their difference.
+        Mean of t/σ in a fit to x and in a fit to m; the mean for x − a m is x's minus a times m's.
     """
 
     log_likelihood: np.ndarray
@@ -144,15 +147,16 @@ class PairFit(NamedTuple):
 
     def nuisance_and_slope(self, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return t of x − a m, (N, 3), and its derivative t' by a, for prior σ (N, 3) (eq. 13)."""
+        # t/σ is linear in the data.
         difference = self.nuisance[:, 0] - self.factor[:, None] * self.nuisance[:, 1]
         return sigma * difference, -sigma * self.nuisance[:, 1]
 
     def select(self, mask: np.ndarray) -> PairFit:
-        """Return the fits of the pairs for which a mask is true."""
+        """Return the fits of the pairs for which a mask is True."""
         return PairFit._make(a[mask] for a in self)
 
 
-def project_pairs(law: FieldLaw, stars: FieldStamps, is_nearby: np.ndarray) -> Pairs:
+def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) -> Pairs:
     """Return stars and PSFs along the axes of each nearby node, and products beyond them.
 
     Products with G⁻¹ are sums over the axes and one term beyond them, for any noise (eq. 8):
@@ -160,83 +164,86 @@ def project_pairs(law: FieldLaw, stars: FieldStamps, is_nearby: np.ndarray) -> P
 
     Parameters
     ----------
-    law : FieldLaw
+    prior : FieldPrior
+        Prior distribution of the stars.
     stars : FieldStamps
+        Stamps of n stars.
     is_nearby : ndarray of bool, shape (n, nodes)
-        Nodes of each star that are looked at.
+        True for nodes in which a star is fitted.
     """
-    # Pairs in the order of the nodes; all nodes have as many axes.
+    # Pairs in the order of the nodes; all nodes have the same number of axes.
     node, star = is_nearby.T.nonzero()
-    images, axis_count = stars.images, len(law.node_axes(node[0], stars.position_known).variance)
+    images, axis_count = stars.images, len(prior.node_axes(node[0], stars.position_known).variance)
     pairs = Pairs(star, node, *(np.empty((len(star), 2, columns)) for columns in (axis_count, 5)))
     square = np.square(images).sum(axis=1)
-    for k, rows in pairs.by_node():
-        derivatives, axes = law.nodes[k].derivatives, law.node_axes(k, stars.position_known)
-        image, mean = images[star[rows]], stars.psfs(law, k, star[rows])
-        # x and m along the axes; m is a sum of the node's images, whose products are there already.
-        along, beyond = pairs.along[rows], pairs.beyond[rows]
+    for k, rows in pairs.iterate_nodes():
+        derivatives, axes = prior.nodes[k].derivatives, prior.node_axes(k, stars.position_known)
+        image, mean = images[star[rows]], stars.psfs(prior, k, star[rows])
+        # x and m along the axes; m is a sum of the node's images, whose products are stored.
+        along, products = pairs.along[rows], pairs.products_beyond[rows]
         along[:, 0] = image @ axes.basis[3:].T
         if stars.centre is None:
-            along[:, 1] = law.nodes[k].image_weights(stars.terms[star[rows]]) @ axes.images
+            along[:, 1] = prior.nodes[k].image_weights(stars.terms[star[rows]]) @ axes.images
         else:
             along[:, 1] = mean @ axes.basis[3:].T
-        # Products over all pixels, less those along the axes.
-        beyond[:, 0, 0] = square[star[rows]]
-        beyond[:, 0, 1] = beyond[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
-        beyond[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
-        beyond[:, 0, 2:], beyond[:, 1, 2:] = image @ derivatives.T, mean @ derivatives.T
-        beyond -= _products(along, along, axes.derivatives)
+        # Products over all pixels, minus products along the axes.
+        products[:, 0, 0] = square[star[rows]]
+        products[:, 0, 1] = products[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
+        products[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
+        products[:, 0, 2:], products[:, 1, 2:] = image @ derivatives.T, mean @ derivatives.T
+        products -= _products(along, along, axes.derivatives)
     return pairs
 
 
-def fit_pairs(law: FieldLaw, stars: FieldStamps, pairs: Pairs) -> PairFit:
+def fit_pairs(prior: FieldPrior, stars: FieldStamps, pairs: Pairs) -> PairFit:
     """Return the fit of stars, divided by their guessed flux, in their nodes (eq. 9 to 11)."""
     count, s = len(pairs.star), stars.noise_variance()[pairs.star]
     scale, sigma = 1.0 / stars.unit[pairs.star, None], stars.prior_sigma()[pairs.star]
     products, precision, log_det = (np.empty((count, *shape)) for shape in ((2, 5), (3, 3), ()))
     # Products of x and m with x, m and L by G⁻¹, the precision Λ of the nuisance parameters, and
     # ln det G.
-    for k, rows in pairs.by_node():
-        axes, along = law.node_axes(k, stars.position_known), pairs.along[rows]
+    for k, rows in pairs.iterate_nodes():
+        axes, along = prior.node_axes(k, stars.position_known), pairs.along[rows]
         inverse = axes.inverse(s[rows])
         products[rows] = _products(along * inverse[:, None, :-1], along, axes.derivatives)
-        products[rows] += inverse[:, -1, None, None] * pairs.beyond[rows]
+        products[rows] += inverse[:, -1, None, None] * pairs.products_beyond[rows]
         precision[rows] = axes.nuisance_precision(s[rows], sigma[rows])
-        # `inverse` has one entry for all dimensions beyond the axes; here are the others.
+        # `inverse` has one entry for the dimensions beyond the axes; the others are added here.
         dimensions = stars.images.shape[1] - inverse.shape[1]
         log_det[rows] = -np.log(inverse).sum(axis=1) - dimensions * np.log(inverse[:, -1])
-    # Stars are x/F from here on, and derivatives are σ L.
+    # From here on, stars are x/F and derivatives are σ L.
     products[:, 0] *= scale
     products[:, :, 0] *= scale
     products[:, :, 2:] *= sigma[:, None]
-    # Woodbury: S⁻¹ = G⁻¹ − G⁻¹ Lᵀ σ Λ⁻¹ σ L G⁻¹; products with S⁻¹ from now on (eq. 9).
+    # Woodbury: S⁻¹ = G⁻¹ − G⁻¹ Lᵀ σ Λ⁻¹ σ L G⁻¹; from here on, products are with S⁻¹ (eq. 9).
     covariance = np.linalg.inv(precision)
     nuisance = products[:, :, 2:] @ covariance
     products[:, :, :2] -= nuisance @ products[:, :, 2:].transpose(0, 2, 1)
     (xx, xm), (_, mm) = products[:, :, :2].transpose(1, 2, 0)
-    # Generalised least squares for a with its prior about 1 (eq. 10): the residual x − m, along
-    # m, over the information.
-    prior = stars.flux_precision()[pairs.star]
-    information, residual = mm + prior, xm - mm
+    # Generalised least squares for a with a prior about 1 (eq. 10): the product of the residual
+    # x − m with m, over the information.
+    flux_precision = stars.flux_precision()[pairs.star]
+    information, residual = mm + flux_precision, xm - mm
     chi2 = xx - xm - residual - residual**2 / information
     # ln of the marginal likelihood (eq. 11), with ln det S = ln det G + ln det Λ.
     log_det += np.linalg.slogdet(precision)[1]
-    log_likelihood = -0.5 * (chi2 + np.log(information / prior) + log_det)
-    # The prior about the guessed flux comes from the same stamp: to count it as information
-    # would use the star twice. A known flux is information.
-    variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, mm)
+    log_likelihood = -0.5 * (chi2 + np.log(information / flux_precision) + log_det)
+    # The prior about the guessed flux comes from the same stamp: as information, it would use the
+    # star twice. A known flux is information.
+    variance = 1.0 / np.where(flux_precision > FLUX_SIGMA**-2.0, information, mm)
     factor = 1.0 + residual / information
     return PairFit(log_likelihood, factor, variance, precision, covariance, nuisance)
 
 
-def _products(weighted: np.ndarray, along: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
+def _products(factors: np.ndarray, along: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
     """Return products of two weighted vectors with vectors and derivatives, along axes.
 
     Parameters
     ----------
-    weighted, along : ndarray, shape (n, 2, m)
-        x and m along the axes, each axis with a weight, and without.
+    factors, along : ndarray, shape (n, 2, m)
+        x and m along the axes, multiplied by a weight of each axis, and without weight.
     derivatives : ndarray, shape (3, m)
+        Derivatives of the node along the axes.
 
     Returns
     -------
@@ -244,8 +251,8 @@ def _products(weighted: np.ndarray, along: np.ndarray, derivatives: np.ndarray) 
         Products of x and m, weighted, with x, m and the three derivatives.
     """
     products = np.empty((len(along), 2, 5))
-    products[..., :2] = np.einsum("nim,njm->nij", weighted, along)
+    products[..., :2] = np.einsum("nim,njm->nij", factors, along)
     # Products with the derivatives of all pairs as one product of matrices.
-    flat = weighted.reshape(-1, weighted.shape[-1])
+    flat = factors.reshape(-1, factors.shape[-1])
     products[..., 2:] = (flat @ derivatives.T).reshape(-1, 2, 3)
     return products

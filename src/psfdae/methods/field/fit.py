@@ -1,41 +1,40 @@
 """Fit of the PSF over the field to the bright stars of an image, with given options.
 
-Weighted least squares for the splines of `psfdae.methods.field_spline` alternate with the flux and
-the centre of every star (Gauss-Newton). Light is the same at all phases of the pixel grid: without
-that condition, splines and fluxes could change with the phase against each other. Changes over the
-field are as small a part of the wings as of the core, unless the stars say otherwise. Stars that
-are unlike the others do not count, and pixels that are brighter or fainter than the model count
-less: they may show a neighbour. `psfdae.methods.field_search` chooses the options, by stars
-that were left out (`psfdae.methods.field_errors`). Equations are numbered as on the page
-docs/field_model.md.
+Weighted least squares for the splines of `psfdae.methods.field.spline` alternate with the flux and
+the centre of every star (Gauss-Newton). The light of a star is the same at all phases of the pixel
+grid: without this condition, splines and fluxes could compensate each other as functions of the
+phase. A prior makes relative changes over the field as small in the wings as in the core. Stars
+unlike the others get no weight, and pixels brighter or fainter than the model less weight, because
+they may show a neighbour. `psfdae.methods.field.search` chooses the options by left-out stars
+(`psfdae.methods.field.errors`). Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from psfdae.base.progress import Advance
-from psfdae.methods.field_spline import (
+from psfdae.methods.field.spline import (
     FieldModel,
     adjust_stars,
     compute_relative_light,
+    compute_spacing,
     deform_splines,
     draw_splines,
     field_terms,
     solve_splines,
-    spacing_of,
 )
 from psfdae.stars.bright_stars import BrightStars
-from psfdae.stars.moments import cubic_splines, robust_scatter, windowed_centres
+from psfdae.stars.moments import cubic_splines, find_centroids, robust_scatter
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of a fit of the field; the search compares fits that differ in one of these.
+    """Options of a fit of the field; the search compares fits that differ in one option.
 
     Attributes
     ----------
@@ -46,10 +45,10 @@ class FitOptions:
     order : int
         Order of the polynomial in x and y.
     star_terms : tuple of int
-        Numbers of the coordinates beyond x and y with which the PSF changes: 2 for the magnitude,
+        Indices of the coordinates after x and y with which the PSF changes: 2 for the magnitude,
         3 for the colour.
     change : float
-        Standard deviation of a coefficient about that of another exposure, over its value.
+        Relative standard deviation of a coefficient about its value in another exposure.
     tolerance : float
         Residual at which the conjugate gradients stop (`FitSettings.compared_tolerance`).
     """
@@ -69,33 +68,33 @@ class FitSettings:
     Attributes
     ----------
     rounds : int
-        Rounds of splines, centres and fluxes; with more, centres follow what splines cannot.
+        Rounds of splines, centres and fluxes; with more rounds, centres fit residuals of splines.
     centre_steps, left_out_steps : int
-        Gauss-Newton steps of a star in a round, and of a star that was left out.
+        Gauss-Newton steps of a star in a round, and of a left-out star.
     window_px, window_reach_px, wide_reach_px : float
-        Width of the window of the first centroids, how far these may move, and how far if stars are
-        rings, in pixels.
+        Width of the window of the first centroids; their largest shift, and the same for stars that
+        are rings, in pixels.
     model_error, min_error : float
-        Error of the model over a pixel's light, which no polynomial follows; error of a pixel over
-        the flux, at least.
+        Error of the model relative to a pixel's light, which no polynomial follows; smallest error
+        of a pixel over the flux.
     outlier_sigma, outlier_chi2 : float
-        Residual of a pixel in σ from which it counts less, as it may show a neighbour; χ² over the
-        median from which a star does not count.
+        Residual in σ above which a pixel has less weight, because it may show a neighbour; χ² over
+        the median above which a star has no weight.
     varying_smoothness : float
-        Smoothness of terms beyond the constant, times that of the constant.
+        Smoothness of terms that vary over the field, over the smoothness of the constant term.
     ridge : float
         Weight of the squared coefficients in the first round, 1/flux².
     field_change, min_coefficient : float
-        Standard deviation of a coefficient over the field, over its mean; and at least.
+        Relative standard deviation of a coefficient over the field, and its minimum.
     varying_change : float
-        Factor of the change between exposures of terms beyond the constant.
+        Factor of the change between exposures for terms that vary over the field.
     folds, enough_stars : int
-        Groups of stars of which one after the other is left out; from so many stars on that were
-        predicted, the further groups are not.
+        Groups of stars that are left out in turn; number of predicted stars after which further
+        groups are skipped.
     few_stars : int
-        With fewer stars, their number limits the order of the polynomial.
+        Number of stars below which it limits the order of the polynomial.
     compared_tolerance : float
-        `FitOptions.tolerance` of fits that are only compared: up to it, errors of stars left out
+        `FitOptions.tolerance` of fits that are only compared: up to it, errors of left-out stars
         hardly change.
     """
 
@@ -125,16 +124,16 @@ class FieldUncertainty(NamedTuple):
 
     Attributes
     ----------
-    redrawn : sequence of FieldModel
-        Fields that the same stars give with other noise.
-    parted : sequence of FieldModel
-        Fields that differ as those do that are fitted without one group of stars after the other.
+    bootstrap : sequence of FieldModel
+        Fields of the same stars with other noise.
+    jackknife : sequence of FieldModel
+        Fields that scatter as much as fits without each group of stars in turn.
     unknown_light : float
-        Scatter of the light in stamps that the field takes for sky, over the flux.
+        Scatter of the light in stamps that the field mistakes for sky, over the flux.
     """
 
-    redrawn: Sequence[FieldModel] = ()
-    parted: Sequence[FieldModel] = ()
+    bootstrap: Sequence[FieldModel] = ()
+    jackknife: Sequence[FieldModel] = ()
     unknown_light: float = 0.0
 
 
@@ -144,16 +143,17 @@ class FieldFit(NamedTuple):
     Attributes
     ----------
     model : FieldModel
+        Splines over the field.
     options : FitOptions
-        Those of the fit.
+        Options of the fit.
     flux : ndarray, shape (n,)
-        In the unit of the images.
+        Flux of each star in the unit of the images.
     centre : ndarray, shape (n, 2)
         (row, column) from index s//2.
     good : ndarray of bool, shape (n,)
-        Stars that count.
+        True for stars that are not outliers.
     residual : ndarray, shape (n, s, s)
-        Image less model of a star of flux 1; 0 where a pixel was not measured.
+        Image minus model of a star of flux 1; 0 where a pixel was not measured.
     uncertainty : FieldUncertainty
         Errors of the model, if they were measured.
     """
@@ -167,10 +167,11 @@ class FieldFit(NamedTuple):
     uncertainty: FieldUncertainty = FieldUncertainty()
 
     def list_error(self, stars: BrightStars) -> np.ndarray:
-        """Return median and robust RMS of fitted less listed centres (row, column), shape (2, 2).
+        """Return median and robust RMS of fitted minus listed centres (row, column), shape (2, 2).
 
-        NaN if fewer than five stars have a listed centre. The RMS is at least 0.05 px.
+        NaN if fewer than five stars have a centre in the list. The RMS is at least 0.05 px.
         """
+        # Both are relative to the middle of the same stamp.
         offset_px = (self.centre + stars.peak - stars.listed)[self.good]
         offset_px = offset_px[np.isfinite(offset_px).all(axis=1)]
         if len(offset_px) < 5:
@@ -181,15 +182,16 @@ class FieldFit(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldFitter:
-    """Stars to which fields are fitted, and what is known of the field from other exposures.
+    """Stars to which fields are fitted, and the field of another exposure if there is one.
 
     Attributes
     ----------
     images : ndarray, shape (n, s, s)
         Stars in frames about their brightest pixel.
-    measured : ndarray of bool, shape (n, s, s)
+    is_valid : ndarray of bool, shape (n, s, s)
+        True for measured pixels.
     noise : ndarray, shape (n,)
-        RMS of a pixel by the sky.
+        RMS of the sky noise in a pixel.
     photons : ndarray, shape (n,)
         Photons per unit of the images.
     place : ndarray, shape (n, 4)
@@ -197,20 +199,21 @@ class FieldFitter:
     axis : ndarray, shape (s,)
         Coordinates of the pixels along a side of the frame.
     stamp_px, around_px : int
-        Side of the stamps; number of pixels around a stamp, of which the sky is the median.
+        Side of the stamps; number of pixels around a stamp whose median is the sky.
     window_px : float
         Width of the window of the first centroids.
     low, high : ndarray, shape (2,) to (4,)
-        Range of the place.
+        Range of the coordinates `place`.
     prior : FieldModel or None
         Field of another exposure.
     settings : FitSettings
+        Tuned constants of the fit.
     advance : callable
-        Called with the number of fits that are done.
+        Function that is called with the number of completed fits.
     """
 
     images: np.ndarray
-    measured: np.ndarray
+    is_valid: np.ndarray
     noise: np.ndarray
     photons: np.ndarray
     place: np.ndarray
@@ -225,7 +228,7 @@ class FieldFitter:
     advance: Advance = lambda fits: None
 
     @classmethod
-    def of(cls, stars: BrightStars, background: float, frame_px: int, stamp_px: int) -> FieldFitter:
+    def build(cls, stars: BrightStars, background: float, frame_px: int, stamp_px: int) -> Self:
         """Return the fitter of bright stars; for the parameters see `fit_field`."""
         # Range of each coordinate over the stars; (0, 0) for one that no star has.
         finite_columns = [column[np.isfinite(column)] for column in stars.place.T]
@@ -233,13 +236,13 @@ class FieldFitter:
             (column.min(), column.max()) if column.size else (0.0, 0.0) for column in finite_columns
         ]
         low, high = np.transpose(ends)
-        images, measured = stars.framed(frame_px)
-        # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
-        # of all light does, 1.4 σ.
+        images, is_valid = stars.cut_frames(frame_px)
+        # A = 4πσ² of a Gaussian. A ring has no light in its middle: it needs a window as wide as
+        # the radius of its light, 1.4 σ.
         sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
         return cls(
             images=images,
-            measured=measured,
+            is_valid=is_valid,
             noise=stars.noise,
             photons=np.sqrt(background) / stars.noise,
             place=stars.place,
@@ -257,9 +260,9 @@ class FieldFitter:
         return np.asarray(np.abs(self.axis + 0.5) < self.stamp_px / 2)
 
     def fit(self, options: FitOptions) -> FieldFit:
-        """Fit field, fluxes and centres to all stars by turns (eq. 2 to 4)."""
-        settings, spacing = self.settings, spacing_of(len(self.axis), options.knots)
-        # Coordinates that do not count have a range of no width; those at the end are left out.
+        """Fit field, fluxes and centres to all stars in alternation (eq. 2 to 4)."""
+        settings, spacing = self.settings, compute_spacing(len(self.axis), options.knots)
+        # Coordinates without influence have a range of zero width, or are left out at the end.
         count = max((1, *options.star_terms)) + 1
         low, high = self.low[:count].copy(), self.high[:count].copy()
         for coordinate in range(2, count):
@@ -271,10 +274,10 @@ class FieldFitter:
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
         is_usual = self.window_px == settings.window_px
         reach = settings.window_reach_px if is_usual else settings.wide_reach_px
-        centre = windowed_centres(self.images, start, window, 4, reach)
-        # Weights are those of a star's expected light, first that of the median star. Those of its
-        # own pixels would be larger where noise makes them fainter, and light in the wings too
-        # little (Humphrey, Liu & Buote 2009, ApJ 693, 822).
+        centre = find_centroids(self.images, start, window, 4, reach)
+        # Weights follow from the expected light of a star, first from the median star. Weights from
+        # its own pixels would be larger where noise makes them fainter, and would bias the wings
+        # (Humphrey, Liu & Buote 2009, ApJ 693, 822).
         light = np.median(self.images / flux[:, None, None], axis=0)
         robust_weight, noise = np.ones(self.images.shape), self.pixel_weight(flux, light)
         coefficients: np.ndarray | None = None
@@ -290,26 +293,26 @@ class FieldFitter:
             factor, centre, _ = adjust_stars(
                 splines, data, weight, centre, self.axis, spacing, settings.centre_steps
             )
-            # The mean star in the middle of its stamp has the sum 1: a factor of all splines is one
-            # of all fluxes.
+            # The mean star in the middle of its stamp has the sum 1: a common factor is moved from
+            # the splines to the fluxes.
             middle = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(draw_splines(middle, sides, np.zeros((1, 2)), spacing).sum())
             coefficients, flux = coefficients / total, flux * factor * total
             splines = np.tensordot(terms, coefficients, 1)
             star_images = draw_splines(splines, self.axis, centre, spacing)
-            # Each star has the sum 1 in the middle of its stamp, and as much light at every phase:
-            # fluxes and splines could change with position and phase against each other (eq. 1a).
+            # Each star has the sum 1 in the middle of its stamp, and the same light at every phase:
+            # otherwise fluxes and splines could compensate each other (eq. 1a).
             in_middle = draw_splines(splines, sides, np.zeros((1, 2)), spacing)
             light = compute_relative_light(splines, np.zeros(1), centre, spacing)
             light *= in_middle.sum(axis=(1, 2), keepdims=True)
             flux, star_images = flux * light[:, 0, 0], star_images / light
-            residual = np.where(self.measured, self.images / flux[:, None, None] - star_images, 0.0)
-            # Outliers: pixels count less (Cauchy's weight), stars of a large χ² not at all. In the
-            # first round, the field is not known well enough to tell stars.
+            residual = np.where(self.is_valid, self.images / flux[:, None, None] - star_images, 0.0)
+            # Outliers: pixels get less weight (Cauchy's weight), stars with a large χ² none. In the
+            # first round, the field is not known well enough to reject stars.
             noise = self.pixel_weight(flux, star_images)
             square = residual**2 * noise
-            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.measured.sum(axis=(1, 2)), 1)
+            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.is_valid.sum(axis=(1, 2)), 1)
             robust_weight = 1.0 / (1.0 + square / settings.outlier_sigma**2)
             if turn:
                 good = chi2 < settings.outlier_chi2 * np.median(chi2)
@@ -321,15 +324,15 @@ class FieldFitter:
     def pixel_weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return 1/variance w of pixels of flux 1 (eq. 3); 0 where not measured.
 
-        `light` is that expected of stars of flux 1, of each (n, s, s) or of all (s, s).
+        `light` is the expected light of stars of flux 1, of each (n, s, s) or of all (s, s).
         """
         # Noise, and the error (0.02 f)² + (10⁻⁵)² of the model.
         model_error = self.settings.model_error * np.maximum(light, 0.0)
         variance = self.pixel_variance(flux, light) + model_error**2 + self.settings.min_error**2
-        return np.where(self.measured, 1.0 / variance, 0.0)
+        return np.where(self.is_valid, 1.0 / variance, 0.0)
 
     def pixel_variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Return the variance of pixels of stars of flux 1 by the sky and the star's photons."""
+        """Return the variance of pixels of stars of flux 1, due to sky and photons of the star."""
         # (σ/F)² + f / (g F), the first two terms of eq. 3.
         factor = 1.0 / flux[:, None, None]
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
@@ -349,42 +352,45 @@ class FieldFitter:
         Parameters
         ----------
         options : FitOptions
+            Knots, smoothness and tolerance.
         terms : ndarray, shape (n, K)
+            Terms of the field at the positions of the stars.
         data, weight : ndarray, shape (n, s, s)
             Images of flux 1, and weights of their pixels.
         centre : ndarray, shape (n, 2)
+            Centres (row, column) from the middle pixel.
         start : ndarray, shape (K, N, N), or None
-            Coefficients of the round before.
+            Coefficients of the previous round.
         """
-        # Stars without a pixel that counts add nothing.
-        used = weight.any(axis=(1, 2))
-        terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
+        # Stars without a pixel of positive weight do not contribute.
+        has_weight = weight.any(axis=(1, 2))
+        terms, data, weight, centre = (a[has_weight] for a in (terms, data, weight, centre))
         shape = (terms.shape[1], options.knots, options.knots)
-        spacing, settings = spacing_of(len(self.axis), options.knots), self.settings
+        spacing, settings = compute_spacing(len(self.axis), options.knots), self.settings
         # B-splines of the rows and columns of each star's frame, at its centre.
         rows, columns = (
             cubic_splines(self.axis[None] - centre[:, i, None], options.knots, spacing)
             for i in (0, 1)
         )
-        # Smoothness η_k, ten times as large beyond the constant term, and the ridge ρ of the first
-        # round.
+        # Smoothness η_k, ten times as large for terms that vary over the field, and the ridge ρ of
+        # the first round.
         penalty = np.full((shape[0], 1, 1), settings.varying_smoothness * options.smoothness)
         penalty[0] = options.smoothness
         ridge, prior_coefficients = np.full(shape, settings.ridge), np.zeros(shape)
         if self.prior is not None:
-            # Only the difference to the other exposure is fitted, after its stretch and blur.
+            # Only the difference from the other exposure is fitted, after a stretch and a blur.
             prior_coefficients = deform_splines(self.prior, terms, data, weight, (rows, columns))
             change = options.change * np.abs(prior_coefficients[0]) + settings.min_coefficient
-            # ρ: a change by `options.change` of the coefficient is one σ.
+            # ρ: a relative change of the coefficient by `options.change` is one σ.
             ridge[:] = 1.0 / change**2
             ridge[1:] /= settings.varying_change**2
             image = rows @ np.tensordot(terms, prior_coefficients, 1) @ columns.transpose(0, 2, 1)
             data = data - image
         elif start is not None:
-            # Changes over the field are a part of the mean star of the round before.
+            # Changes over the field are relative to the mean star of the previous round.
             change = settings.field_change * np.abs(start[0]) + settings.min_coefficient
             ridge[1:] = 1.0 / change**2
-        # Iterations begin at the coefficients of the round before.
+        # Iterations begin at the coefficients of the previous round.
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(

@@ -1,0 +1,173 @@
+"""Fit of the PSF over the field with the options that predict left-out stars best.
+
+The distance of the knots, the order of the polynomial and the smoothness of the splines
+(`FitOptions`) are chosen by the prediction of left-out stars: knots finer than the structure of
+stars would follow noise. Where a detector or a plate is not linear, the PSF also changes with the
+brightness of a star, and through lenses and atmosphere with its colour. Magnitude and its square
+are two additional terms if they clearly improve the prediction, and likewise the colour.
+
+`fit_field` fits the stars of an image, and `refit_field` the stars of another exposure of its
+field; both return a `FieldFit`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from psfdae.base.progress import task
+from psfdae.methods.field.errors import field_uncertainty, left_out_error
+from psfdae.methods.field.fit import FieldFit, FieldFitter, FitOptions, FitSettings
+from psfdae.methods.field.spline import FieldModel, compute_spacing, count_knots
+from psfdae.stars.bright_stars import BrightStars
+
+
+def fit_field(
+    stars: BrightStars,
+    background: float,
+    frame_px: int,
+    stamp_px: int,
+    orders: Sequence[int],
+    spacing: float,
+    smoothness: float,
+    rng: np.random.Generator | None = None,
+) -> FieldFit:
+    """Fit the field with coarser knots, higher orders and stronger smoothing while they pay.
+
+    They pay if they improve the prediction of left-out stars. With the best order, terms of the
+    magnitude and then of the colour are tried.
+
+    Parameters
+    ----------
+    stars : BrightStars
+        Stars of the fit; if any position is unknown, only order 0 is fitted.
+    background : float
+        Sky in photons per pixel.
+    frame_px, stamp_px : int
+        Side of the fitted frames, and of the stamps in which stars have flux 1 and are predicted.
+    orders : sequence of int
+        Orders of the polynomial to try; with a single one, other options are not searched either.
+    spacing : float
+        Minimum distance of the knots, in pixels.
+    smoothness : float
+        Minimum weight of the squared second differences of the coefficients, 1/flux².
+    rng : Generator, optional
+        Source of the noise with which the fit is repeated for `FieldFit.uncertainty`; by default
+        the uncertainty is not computed.
+    """
+    fitter = FieldFitter.build(stars, background, frame_px, stamp_px)
+    # Orders that the stars can determine: without positions, the field is one mean PSF.
+    usable_orders = sorted(orders)
+    if not np.isfinite(stars.position).all():
+        usable_orders = [0]
+    elif len(stars) < FitSettings.few_stars and len(orders) > 1:
+        # Few left-out stars cannot decide: require at least three stars for two terms of the
+        # polynomial of order o, which has (o + 1)(o + 2)/2 terms.
+        determined_orders = [o for o in usable_orders if 3 * (o + 1) * (o + 2) <= 4 * len(stars)]
+        usable_orders = determined_orders or usable_orders[:1]
+    options = FitOptions(count_knots(frame_px, spacing), smoothness, usable_orders[0])
+    # Largest number of fits: ten for knots and smoothness, all orders, three for magnitude and
+    # colour, the final one and four for the uncertainty.
+    with task("field", 10 + len(usable_orders) + 3 + 5) as advance:
+        fitter = replace(fitter, advance=advance)
+        if len(orders) > 1 and len(stars) >= 3:
+            options = _search_options(fitter, options, usable_orders)
+        fit = fitter.fit(options)
+        # Two stars are too few to leave one out.
+        if rng is None or len(stars) < 3:
+            return fit
+        return fit._replace(uncertainty=field_uncertainty(fitter, fit, rng))
+
+
+def _search_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int]) -> FitOptions:
+    """Return the options with which left-out stars are predicted best.
+
+    Parameters
+    ----------
+    fitter : FieldFitter
+        Stars of the fits.
+    options : FitOptions
+        Options at the start: the smallest distance of knots, and the smallest smoothness.
+    orders : sequence of int
+        Orders of the polynomial, ascending.
+    """
+
+    def compute_error(options: FitOptions) -> float:
+        return left_out_error(fitter, fitter.fit(options))
+
+    final_tolerance = options.tolerance
+    # Splines first, with a polynomial that follows most of the field: with splines that follow
+    # noise, higher orders would not seem to pay. Orders up to 2 are all tried, because a symmetric
+    # field has no slope.
+    curved_order = 2
+    start = max((o for o in orders if o <= curved_order), default=orders[0])
+    options = replace(options, order=start, tolerance=fitter.settings.compared_tolerance)
+    least_error = compute_error(options)
+    # Knots √2 farther apart, at most six times, then splines ten times as smooth, at most three
+    # times.
+    frame_px = len(fitter.axis)
+    for steps, coarser, smoother in ((6, 2.0**0.5, 1.0), (3, 1.0, 10.0)):
+        for _ in range(steps):
+            spacing = coarser * compute_spacing(frame_px, options.knots)
+            step = replace(
+                options,
+                knots=count_knots(frame_px, spacing),
+                smoothness=smoother * options.smoothness,
+            )
+            if (error := compute_error(step)) >= least_error:
+                break
+            options, least_error = step, error
+    # Orders from the lowest to the first one that does not pay.
+    best_order, least_error = 0, np.inf
+    for order in orders:
+        error = compute_error(replace(options, order=order))
+        # Most fields are curved. Higher orders must pay clearly, because noise may favour them.
+        if error < (1.0 if order <= curved_order else 0.99) * least_error:
+            best_order, least_error = order, error
+        elif order >= curved_order:
+            break
+    options = replace(options, order=best_order)
+    # Magnitude and colour, the better one first, because the other may only be correlated with it.
+    # Each must reduce the error by 2 %.
+    coordinates = [c for c in range(2, len(fitter.high)) if fitter.high[c] > fitter.low[c]]
+    while coordinates:
+        steps_by_error = [
+            (compute_error(step), step)
+            for c in coordinates
+            if (step := replace(options, star_terms=(*options.star_terms, c)))
+        ]
+        error, step = min(steps_by_error, key=lambda error_and_step: error_and_step[0])
+        if error >= 0.98 * least_error:
+            break
+        options, least_error = step, error
+        coordinates.remove(step.star_terms[-1])
+    return replace(options, tolerance=final_tolerance)
+
+
+def refit_field(
+    prior: FieldModel,
+    stars: BrightStars,
+    background: float,
+    frame_px: int,
+    stamp_px: int,
+    smoothness: float,
+) -> FieldFit:
+    """Fit another exposure of a field; its stars determine the difference from `prior`.
+
+    Left-out stars determine the allowed size of the difference. For the other parameters see
+    `fit_field`, which fitted the prior to frames of the same size.
+    """
+    fitter = replace(
+        FieldFitter.build(stars, background, frame_px, stamp_px),
+        prior=prior,
+        low=prior.low,
+        high=prior.high,
+    )
+    # The same terms and knots; three limits of the change are compared (eq. 5).
+    knots, star_terms = count_knots(frame_px, prior.spacing), tuple(prior.star_coordinates.tolist())
+    options = FitOptions(knots, smoothness, prior.order, star_terms)
+    fits = [fitter.fit(replace(options, change=change)) for change in (0.005, 0.02, 0.1)]
+    return min(fits, key=partial(left_out_error, fitter))

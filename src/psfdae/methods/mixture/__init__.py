@@ -1,0 +1,1 @@
+"""Gaussian mixture of training stars: its distribution, fit, densities and posterior."""
