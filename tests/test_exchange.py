@@ -207,6 +207,28 @@ def test_models_of_other_programs_are_named(foreign, tmp_path, name):
         assert "2 tables PSF_DATA" in refused("psf", path, "--out", tmp_path / "a.psf")
 
 
+EDGES = [1, 2048, 2049, 4096, 4097, 6144, 6145, 8192]
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "rows"),
+    [
+        ("STDPSF_ACSWFC_F814W.fits", [1, 2048, 4096], EDGES[:4]),
+        ("STDPSF_WFC3UV_F606W.fits", [1, 2048, 4096], EDGES[:4]),
+        ("STDPSF_NRCSW_F150W.fits", EDGES, EDGES[:4]),
+    ],
+)
+def test_a_grid_of_several_detectors_is_refused_under_its_usual_name(tmp_path, name, columns, rows):
+    """As STScI lays them out, side by side: no position says which detector is meant."""
+    stdpsf(tmp_path / "m.fits", len(columns), len(rows))
+    with fits.open(tmp_path / "m.fits", mode="update") as hdus:
+        for key, nodes in (("IPSFX", columns), ("JPSFY", rows)):
+            hdus[0].header.update({f"{key}{k:02d}": node for k, node in enumerate(nodes, start=1)})
+    path = (tmp_path / "m.fits").rename(tmp_path / name)
+    with pytest.raises(PredictionError, match=f"{name}: PSFs of several detectors, expected"):
+        load_field(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,9 +1,12 @@
 """A night of a telescope: the simulated example, and the tables and pages made of many images."""
 
 import csv
+import itertools
+import os
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from html import escape
 from itertools import combinations
 from pathlib import Path
@@ -17,8 +20,10 @@ from astropy.table import Table
 
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae.denoise import star_model as psf_model
+from psfdae.photometry import image_photometry
+from psfdae.report import validation
 from psfdae_paper.evaluation.night import LIMITS, add_verdicts, night_page, read_night
+from psfdae_paper.stages import night as night_stage
 from psfdae_paper.stages.night import (
     TABLE_COLUMNS,
     NightError,
@@ -276,7 +281,7 @@ def test_names_of_images_are_texts_whatever_they_look_like(tmp_path, monkeypatch
         opened.append(path.name.removesuffix(".psf.safetensors"))
         return SimpleNamespace(image_px=(300, 200), draw_on_pixels=lambda _: np.ones((5, 8, 8)))
 
-    monkeypatch.setattr(psf_model, "load_model", load)
+    monkeypatch.setattr(api, "load_model", load)
     write_night_page(out, tmp_path / "images", tmp_path / "night.html")
     by_size = sorted(rows, key=lambda row: row["fwhm_px_centre"])
     middle = by_size[len(rows) // 2]
@@ -300,17 +305,101 @@ def test_names_are_drawn_as_they_are(name):
     assert night_page(night, psfs, "images").count("<img") == 3
 
 
+class FewStars(list):
+    """Stars of an image, as far as the stage looks at them."""
+
+    def __init__(self, width_px):
+        axis = np.arange(16) - 8
+        star = np.exp(-(axis[:, None] ** 2 + axis**2) / (2 * width_px**2))
+        super().__init__([star] * 9)
+        self.mean_psf, self.source = star / star.sum(), None
+        self.settings = SimpleNamespace(framing=SimpleNamespace(stamp_px=16))
+        self.observation = SimpleNamespace(instrument={}, shape=(40, 60), header_cards=[])
+
+
+def test_a_night_killed_between_any_two_files_is_the_same_once_repeated(tmp_path, monkeypatch):
+    """Two images, killed before each file is on the disk and before each has its name.
+
+    The next run removes the temporary files that the killed one has left.
+    """
+    write_csv(
+        tmp_path / "rows.csv",
+        pd.DataFrame([{"image": f"{name}.fits", "name": name, "reason": ""} for name in "ab"]),
+    )
+    table = Table({"flux": np.arange(1.0, 31.0), "flags": np.zeros(30, int), "chi2": np.ones(30)})
+    page = SimpleNamespace(save=lambda path: write_text(path, "page"))
+    model = SimpleNamespace(
+        info=SimpleNamespace(adapted=False),
+        order=0,
+        draw_on_pixels=lambda place: np.stack([FewStars(1.5).mean_psf] * len(place)),
+        save=lambda path: write_text(path, "model"),
+    )
+    monkeypatch.setattr(night_stage, "bright_stars", lambda row: FewStars(1.5))
+    monkeypatch.setattr(night_stage, "fit_image", lambda stars, start: model)
+    monkeypatch.setattr(validation, "validate", lambda model, stars: page)
+    photometry = SimpleNamespace(table=table)
+    monkeypatch.setattr(image_photometry, "photometry_of_image", lambda *a, **kw: photometry)
+
+    def run(out):
+        night_images(tmp_path / "rows.csv", out / "images", out / "part.csv")
+        night_table((out / "part.csv",), out / "night.csv")
+
+    def products(out):
+        return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+    def run_and_kill(out, number):
+        """Run in a process that is killed before a call; return whether it was."""
+        if (process := os.fork()) == 0:
+            calls = itertools.count()
+
+            def before(function):
+                def call(*arguments):
+                    if next(calls) == number:
+                        os.kill(os.getpid(), signal.SIGKILL)
+                    return function(*arguments)
+
+                return call
+
+            os.fsync, Path.replace = before(os.fsync), before(Path.replace)
+            with suppress(BaseException):
+                run(out)
+                os._exit(0)
+            os._exit(1)
+        code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        assert code in (0, -signal.SIGKILL)
+        return code != 0
+
+    run(tmp_path / "whole")
+    expected = products(tmp_path / "whole")
+    assert len(expected) == 9
+    with_temporary_file = 0
+    for number in itertools.count():
+        out = tmp_path / str(number)
+        if not run_and_kill(out, number):
+            break
+        with_temporary_file += any(name.endswith(".tmp") for name in products(out))
+        run(out)
+        assert products(out) == expected, number
+    # A call for the content of each file, and one for its name.
+    assert number == with_temporary_file == 2 * len(expected)
+
+
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_killed_and_typed_again_gives_the_same_files(folder, truth, tmp_path):
     """The start of an image depends on the list, not on what was finished before.
 
-    One image of each job tells the state of the telescope, whose focus runs away.
+    Two jobs of two images; one image of each job tells the state of the telescope, whose focus runs
+    away.
     """
-    products = []
+    products, images = [], f"{folder}/exposure_00[0-3].fits"
     for is_killed in (False, True):
         place = copy_of_sources(tmp_path / str(is_killed))
-        words = ["snakemake", "night", "--cores", "2", "--config", f"images={folder}/exp*.fits"]
+        rules = place / "workflow/rules/common_night.smk"
+        text = rules.read_text()
+        assert text.count("IMAGES_PER_JOB = 10") == 1
+        rules.write_text(text.replace("IMAGES_PER_JOB = 10", "IMAGES_PER_JOB = 2"))
+        words = ["snakemake", "night", "--cores", "2", "--config", f"images={images}"]
         words += [f"telescope={folder}/telescope.yaml"]
         options = {"cwd": place, "env": environment(SOURCE_DATE_EPOCH="0")}
         if is_killed:

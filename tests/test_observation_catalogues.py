@@ -12,6 +12,7 @@ from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.image.position_columns import CONVENTIONS
 from psfdae.image.stamps import StarFlag
+from psfdae.image.tables import SUFFIXES, star_table, write_table
 
 D = 8
 X, Y = [12.0, 20.25, 33.5], [9.0, 15.0, 21.75]
@@ -118,6 +119,88 @@ def test_identifiers(tmp_path, name, values, expected, file):
     identifiers = read_catalogue(tmp_path / file).identifiers()
     np.testing.assert_array_equal(identifiers, expected)
     assert identifiers.dtype.kind == expected.dtype.kind
+
+
+VOTABLE = (
+    '<VOTABLE version="1.3"><RESOURCE><TABLE><FIELD name="id" datatype="char" arraysize="*"/>'
+    '<FIELD name="x_fit" datatype="double"/><FIELD name="y_fit" datatype="double"/>'
+    "<DATA><TABLEDATA><TR><TD>001</TD><TD>1</TD><TD>2</TD></TR>"
+    "<TR><TD>1e5</TD><TD>3</TD><TD>4</TD></TR></TABLEDATA></DATA></TABLE></RESOURCE></VOTABLE>"
+)
+SEXTRACTOR = "#   1 NUMBER  Running\n#   2 X_IMAGE  x  [pixel]\n#   3 Y_IMAGE  y  [pixel]\n"
+LISTS = {
+    "commas": "id,x_fit,y_fit\n001,1,2\n1e5,3,4\n",
+    "quotes": 'id,x_fit,y_fit\n"001",1,2\n"1e5",3,4\n',
+    "blanks": "  ID  x_fit y_fit\n 001  1 2\n 1e5  3 4\n",
+    "semicolons": "Number;x_fit;y_fit\n001 ;1;2\n 1e5;3;4\n",
+    "tabs": "id\tx_fit\ty_fit\n001\t1\t2\n1e5\t3\t4\n",
+    "a first column without a name": "\tid\tx_fit\ty_fit\n0\t001\t1\t2\n1\t1e5\t3\t4\n",
+    "two columns of one name": "id,id,x_fit,y_fit\n001,5,1,2\n1e5,6,3,4\n",
+    "names in a comment": "# id x_fit y_fit\n001 1 2\n1e5 3 4\n",
+    "a comment below the names": "# id x_fit y_fit\n# as I saw them\n001 1 2\n1e5 3 4\n",
+    "VizieR": "id;x_fit;y_fit\n ;pix;pix\n---;---;---\n001;1;2\n1e5;3;4\n",
+    "SExtractor": f"{SEXTRACTOR}  001 2 3\n  1e5 4 5\n",
+    "DAOPHOT": " NL NX NY LOWBAD\n 1 99 99 0\n\n 001 2.0 3.0 9.\n 1e5 4.0 5.0 9.\n",
+    "IPAC": "|id  |x_fit|y_fit|\n 001   1.0   2.0  \n 1e5   3.0   4.0  \n",
+    "IPAC with types": "|id  |x_fit|y_fit|\n|char|real |real |\n 001   1.0   2.0  \n"
+    " 1e5   3.0   4.0  \n",
+    "DS9": "# Region file\nimage\ncircle(2,3,1) # text={001}\ncircle(4,5,1) # text={1e5}\n",
+    "VOTable": VOTABLE,
+}
+
+
+@pytest.mark.parametrize("kind", LISTS)
+def test_identifiers_are_the_texts_of_the_list(tmp_path, kind):
+    """Neither 001 is 1 nor 1e5 a number, and the positions are those of the same rows."""
+    (tmp_path / "stars").write_text(LISTS[kind])
+    stars = read_catalogue(tmp_path / "stars")
+    assert stars.identifiers().tolist() == ["001", "1e5"]
+    pair = stars.positions()
+    position = np.stack([stars.pixels(pair.first), stars.pixels(pair.second)], axis=1)
+    np.testing.assert_array_equal(position - pair.origin, [[1, 2], [3, 4]])
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (["7", "-12"], [7, -12]),
+        (["7", "07"], ["7", "07"]),
+        (["12.0", "13.0"], ["12.0", "13.0"]),
+        (["7", ""], ["7", ""]),
+        (["-0", "+1"], ["-0", "+1"]),
+        (["NA", "nan"], ["NA", "nan"]),
+        (["True", "False"], ["True", "False"]),
+        (["9" * 25, "1"], ["9" * 25, "1"]),
+    ],
+)
+def test_identifiers_are_numbers_only_if_their_texts_are_the_same(tmp_path, cells, expected):
+    (tmp_path / "a.csv").write_text("id,x,y\n" + "".join(f"{cell},1,2\n" for cell in cells))
+    assert read_catalogue(tmp_path / "a.csv").identifiers().tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# stars of field 3\n10 20\n30 40\n", "no names of columns: its first row is '10 20'"),
+        ("# 10 20 30\n10 20\n30 40\n", "no names of columns"),
+        ("# one\n# two of them\n10,20\n", "no names of columns"),
+        ("# my stars\n10 20\n30 40\n", "no position columns; found my, stars"),
+    ],
+)
+def test_a_comment_above_a_list_without_names_is_not_the_names(tmp_path, text, message):
+    (tmp_path / "a.coo").write_text(text)
+    with pytest.raises(ObservationError, match=message):
+        stars = read_catalogue(tmp_path / "a.coo")
+        stars.positions()
+
+
+def test_tables_have_the_texts_of_identifiers(tmp_path):
+    """In every format of an output table."""
+    identifiers = np.array(["001", "1e5"])
+    for suffix in SUFFIXES:
+        path = tmp_path / f"out{suffix}"
+        write_table(path, star_table({"id": identifiers, "x": np.ones(2), "y": np.ones(2)}))
+        assert read_catalogue(path).identifiers().tolist() == ["001", "1e5"]
 
 
 def test_values_that_are_missing_are_nan_where_they_may_be(tmp_path):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,6 +26,7 @@ from psfdae.image.position_columns import (
     ColumnError,
     Positions,
     choose_positions,
+    find_identifier,
     name_in_any_case,
 )
 from psfdae.image.stamps import StarFlag, raise_flag
@@ -234,7 +234,8 @@ class Catalogue:
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
-        # Whole numbers stay numbers, also if they are written as 12.0; all else is text.
+        # Whole numbers stay numbers, also if a column of real numbers has them; all else is text.
+        # Readers of text keep texts that numbers would change, such as 001 or 1e5.
         column = self._column(name)
         values = np.ma.getdata(column)
         if values.dtype.kind in "iuf" and not np.ma.getmaskarray(column).any():
@@ -248,14 +249,9 @@ class Catalogue:
 
     def _identifier(self) -> str | None:
         """Return the name of the column that identifies the stars; None without one."""
-        # The first that the list has; of two that differ by their case only, none.
-        names = ("id", "source_id", "number", "star_id", "objid", "obj_id")
-        for alias in (*names, "object_id", "label", "name"):
-            with suppress(ColumnError):
-                name = self._resolve(alias)
-                if name is not None and self._column(name).ndim == 1:
-                    return name
-        return None
+        columns = {name: self.table[name] for name in self.table.colnames}
+        is_plain = {n: isinstance(c, np.ndarray) and c.ndim == 1 for n, c in columns.items()}
+        return find_identifier([name for name in columns if is_plain[name]])
 
     def columns(self, rows: np.ndarray) -> Table:
         """Return some rows of all columns of numbers and text but identifiers and pixel positions.

@@ -218,7 +218,24 @@ def open_hdus(file: PlainFile, as_stored: bool = False, **options: Any) -> HDULi
 
     if as_stored:
         options |= {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
+    check_counts(file.path)
     return fits.open(file.path, **options)
+
+
+def check_counts(path: Path) -> None:
+    """Raise ValueError if a header of a FITS file announces more axes or columns than FITS has.
+
+    astropy would make a list of as many, whatever the size of the file.
+    """
+    from astropy.io import fits
+
+    # Header after header, to the end of the file; of a header without an end, astropy says so.
+    with path.open("rb") as file, suppress(OSError, EOFError):
+        while header := fits.Header.fromfile(file):
+            for key in ("NAXIS", "ZNAXIS", "TFIELDS"):
+                if header.get(key, 0) not in range(1000):
+                    raise ValueError(f"{key} = {header[key]}, expected 0 … 999")
+            file.seek(max(int(header.data_size_padded), 0), os.SEEK_CUR)
 
 
 # Images.

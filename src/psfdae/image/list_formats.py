@@ -13,8 +13,9 @@ import io
 import math
 import operator
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from psfdae.image.fits_file import (
     open_hdus,
     unpack_file,
 )
+from psfdae.image.position_columns import find_identifier, has_positions
 
 COLUMNS_MAX = 2000
 """Largest number of columns of a list that is text; LSST's have 1300."""
@@ -76,7 +78,7 @@ def read_list_table(path: Path) -> Table:
         return votable(path, content)
     # A list of DAOPHOT itself (Stetson 1987, PASP 99, 191) begins with number, x and y. Its pixels
     # count from 1, as SExtractor's do. Two of its three head lines are not blank.
-    if re.match(r"\s*NL\s+NX\s+NY\b", lines[0]):
+    if re.match(r"\s*+NL\s++NX\s++NY\b", lines[0]):
         rows = (" ".join(line.split()[:3]) for line in lines[2:])
         lines = ["id X_IMAGE Y_IMAGE", *rows]
     return text_table(path, lines)
@@ -164,7 +166,7 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
     """
     from astropy.io import ascii as text_tables
 
-    head = "\n".join(lines[:200])
+    head = "\n".join(line[:1000] for line in lines[:200])
     names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
     options = {"format": next(names, "basic")}
     if options["format"] == "basic" and (lines := plain_rows(lines)):
@@ -186,7 +188,41 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
             raise ObservationError(path, f"more than {COLUMNS_MAX} columns, or letters in a name")
     with reading(path):
         # The line break at the end is what tells a table from the name of a file.
-        return text_tables.read("\n".join(lines) + "\n", guess=False, **options)
+        table = text_tables.read("\n".join(lines) + "\n", guess=False, **options)
+        return with_texts_of_identifiers(table, lines, options)
+
+
+def with_texts_of_identifiers(
+    table: Table, lines: Sequence[str], options: Mapping[str, Any]
+) -> Table:
+    """Return a text table with its identifiers as they are written: 001 is not 1, nor 1e5 100000.0.
+
+    Parameters
+    ----------
+    table : Table
+        The table as astropy reads it.
+    lines : sequence of str
+        Its lines.
+    options : mapping
+        Options with which astropy reads them.
+    """
+    from astropy.io import ascii as text_tables
+
+    # ECSV and the formats of IRAF and CDS have types of their own.
+    name, form = find_identifier(table.colnames), options["format"]
+    if name is None or form not in ("basic", "tab", "sextractor", "ipac"):
+        return table
+    # astropy's fast reader takes no types, but a column with a second row of names is text.
+    options = {"guess": False, **options, "include_names": [name]}
+    if form in ("basic", "tab"):
+        lines = [lines[0], *lines]
+    else:
+        options["converters"] = {name: [text_tables.convert_numpy(str)]}
+    texts = text_tables.read("\n".join(lines) + "\n", **options)[name][-len(table) :]
+    # Whole numbers stay numbers if their texts are the same.
+    if table[name].dtype.kind != "i" or (table[name].astype(str) != texts).any():
+        table[name] = texts
+    return table
 
 
 TEXT_FORMATS = {
@@ -204,15 +240,16 @@ table is "basic"."""
 def has_mostly_numbers(row: str) -> bool:
     """Return whether most words of a row of a text table are numbers, or sexagesimal angles."""
     words = re.split(r"[,;|\s]+", row.strip())
-    form = re.compile(r"[-+.:\d]+([eE][-+]?\d+)?")
+    form = re.compile(r"[-+.:\d]++(?:[eE][-+]?\d++)?")
     return 2 * sum(form.fullmatch(word) is not None for word in words) > len(words)
 
 
 def plain_rows(lines: Sequence[str]) -> Sequence[str]:
     """Return the rows of a text table, the names of its columns first, without comments.
 
-    A comment right before numbers without names is the names. VizieR writes two lines of units and
-    of dashes below the names, which are left out.
+    A comment above numbers without names is the names if it has as many words as the numbers'
+    first row: of several ones, the last with names of positions, or else the last. VizieR writes
+    two lines of units and of dashes below the names, which are left out.
 
     Parameters
     ----------
@@ -225,7 +262,11 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
         return []
     preamble = lines[: lines.index(rows[0])]
     if preamble and has_mostly_numbers(rows[0]):
-        return [preamble[-1].lstrip("# \t"), *rows]
+        mark = next((mark for mark in ",;\t" if mark in rows[0]), None)
+        texts = [line.lstrip("# \t") for line in reversed(preamble[-50:])]
+        names = [text for text in texts if len(text.split(mark)) == len(rows[0].split(mark))]
+        best = max(names, key=lambda text: has_positions(text.split(mark)), default=None)
+        return rows if best is None else [best, *rows]
     has_dashes = len(rows) > 2 and "--" in rows[2] and not rows[2].strip("-\t;|, ")
     return [rows[0], *rows[3:]] if has_dashes else rows
 
@@ -261,7 +302,7 @@ def votable(path: Path, content: bytes) -> Table:
                     raise ObservationError(path, f"{problem}; write them into it")
                 rows = max(rows, int(attributes.get("nrows", 0)))
                 if tag == "FIELD":
-                    sizes = re.findall(r"\d+", attributes.get("arraysize", ""))
+                    sizes = re.findall(r"\d+", attributes.get("arraysize", "")[:1000])
                     widths.append(8 * math.prod(map(int, sizes)))
         if len(widths) > COLUMNS_MAX or rows * sum(widths) > compute_unpacked_max(len(content)):
             raise ObservationError(path, f"damaged: {len(widths)} columns, {rows} rows")

@@ -12,6 +12,7 @@ not guessed between, either.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -149,6 +150,13 @@ def choose_positions(names: Sequence[str]) -> Positions:
     return choices[0]
 
 
+def has_positions(names: Sequence[str]) -> bool:
+    """Return whether `choose_positions` finds the position columns among some names."""
+    with suppress(ColumnError):
+        return bool(choose_positions(names))
+    return False
+
+
 def name_in_any_case(names: Sequence[str], name_wanted: str) -> str | None:
     """Return the only one of some names that is the one wanted but for its case, None without.
 
@@ -162,3 +170,17 @@ def name_in_any_case(names: Sequence[str], name_wanted: str) -> str | None:
     if len(matches) > 1:
         raise ColumnError(f"columns {' and '.join(matches)} differ in their case only; keep one")
     return matches[0] if matches else None
+
+
+def find_identifier(names: Sequence[str]) -> str | None:
+    """Return the name of the column that identifies the stars of a list; None without one.
+
+    Of the names that identify stars, it is the first one that the list has. Two columns whose names
+    differ by their case only are none.
+    """
+    known = "id source_id number star_id objid obj_id object_id label name"
+    for wanted in known.split():
+        matches = [wanted] if wanted in names else [n for n in names if n.strip().lower() == wanted]
+        if len(matches) == 1:
+            return matches[0]
+    return None

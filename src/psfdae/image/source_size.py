@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from psfdae.image.errors import silent
 from psfdae.image.stamps import cut_image
 from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, robust_scatter
 
@@ -152,7 +153,7 @@ def size_of_windows(
         peak = np.unravel_index(core.argmax(), core.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))
     # Above the sky, the median of the four outer rings; of flux 1 within 16 px.
-    with np.errstate(all="ignore"):
+    with silent():  # near an edge, the outer rings of a star may have no pixel
         rings = rings - np.nanmedian(rings[:, -4:], axis=1)[:, None]
     flux = np.nansum(rings[:, edges[1:] <= 16] * area[edges[1:] <= 16], axis=1)
     usable = np.isfinite(rings).mean(axis=1) > 0.5
@@ -163,7 +164,8 @@ def size_of_windows(
     # Median profile, up to the first ring that half of the stars do not have.
     is_covered = np.isfinite(scaled).sum(axis=0) > 0.5 * usable.sum()
     last = len(is_covered) if is_covered.all() else int(np.argmin(is_covered))
-    scaled = np.where(np.isfinite(scaled), scaled, np.nanmedian(scaled, axis=0))[:, :last]
+    scaled = scaled[:, :last]
+    scaled = np.where(np.isfinite(scaled), scaled, np.nanmedian(scaled, axis=0))
     profile = np.median(scaled, axis=0)
     # 1.25 σ/√n is the error of a median; three of these above 0 are light.
     error = 1.25 * robust_scatter(scaled) / np.sqrt(len(scaled))

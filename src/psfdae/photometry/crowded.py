@@ -30,9 +30,6 @@ from psfdae.psf.wings import Wings, outer_shares
 MAX_CHI2_RATIO = 2.5
 """Median χ² of an image's bright stars, over that of the training, from which all are flagged."""
 
-MAX_TURNS = 5
-"""Joint fits; stars are looked for after all but the last two."""
-
 RESIDUAL_SNR = 4.0
 """Minimum S/N of a star in the residuals: of 10⁶ pixels of noise, some 25 peaks are higher."""
 
@@ -96,7 +93,7 @@ class CrowdedPhotometry:
 
 
 def photometry(
-    model: FieldPsfs, observation: Observation, threshold: float = RESIDUAL_SNR
+    model: FieldPsfs, observation: Observation, threshold: float = RESIDUAL_SNR, turns: int = 5
 ) -> CrowdedPhotometry:
     """Fit positions and fluxes of all stars of an image.
 
@@ -108,6 +105,8 @@ def photometry(
         The image with its stars. No others are looked for if they are those of a list.
     threshold : float
         Minimum S/N of stars that are found where the models of others are subtracted.
+    turns : int
+        Maximum number of joint fits, at least 2; stars are looked for after all but the last two.
 
     Raises
     ------
@@ -139,7 +138,7 @@ def photometry(
     error = pixel_error(sky.noise, sky.flat, observation.gain)
     # Positions of all stars that were found in residuals: each is tried once.
     peaks = np.empty((0, 2))
-    for turn in steps("photometry", range(MAX_TURNS)):
+    for turn in steps("photometry", range(turns)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
         fit = fit_stars(psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin)
@@ -154,7 +153,7 @@ def photometry(
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
-        if turn == MAX_TURNS - 1 or (turn > 0 and observation.detections is None):
+        if turn == turns - 1 or (turn > 0 and observation.detections is None):
             break
         # A star found in residuals is dropped if it is faint, if it may be what the PSF of another
         # star lacks, or if it has moved to another star.
@@ -165,7 +164,7 @@ def photometry(
         place, flux, origin = place[real], flux[real], origin[real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
         # stars and find none.
-        if observation.detections is not None and turn < MAX_TURNS - 2:
+        if observation.detections is not None and turn < turns - 2:
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
             positions = np.concatenate([place, peaks])
             new, new_flux = find_stars(psfs, sky.flat, sigma, positions, threshold, fwhm)

@@ -159,9 +159,19 @@ def photometry_of_image(
 
 
 def measure_stars(
-    model: FieldPsfs, observation: Observation, threshold: float | None = None
+    model: FieldPsfs, observation: Observation, threshold: float | None = None, turns: int = 5
 ) -> tuple[CrowdedPhotometry, str | None]:
     """Measure the stars that can be measured, and return a row for every star of the list.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+    observation : Observation
+        The image with its stars.
+    threshold : float, optional
+        Minimum S/N of stars that are found in residuals.
+    turns : int
+        Maximum number of joint fits (`crowded.photometry`).
 
     Returns
     -------
@@ -174,7 +184,7 @@ def measure_stars(
     # light of its own: measure the others, and add flagged rows for these.
     unusable = observation.without_position() | observation.listed_again()
     usable = observation.select(~unusable) if unusable.any() else observation
-    measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR)
+    measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR, turns)
     if unusable.any():
         stars = with_unmeasured_rows(measured.stars, observation, unusable)
         measured = replace(measured, stars=stars)

@@ -173,11 +173,13 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
         if not method_fit.knows_field or stars.observation.shape is None:
             return model
         # Light outside the stamps, as the photometry of each image with this model measures it:
-        # `flux_total` of a star and its flux by photometry are the same.
+        # `flux_total` of a star and its flux by photometry are the same. Stars that are found in
+        # the residuals of the first fit change the wings by up to two of their errors, those of
+        # later fits by less than a quarter of one: three fits are enough.
         wings = []
         for image in stars.images:
             observation = with_measured_gain(model, image.observation.assuming())
-            photometry, _ = measure_stars(model, observation, image.source.given_threshold)
+            photometry, _ = measure_stars(model, observation, image.source.given_threshold, 3)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model

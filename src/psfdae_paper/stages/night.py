@@ -273,20 +273,25 @@ def order_images(
 
 def fit_image(stars: ImageStars, start: StarModel | None) -> StarModel:
     """Fit the field model of an image, starting from the model of another image if there is one."""
+    from psfdae.methods.field import FieldMixture
     from psfdae.training.exposures import adapt_to_stars
-    from psfdae.training.fitting import fit_model
+    from psfdae.training.fitting import fit_method, pack_model
+    from psfdae.training.settings import apply_keywords
     from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
 
     # Fewer stars than this cannot show how the field has changed.
     training_stars = np.count_nonzero(~stars.held_out)
     if start is None or training_stars < MIN_STARS_WITH_ERROR:
-        model = fit_model(stars, method="field")
+        method_fit = fit_method(stars, FieldMixture)
         # Where wavefronts grow with the square of the position, as Seidel aberrations do, second
         # moments grow with its fourth power: a curved field gets at least order 4, if there are two
         # stars for each of its 15 terms. Few of the stars that decide the order are in corners.
-        if 2 <= model.order < 4 and training_stars >= 30:
-            model = fit_model(stars, method="field", orders=[4, 6])
-        return model
+        if 2 <= method_fit.order < 4 and training_stars >= 30:
+            settings = apply_keywords(stars.settings, [*FieldMixture.groups], {"orders": [4, 6]})
+            stars = stars.replace_settings(settings)
+            method_fit = fit_method(stars, FieldMixture)
+        # Errors and wings take most of the time: they are measured once, of the fit that stays.
+        return pack_model(stars, method_fit, stars.name, "not stated")
     return adapt_to_stars(start, stars)
 
 
