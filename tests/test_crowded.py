@@ -348,6 +348,37 @@ def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighb
 
 
 @pytest.mark.parametrize(
+    ("light", "middle", "stretch"),
+    [(2e7, (100.4, 119.6), 1.0), (2e8, (185.3, 289.6), 1.0), (2e8, (60.0, 60.0), 1.08)],
+)
+def test_errors_of_stars_on_a_halo_include_the_error_of_the_halo(sky, light, middle, stretch):
+    """Faint stars on all sides: a middle between pixels, at an edge, beside listed stars; ovals."""
+    folder, model, true = sky
+    rng = np.random.default_rng(7)
+    place, flux = np.stack([true["x"], true["y"]], axis=1), np.array(true["flux"])
+    for angle in np.arange(0, 32 * np.pi, 0.3):
+        distance = rng.uniform(12, 45)
+        new = middle + distance * np.array([np.cos(angle), np.sin(angle)])
+        if np.hypot(*(place - new).T).min() > 9 and (abs(new - SIZE / 2) < SIZE / 2 - 8).all():
+            place, flux = np.vstack([place, new]), np.append(flux, 10 ** rng.uniform(3.2, 3.8))
+    row, column = np.indices((SIZE, SIZE))
+    radius = np.hypot(stretch * (column - middle[0]), (row - middle[1]) / stretch)
+    added = light * profile(radius, 0.0)
+    faint = slice(len(true), None)
+    add_stamps(added, flux[faint, None, None] * stamps(*place[faint].T), *place[faint].T)
+    image = np.minimum(fits.getdata(folder / "i.fits") + rng.poisson(added), 6e4)
+    source = ImageInput(image, catalogue=place, origin=0, gain=1.0, saturate=6e4)
+    rows = crowded.photometry(load_model(model), source.open(STAMP)).stars[faint]
+    pull = ((rows["flux"] - flux[faint]) / rows["flux_error"])[rows["flags"] == 0]
+    assert len(pull) > 0.6 * len(rows) > 12
+    assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.5 and np.abs(pull).max() < 3.5
+    # Of stars at 20 to 45 px, errors are still useful.
+    distance = np.hypot(*(place[faint] - middle).T)
+    relative_error = (rows["flux_error"] / flux[faint])[distance > 20]
+    assert np.median(relative_error) < 0.07
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["x.txt"], "x.txt"),

@@ -18,6 +18,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from psfdae import api
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
 from psfdae.photometry import image_photometry

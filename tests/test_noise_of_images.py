@@ -215,15 +215,39 @@ def test_offsets_of_rows_or_columns_are_in_the_noise_of_stars(axis, offset):
     assert sums.std() == pytest.approx(expected, rel=0.15)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_predictions_of_pixels_that_share_their_noise_are_warned_of(model, image, options, axis):
-    """Their errors are of independent pixels."""
-    options = {**options, **camera(1.0)}
-    shape = (1, image.shape[1]) if axis else (image.shape[0], 1)
-    noise = 0.7 * np.sqrt(SKY / GAIN + (READ / GAIN) ** 2)
-    offsets = np.random.default_rng(8).normal(0, noise, shape)
-    notes = [model.predict_image(pixels, **options).notes for pixels in (image, image + offsets)]
-    assert ["pixels share their noise" in "".join(lines) for lines in notes] == [False, True]
+SHARED = {
+    "none": lambda noise, rng: noise,
+    "two by two pixels": lambda noise, rng: 2.0 * ndimage.uniform_filter(noise, 2),
+    "a seeing disc": lambda noise, rng: 2.8 * ndimage.gaussian_filter(noise, 0.8),
+    "rows": lambda noise, rng: noise + 0.7 * rng.normal(size=(len(noise), 1)),
+    "columns": lambda noise, rng: noise + 0.7 * rng.normal(size=(1, len(noise))),
+}
+"""Noise that pixels share, of about 1 in a pixel, from independent noise (h, w)."""
+
+
+@pytest.mark.parametrize("kind", SHARED)
+def test_errors_of_predictions_include_noise_that_pixels_share(model, image, kind):
+    """Two thirds of faint fluxes are within their errors; χ² is that of pixels, and stays 1.
+
+    A PSF is a sum of few pixels: where neighbours share noise, errors are up to 1.2 times as large.
+    """
+    axis, rng = np.arange(16.0, len(image) - 16, 20), np.random.default_rng(3)
+    place = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    place = place + rng.uniform(-1, 1, place.shape)
+    light = drawn(lambda r: np.exp(-(r**2) / 3.38) / 10.62, place, np.full(len(place), 2e3), 300)
+    pulls = []
+    for _ in range(2):
+        noise = SHARED[kind](rng.normal(size=image.shape), rng)
+        stars = {"catalogue": place, "origin": 0, **SCALE}
+        found = model.predict_image(SKY + light + 14 * noise, **stars)
+        pulls.append((found.flux - np.median(found.flux)) / found.flux_error)
+        assert ("pixels share their noise" in "".join(found.notes)) == (kind != "none")
+        assert np.median(found.chi2) == pytest.approx(1.0, abs=0.1)
+        # Errors of centres, which depend on differences of pixels, are not too small.
+        off = found.x_fit - place[:, 0]
+        assert np.mean(np.abs(off - np.median(off)) < found.x_error) > 0.62
+    is_local = kind in ("two by two pixels", "a seeing disc")
+    assert 0.62 < np.mean(np.abs(pulls) < 1) < (0.8 if is_local else 0.74)
 
 
 def test_faint_sources_are_not_noise_that_pixels_share():

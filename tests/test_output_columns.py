@@ -271,6 +271,28 @@ def test_columns_that_have_no_formula(folder, true):
     assert score[table["distance"] > 50].min() > 10 * np.median(score[true["faint"]])
 
 
+def test_half_widths_hold_the_errors_of_psfs_above_the_ring_around_their_stamps(
+    folder, stars, true
+):
+    """Light of wings in the ring passes for sky, as the page says; with it, errors are larger."""
+    table = Table.read(folder / "predict.fits", hdu="STARS")
+    with fits.open(folder / "predict.fits") as file:
+        psf, half_width = file["PSF"].data, file["UNCERT"].data
+    ring = np.ones((STAMP + 16, STAMP + 16), bool)
+    ring[8:-8, 8:-8] = False
+    parts = []
+    for star in np.flatnonzero(true["alone"] & (true["snr"] > 10) & (true["snr"] < 60)):
+        shift = table["shift_x"][star], table["shift_y"][star]
+        about = known.pixel(stars["x0"][star] + shift[0], stars["y0"][star] + shift[1])
+        light = stars["flux"][star] * known.light(*stars["x", "y"][star], about)
+        whole = known.middle(light, STAMP)
+        even_light = np.median(known.middle(light, STAMP + 16)[ring])
+        errors = [np.abs(psf[star] - whole + even) for even in (even_light, 0.0)]
+        parts.append([(error < half_width[star]).mean() for error in errors])
+    above_ring, whole = np.mean(parts, axis=0)
+    assert len(parts) > 10 and 0.6 < above_ring < 0.8 and whole < above_ring - 0.05
+
+
 def test_columns_of_photometry(folder, stars, true, model):
     table = Table.read(folder / "photometry.fits")
     alone, bright, middling = true["alone"], true["bright"], true["middling"]

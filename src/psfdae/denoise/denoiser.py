@@ -81,7 +81,7 @@ class CentredStars(NamedTuple):
         data : ndarray, shape (n, d, d), float64
             0 in stamps that are unusable.
         noise : ndarray, shape (n,)
-            Standard deviation of a pixel.
+            Standard deviation of a pixel, as sums of pixels have it.
         is_unusable : ndarray of bool, shape (n,)
             True if a stamp has nothing to measure: bad, constant, or beyond any number.
         """
@@ -103,8 +103,8 @@ class CentredStars(NamedTuple):
         is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
         is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
         data = np.where(is_unusable[:, None, None], 0.0, data)
-        # σ² of a pixel: that of the sky, and the mean of the star's photons.
-        noise = np.fmax(photometry.noise, NOISE_FLOOR * modulus)
+        # σ² of a pixel: the sky's, as it is in sums of pixels, and the mean of the star's photons.
+        noise = np.fmax(self.stars.noise_correlation * photometry.noise, NOISE_FLOOR * modulus)
         photons = np.maximum(photometry.flux, 0.0) / self.stars.gain / stamps[0].size
         noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
         return data, noise, is_unusable
@@ -275,8 +275,10 @@ class Denoiser(ABC):
             denoised_stars.photometry,
         )
         psf, sigma = denoised_stars.psf, denoised_stars.sigma
-        # Noise over the flux: the unit of the training, on which errors and limits depend.
+        # Noise over the flux: the unit of the training, on which errors and limits depend. PSFs and
+        # fluxes are sums of pixels, which have more noise where pixels share it.
         noise = photometry.noise / np.where(denoised_stars.has_no_flux, np.nan, photometry.flux)
+        noise *= stars.noise_correlation
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
         snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
@@ -294,7 +296,7 @@ class Denoiser(ABC):
         residual[~photometry.used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
         chi2 = compute_reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
-        flux_error = self._flux_errors(photometry, flux_scale, stars.gain)
+        flux_error = self._flux_errors(photometry, flux_scale, stars)
         # Flags beside those of centring, photometry and method. The S/N of a star is known to its
         # tolerance.
         is_unlike = errors.is_unlike_training(noise, distance, denoised_stars.outlier_score)
@@ -333,11 +335,11 @@ class Denoiser(ABC):
 
     @abstractmethod
     def _flux_errors(
-        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+        self, photometry: Photometry, flux_scale: np.ndarray, stars: Stamps
     ) -> np.ndarray:
         """Return the standard errors of fluxes (n,), with the photons of the stars.
 
-        `flux_scale` (n,) is the factor of the errors by noise, `gain` (n,) in electrons per unit.
+        `flux_scale` (n,) is the factor of the errors by noise.
         """
 
     @abstractmethod
@@ -418,11 +420,12 @@ class StampDenoiser(Denoiser):
         return images, np.where(has_no_flux, self.bundle.info.noise_max, noise)
 
     def _flux_errors(
-        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+        self, photometry: Photometry, flux_scale: np.ndarray, stars: Stamps
     ) -> np.ndarray:
-        # σ² of the sky's noise, scaled, and the photons of the star.
-        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / gain)
-        return np.asarray(np.sqrt((flux_scale * photometry.flux_error) ** 2 + photons))
+        # σ² of the sky's noise in a sum of pixels, scaled, and the photons of the star.
+        photons = np.nan_to_num(np.maximum(photometry.flux, 0.0) / stars.gain)
+        scale = flux_scale * stars.noise_correlation
+        return np.asarray(np.sqrt((scale * photometry.flux_error) ** 2 + photons))
 
     def _total_fluxes(
         self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
@@ -445,7 +448,7 @@ class FieldDenoiser(Denoiser):
         return [measure_stars(part, self.method, self.bundle.errors) for part in centred_stars]
 
     def _flux_errors(
-        self, photometry: Photometry, flux_scale: np.ndarray, gain: np.ndarray
+        self, photometry: Photometry, flux_scale: np.ndarray, stars: Stamps
     ) -> np.ndarray:
         return np.asarray(np.abs(flux_scale * photometry.flux_error))
 

@@ -107,6 +107,7 @@ def make_stamps(
         magnitude=magnitude,
         colour=colour,
         listed=_columns("centre", centre, count, 2)[:, ::-1],
+        noise_correlation=np.ones(count),
         **star_columns,
     )
     return checked_arrays, unit

@@ -295,7 +295,7 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
 
 def checked_camera(
     image: ImageFile, camera: Mapping[str, CameraValue]
-) -> tuple[dict[str, CameraValue], list[str]]:
+) -> tuple[dict[str, CameraValue], list[str], float]:
     """Leave out header values that the pixels contradict; those that are given stay, with a word.
 
     Parameters
@@ -311,6 +311,8 @@ def checked_camera(
         Those that fit the pixels.
     remarks : list of str
         A sentence on each that does not, on colours, and on noise that pixels share.
+    correlation : float
+        Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
 
     Raises
     ------
@@ -319,7 +321,7 @@ def checked_camera(
     """
     sky, values = sky_sample(image), dict(camera)
     if sky is None:
-        return values, []
+        return values, [], 1.0
     values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
     # Noise makes less than 0.1 in 100 × 100 pixels; readout changes levels along rows or columns.
     if abs(sky.checker) > 0.3:
@@ -331,17 +333,16 @@ def checked_camera(
         warn(remarks[-1:])
     if sky.correlation > 1.0:
         remarks.append(
-            f"{image.path}: pixels share their noise: errors of predictions are of independent "
-            f"pixels, up to {sky.correlation:.2f} times too small for faint stars; errors of "
-            "photometry include it"
+            f"{image.path}: pixels share their noise: the noise of their sums is "
+            f"{sky.correlation:.2f} times as large as of independent pixels, and errors include it"
         )
     # A gain of the header that cannot be right is not used, one that is stated is.
     problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
-        return values, remarks
+        return values, remarks, sky.correlation
     origin = camera["gain"].origin
     if origin == "given":
-        return values, [*remarks, f"{image.path}: {problem}: used as stated"]
+        return values, [*remarks, f"{image.path}: {problem}: used as stated"], sky.correlation
     values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
     remarks.append(
         f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
@@ -352,7 +353,7 @@ def checked_camera(
     level, origin = values["saturation"]
     if level is not None and origin != "given" and sky.highest <= 1.0 < level:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
-    return values, remarks
+    return values, remarks, sky.correlation
 
 
 def checked_saturation(

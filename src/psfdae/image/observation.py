@@ -95,6 +95,8 @@ class Observation:
         Column of the star list with colours.
     remarks : tuple of str
         Sentences on what is in the file or the list, and used or not.
+    noise_correlation : float
+        Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
     neighbour_light : callable or None
         Returns the light of other stars in the stamps of a part of the list, for a side and a
         margin in px; it is subtracted.
@@ -112,6 +114,7 @@ class Observation:
     detections: Catalogue | None
     colour_column: str | None
     remarks: tuple[str, ...]
+    noise_correlation: float
     # All of the list, also stars that are off the image.
     _list: Catalogue | None
     _layers: Layers
@@ -524,6 +527,7 @@ def _with_stars(
         flux=stars.flux,
         background=stars.background,
         noise=noise,
+        noise_correlation=np.full(len(data), observation.noise_correlation),
         gain=unknown if observation.gain is None else np.full(len(data), observation.gain),
         magnitude=unknown,
         colour=stars.colour,

@@ -75,8 +75,9 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
     image, is_cube = image_or_cube(source, image, table, stamp_px)
     # The camera: values of a header are used as far as the pixels do not contradict them.
     camera, remarks = camera_values(image, stated_camera), unread_card_remarks(image)
+    noise_correlation = 1.0
     if not is_cube:
-        camera, camera_remarks = checked_camera(image, camera)
+        camera, camera_remarks, noise_correlation = checked_camera(image, camera)
         remarks += [*camera_remarks, *sky_coordinate_remarks(image)]
     # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
     image = image.to_noise_unit()
@@ -111,6 +112,8 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
         detections=detections,
         colour_column=source.colour_column,
         remarks=(*remarks, *list_remarks),
+        # The scale of a noise map includes it.
+        noise_correlation=noise_correlation if layers.noise is None else 1.0,
         _list=table,
         _layers=layers,
     )

@@ -36,6 +36,8 @@ class Stamps:
     flux, background, noise : ndarray, shape (n,)
         Flux inside the stamp, sky level, and RMS of the sky in a pixel; NaN where they are to be
         estimated.
+    noise_correlation : ndarray, shape (n,)
+        Noise of sums of pixels of the sky over the noise of sums of independent pixels, at least 1.
     gain : ndarray, shape (n,)
         Electrons per unit of the stamps.
     magnitude : ndarray, shape (n,)
@@ -58,6 +60,7 @@ class Stamps:
     flux: np.ndarray
     background: np.ndarray
     noise: np.ndarray
+    noise_correlation: np.ndarray
     gain: np.ndarray
     magnitude: np.ndarray
     colour: np.ndarray

@@ -96,14 +96,10 @@ def find_spikes(
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
-        Finite.
-    bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+    image, bad, is_saturated : ndarray, shape (h, w)
+        Finite image; True for pixels that are left out, and for saturated ones.
     sky : SkyLevel
         Sky of the image.
-    is_saturated : ndarray of bool, shape (h, w)
-        Saturated pixels.
 
     Returns
     -------
@@ -117,7 +113,7 @@ def find_spikes(
     part_px, angles, parts = 8, 720, 32
     reach_px = part_px * parts
     shape = angles, reach_px
-    for x, y, core_px in saturated_cores(is_saturated):
+    for x, y, core_px in find_saturated_cores(is_saturated):
         middle = y, x
         first = int(2.0 * core_px / part_px) + 1
         # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
@@ -144,7 +140,7 @@ def find_spikes(
     return np.asarray(scipy.ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
 
 
-def saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
+def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
     """Return middles and radii of the cores of saturated stars: x, y and r in px, (k, 3).
 
     A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The middle

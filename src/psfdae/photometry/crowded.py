@@ -115,6 +115,8 @@ def photometry(
     ObservationError
         If there is no sky to measure.
     """
+    from scipy.ndimage import map_coordinates
+
     observation, unit = observation.to_sky_unit(), observation.unit_factor
     # PSFs of the field, and lengths that follow from the PSF in its middle.
     psfs = PsfGrid.of(model, by_magnitude=True).times(unit)
@@ -148,7 +150,7 @@ def photometry(
         # Sky and light beyond the stamps, from the image without the light of stars.
         fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
         # At first, stars are no better known than to the error of the wings.
-        sky, wing_light, wings = around_stars(
+        sky, wing_light, wings, halo_error = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, saturated
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
@@ -174,7 +176,10 @@ def photometry(
             break
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm)
+    # A halo that is off by δ in all pixels of a star changes its flux by δ Σ P / Σ P².
+    rows_columns = np.nan_to_num(fit.place[:, ::-1]).T
+    light_error = area_px * map_coordinates(halo_error, rows_columns, order=1, mode="nearest")
+    stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm, light_error)
     stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, box_px, fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
@@ -190,6 +195,7 @@ def tabulate_stars(
     origin: np.ndarray,
     wings: Wings | None,
     fwhm: float,
+    light_error: np.ndarray,
 ) -> Table:
     """Return a row for each star with all its light, all errors, and flags that need no pixels.
 
@@ -207,6 +213,8 @@ def tabulate_stars(
         Light outside of the stamps; None adds none to the fluxes.
     fwhm : float
         FWHM of the PSF in pixels, which groups stars.
+    light_error : ndarray, shape (n,)
+        Standard errors of the fluxes due to light that was subtracted as halos of other stars.
     """
     from astropy.table import Table
 
@@ -223,14 +231,15 @@ def tabulate_stars(
     # in the fluxes as in the residuals.
     excess = np.sqrt(np.fmax(fit.chi2, 1.0))
     # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
-    # whatever its χ²: σ² = χ² σ_noise² + (σ_model F)² + (σ_wings F)².
+    # whatever its χ²: σ² = χ² σ_noise² + σ_halo² + (σ_model F)² + (σ_wings F)².
     relative_error = np.hypot(model.flux_error(fit.place), total_error / total)
     # Stars of a list keep its numbers and flags.
     stars = Table({"id": np.arange(1, len(flux) + 1) if is_detected else observation.stars.id})
     stars["x"], stars["y"] = fit.place.T
     stars["x_error"], stars["y_error"] = excess * fit.place_error.T
     stars["flux"] = total * flux
-    stars["flux_error"] = np.hypot(total * excess * fit.flux_error, relative_error * total * flux)
+    fit_error = np.hypot(excess * fit.flux_error, light_error)
+    stars["flux_error"] = total * np.hypot(fit_error, relative_error * flux)
     stars["flux_model"] = flux
     # Chains of neighbours, numbered from 1.
     group = chains(fit.place, 2.4 * fwhm)

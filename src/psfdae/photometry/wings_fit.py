@@ -16,7 +16,7 @@ import numpy as np
 from psfdae.base.progress import steps
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.sky_level import level_and_noise
-from psfdae.image.trails import saturated_cores
+from psfdae.image.trails import find_saturated_cores
 from psfdae.psf.wings import Wings, compute_prior_profile, tents
 from psfdae.stars.moments import dither
 
@@ -221,7 +221,7 @@ def around_stars(
     earlier: Wings | None,
     tolerance: float,
     is_saturated: np.ndarray,
-) -> tuple[Sky, np.ndarray, Wings | None]:
+) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
     A sky map takes wide wings for sky until the wings are known.
@@ -248,8 +248,10 @@ def around_stars(
     sky : Sky
         Sky without wings; its `flat` is what is left without sky, stars and wings.
     light_of_wings : ndarray, shape (h, w)
-        With the halos of saturated cores without a fitted star.
+        With the halos of saturated cores.
     wings : Wings or None
+    halo_error : ndarray, shape (h, w)
+        Standard error of these halos in a pixel, which neighbours share.
     """
     # What is left beside the models has their errors, too.
     sigma = add_model_errors(error, star_light)
@@ -272,22 +274,40 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
-    # Saturated stars that are not fitted have halos, too.
-    middles = stars.place[stars.flux > 0]
-    for core in saturated_cores(is_saturated):
-        if np.hypot(*(middles - core[:2]).T).min(initial=np.inf) > 2.0:
-            halo = measure_halo(sky.flat, sky.bad, sigma, core)
-            light_of_wings += halo
-            sky = replace(sky, flat=sky.flat - halo)
-    return sky, light_of_wings, wings
+    # Saturated stars have halos that the fit of a few pixels, or of a neighbour, does not know.
+    halo_error = np.zeros_like(sky.flat)
+    for core in find_saturated_cores(is_saturated):
+        if (halo := measure_halo(sky.flat, sky.bad, sigma, core)) is not None:
+            light_of_wings[halo.window] += halo.light
+            sky.flat[halo.window] -= halo.light
+            halo_error[halo.window] = np.hypot(halo_error[halo.window], halo.error)
+    return sky, light_of_wings, wings, halo_error
+
+
+class Halo(NamedTuple):
+    """Light around a saturated core.
+
+    Attributes
+    ----------
+    window : tuple of slice
+        Rows and columns of the pixels.
+    light, error : ndarray, shape (h, w)
+        Light in the window, negative where the model of a star has too much, and its standard error
+        in a pixel, which neighbours share.
+    """
+
+    window: tuple[slice, ...]
+    light: np.ndarray
+    error: np.ndarray
 
 
 def measure_halo(
     residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
-) -> np.ndarray:
-    """Return the light (h, w) around a saturated core: at each distance, the median.
+) -> Halo | None:
+    """Measure the light that is left around a saturated core: at each distance, the median.
 
-    It ends at the first ring of which the median is below five times its error, or at 256 px.
+    It ends at the first ring of which the median is below five times its error; farther out, it
+    falls off as the power of the distance that the last four rings follow, up to 256 px.
 
     Parameters
     ----------
@@ -297,31 +317,64 @@ def measure_halo(
         Pixels that are in no ring.
     core : ndarray, shape (3,)
         Middle x, y and radius in px.
+
+    Returns
+    -------
+    Halo or None
+        None if no two rings that follow each other show a halo.
     """
     from scipy import ndimage
 
-    halo, (height, width) = np.zeros_like(residual), residual.shape
     column, row = np.rint(core[:2]).astype(int)
-    rows = slice(max(row - 256, 0), min(row + 257, height))
-    window = rows, slice(max(column - 256, 0), min(column + 257, width))
-    y, x = np.mgrid[window]
-    radius = np.hypot(x - core[0], y - core[1])
-    # Rings wider by a tenth each; bad pixels are in none.
+    window = tuple(
+        slice(max(at - 256, 0), min(at + 257, size))
+        for at, size in zip((row, column), residual.shape, strict=True)
+    )
+    data, noise, middle = residual[window], sigma[window], core[1::-1].astype(float)
+    # Rings wider by a tenth each.
     edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
-    ring = np.where(bad[window], 0, np.digitize(radius, edges))
-    numbers = np.unique(ring)[1:-1]
-    level = ndimage.median(residual[window], ring, numbers)
-    middle = ndimage.mean(radius, ring, numbers)
-    # The error of a median of n values is 1.25 σ/√n.
-    error = 1.25 * ndimage.mean(sigma[window], ring, numbers)
-    error /= np.sqrt(np.bincount(ring.ravel())[numbers])
-    # Between the rings it is a power of the distance.
-    count = int(np.logical_and.accumulate(level > 5.0 * error).sum())
-    if count:
-        log_level = np.log(level[:count])
-        power = np.interp(np.log(np.maximum(radius, 1.0)), np.log(middle[:count]), log_level)
-        halo[window] = np.where(radius <= middle[count - 1], np.exp(power), 0.0)
-    return halo
+    for _ in range(3):
+        offset = np.mgrid[window] - middle[:, None, None]
+        radius = np.hypot(*offset)
+        ring = np.where(bad[window], 0, np.digitize(radius, edges))
+        numbers = np.unique(ring)[1:-1]
+        level = ndimage.median(data, ring, numbers)
+        log_radius = np.log(ndimage.mean(radius, ring, numbers))
+        # The error of a median of n values is 1.25 σ/√n.
+        level_error = 1.25 * ndimage.mean(noise, ring, numbers)
+        level_error /= np.sqrt(np.bincount(ring.ravel())[numbers])
+        # Near the core, in the errors of a fitted star's model, there may be nothing to see.
+        is_seen = np.append(np.abs(level) > 5.0 * level_error, False)
+        first = int(is_seen.argmax())
+        count = first + int(is_seen[first:].argmin())
+        if count - first < 2:
+            return None
+        # Noise hides the light of farther rings: it goes on along a power of the distance that fits
+        # the last four, at least r^-2. Between rings, r³ h is linear in ln r.
+        last = np.s_[max(count - 4, first) : count]
+        slope = min(np.polyfit(log_radius[last], np.log(np.abs(level[last])), 1)[0], -2.0)
+        log_r, end = np.log(np.maximum(radius, 1.0)), log_radius[count - 1]
+        scaled_level = level[:count] * np.exp(3.0 * log_radius[:count])
+        height = np.interp(log_r, log_radius[:count], scaled_level)
+        light = height * np.exp(slope * np.maximum(log_r - end, 0.0) - 3.0 * np.minimum(log_r, end))
+        light[radius >= 256.0] = 0.0
+        # A core shows its middle to half a pixel: off by δ, it leaves −δ ∇h. Least squares of δ,
+        # where uneven light counts as an error of 30 %.
+        doubt = np.hypot(noise, 0.3 * light)
+        is_fitted = (ring > 0) & (log_r < end) & (np.abs(data - light) < 3.0 * doubt)
+        design = np.stack(np.gradient(light))[:, is_fitted] / doubt[is_fitted]
+        shift = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
+        middle += np.clip(shift, -1.0, 1.0)
+    # A halo is not round: medians in eighths of a ring scatter by more than noise does, √8 times
+    # the error of the ring. σ² = their mean square less seven of these; half of the light outside.
+    eighth = np.floor(np.arctan2(*offset) * 4.0 / np.pi).astype(int) % 8
+    parts = numbers[:count, None] * 8 + np.arange(8)
+    uneven = ndimage.median(data - light, ring * 8 + eighth, parts.ravel()).reshape(parts.shape)
+    noise_variance = np.square(level_error[:count])
+    variance = np.nanmean(np.square(uneven), axis=1) - 7.0 * noise_variance
+    ring_error = np.sqrt(np.maximum(variance, noise_variance))
+    error = np.interp(log_r, log_radius[:count], ring_error)
+    return Halo(window, light, np.where(log_r > end, 0.5 * np.abs(light), error))
 
 
 def _wings_beside(

@@ -129,6 +129,7 @@ def build_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | No
         flags=np.zeros(count, np.uint16),
         id=np.arange(count),
         noise=per_star("noise", noise),
+        noise_correlation=np.ones(count),
         gain=per_star("gain", gain),
         listed=np.full((count, 2), np.nan),
         **dict.fromkeys(("x", "y", "flux", "background", "magnitude", "colour"), unknown),
