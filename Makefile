@@ -88,7 +88,7 @@ UNKNOWN := $(strip $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $
 $(if $(filter-out PYTHON,$(UNKNOWN)),$(error $(UNKNOWN): no variable of this Makefile, whose first lines list them))
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs notebook site test fast-tests nightly test-all test-light test-docs test-pythons dist lint format lock clean \
+.PHONY: help env reproduce report mlflow reference notebook site test fast-tests nightly test-all test-light test-docs test-pythons dist lint format lock clean \
   benchmark stability bounds bundles shipped night
 
 help: ## List the targets
@@ -148,17 +148,13 @@ mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	mlflow ui --workers 1 --port "$$PORT" --backend-store-uri "sqlite:///$$PSFDAE_RESULTS/mlflow.db" \
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 
-reference: env ## Make the finished run in results the run of record, and renew the docs
+reference: env ## Make the finished run in results the run of record
 	@sh workflow/reference.sh
-	@$(MAKE) --no-print-directory docs
-
-docs: env ## Renew the numbers in README and docs
-	python docs/tables.py
 
 notebook: env ## Run the cells of the first session anew
 	python docs/notebook.py docs/first_session.ipynb
 
-site: docs ## Build the site of README and docs in site/
+site: env ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
 lint: env ## Check style, words and types of Python, and Snakemake files

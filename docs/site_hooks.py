@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "docs"))
+from page_tables import insert_tables  # noqa: E402
+
 PUBLISHED = (
     *("*.md", "LICENSE", "CITATION.cff", "config/*.md"),
     *("docs/*.md", "docs/*.ipynb", "docs/*.css", "docs/*.js", "docs/figures/*.png"),
@@ -69,15 +73,17 @@ MEMBERS = re.compile(r"^::: (\S+) \[(.*)\]$", re.M)
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Put in the references that only the site has, and link notebooks as the pages they are."""
+    """Insert the references and tables of the site, and link notebooks as the pages they are."""
 
     def directives(comment: re.Match[str]) -> str:
-        members = r"::: \1\n    options:\n      members: [\2]"
+        # Methods of the base classes are members, too.
+        members = r"::: \1\n    options:\n      members: [\2]\n      inherited_members: true"
         return re.sub(r"^(?=:::)", "\n", MEMBERS.sub(members, comment[1]), flags=re.M)
 
     # The page of a notebook, which is made in memory, links the file itself.
     if page.file.abs_src_path:
         markdown = markdown.replace(".ipynb)", ".md)")
+        markdown = insert_tables(markdown, Path(page.file.abs_src_path))
     return SITE_ONLY.sub(directives, markdown)
 
 

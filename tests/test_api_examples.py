@@ -13,14 +13,14 @@ from docs_pages import blocks, read
 from image_training import few_draws
 
 NAMES = [name for name in psfdae.__all__ if name != "__version__"]
-REFERENCE = "docs/api.md"
+REFERENCE = "docs/python.md"
 
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory):
-    """Variables that the lines at the head of the page leave, in a folder of their own."""
+    """Variables that the lines above the reference set, in a folder of their own."""
     folder = tmp_path_factory.mktemp("examples")
-    (body,) = blocks(read(REFERENCE), "python")
+    body = blocks(read(REFERENCE), "python")[-1]
     names = {}
     with pytest.MonkeyPatch.context() as patch, few_draws():
         patch.chdir(folder)
@@ -49,6 +49,6 @@ def test_the_example_gives_what_it_says(name, lines):
 
 def test_the_reference_is_the_public_names():
     page = read(REFERENCE)
-    listed = set(re.findall(r"^::: (\S+)", page, re.M))
+    listed = set(re.findall(r"^::: (psfdae\.\S+)", page, re.M))
     assert listed == {f"{getattr(psfdae, name).__module__}.{name}" for name in NAMES}
     assert "`psfdae.__version__`" in page and psfdae.__version__

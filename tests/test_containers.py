@@ -133,7 +133,7 @@ def test_what_a_process_gives_back_is_as_good_as_its_own(expected):
         assert f"{len(result)} stars" in repr(result) and "<table>" in result._repr_html_()
 
 
-# The tutorial's table: images of these kinds, by a word of their row.
+# The table of the page on input: images of these kinds, by a word of their row.
 
 KINDS = {
     "cosmic": lambda image: image + 3e3 * (np.random.default_rng(1).random(image.shape) < 1e-3),
@@ -146,13 +146,13 @@ KINDS = {
     "colour": lambda image: np.stack(3 * [image]),
     **dict.fromkeys(("MJy/sr", "SCI", "header", "list"), lambda image: image),
 }
-ROWS = re.findall(r"^\| ((?:is|has|comes) .*) \| (.*) \| (.*)\|$", read("docs/tutorial.md"), re.M)
+ROWS = re.findall(r"^\| ((?:is|has|comes) .*) \| (.*) \| (.*)\|$", read("docs/input.md"), re.M)
 LONG = pytest.param(True, marks=[pytest.mark.slow, pytest.mark.written])
 
 
 @pytest.mark.parametrize("is_trained", [False, LONG])
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:30])
-def test_an_image_of_the_tutorials_table_gives_what_it_says(
+def test_an_image_of_the_pages_table_gives_what_it_says(
     tmp_path, monkeypatch, image, place, row, is_trained
 ):
     monkeypatch.chdir(tmp_path)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
+import importlib
 import os
 import re
 import sys
@@ -17,49 +16,49 @@ from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import compose, dataset_names
 from workflow_runs import captured
 
-
-@pytest.fixture
-def tables(monkeypatch):
-    """The script docs/tables.py, run with --check."""
-    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs/tables.py")
-    tables = importlib.util.module_from_spec(spec)
-    monkeypatch.syspath_prepend(ROOT / "docs")
-    monkeypatch.setattr(sys, "argv", ["tables.py", "--check"])
-    spec.loader.exec_module(tables)
-    return tables
+sys.path.append(str(ROOT / "docs"))
+sentences = importlib.import_module("page_sentences")
+tables = sentences.tables
 
 
-def test_numbers_are_those_of_the_run_of_record(tables):
-    tables.main()  # it exits with the names of what has drifted; without --check it renews them
+@pytest.mark.parametrize("page", sentences.SENTENCES)
+def test_numbers_in_sentences_are_those_of_the_tables(page):
+    """A sentence that differs is printed as the tables of today give it."""
+    text = " ".join(read(page).split())
+    expected = [" ".join(sentence.split()) for sentence in sentences.SENTENCES[page]()]
+    assert expected and [sentence for sentence in expected if sentence not in text] == []
 
 
-@pytest.mark.parametrize(
-    ("name", "mark"), [("new", ""), ("old", " (recorded 2026-01-02 at commit 111111111111)")]
-)
-def test_a_typed_number_is_named_and_renewed_with_its_record(
-    tables, tmp_path, monkeypatch, name, mark
-):
-    record, page = tmp_path / "results/reference", tmp_path / "README.md"
-    record.mkdir(parents=True)
-    (record / f"{name}.csv").write_text("a,b\n1,2\n")
-    old_record = {"old.csv": {"commit": "1" * 40, "date": "2026-01-02"}}
-    (record / "provenance.json").write_text(json.dumps({"commit": "3" * 40, "kept": old_record}))
-    monkeypatch.setattr(tables, "ROOT", tmp_path)
-    monkeypatch.setattr(tables, "REFERENCE", record)
-    sources = tmp_path / "docs/numbers.yaml"
-    sources.parent.mkdir()
-    sources.write_text(f"README.md: [{{table: {name}.csv, numbers: {{stars: '{{a}}'}}}}]")
-    page.write_text("Of <!--n:stars-->2<!--/--> stars.\n")
-    with pytest.raises(SystemExit, match=r"README\.md: stars"):
-        tables.main()
-    monkeypatch.setattr(sys, "argv", ["tables.py"])
-    tables.main()
-    assert page.read_text() == f"Of <!--n:stars-->1{mark}<!--/--> stars.\n"
-    # A key of the page alone, or of the file of all keys alone, is refused.
-    for text in ("No number.\n", "<!--n:stars-->1<!--/--> of <!--n:all-->2<!--/-->"):
-        page.write_text(text)
-        with pytest.raises(SystemExit, match="only one of both has"):
-            tables.main()
+def test_every_table_of_a_page_has_rows_and_every_function_a_page():
+    page_of_table = {}
+    for page in pages():
+        for link in tables.LINK.finditer(read(page)):
+            assert (ROOT / page).parent.joinpath(link["path"]).exists(), (page, link["path"])
+            page_of_table[link["name"]] = page
+    assert page_of_table.keys() == tables.TABLES.keys()
+    for name, table in tables.TABLES.items():
+        frame = table()
+        assert len(frame) > 1 and frame.columns.is_unique, name
+        assert not frame.astype(str).isin(["nan"]).any(axis=None), name
+
+
+def test_a_table_of_an_earlier_record_gets_its_date(monkeypatch):
+    (name, row), *_ = tables.provenance()["kept"].items()
+    monkeypatch.setitem(tables.TABLES, "both", lambda: tables.pd.DataFrame({"a": [1], "b": [2.5]}))
+    page, path = ROOT / "README.md", f"results/reference/{name}"
+    text = tables.insert_tables(f'Text.\n\n[All]({path} "table both")\n', page)
+    date = f"recorded {row['date']} at commit {row['commit'][:12]}, not with the run of record"
+    # The table, and below it the link.
+    assert text == (f"Text.\n\n| a | b |\n| --- | --- |\n| 1 | 2.5 |\n\n*[All]({path}), {date}.*\n")
+    # A file of the run of record itself needs no date.
+    assert tables.recorded(tables.RECORD / "runtime.csv") == ""
+
+
+def test_sources_of_pages_have_no_marks_and_the_readme_is_short():
+    # Of comments, only the directives of the site are left.
+    for page in ("README.md", *(page for page in pages() if page.startswith("docs/"))):
+        assert not re.search(r"<!--(?!site\n)", read(page)), page
+    assert len(read("README.md").splitlines()) <= 120
 
 
 @pytest.mark.slow
@@ -74,8 +73,8 @@ def test_site_has_every_page_no_dead_link_and_needs_no_other_server(tmp_path):
         path = tmp_path / re.sub(r"README$", "index", page[:-3])
         text = path.with_suffix(".html").read_text(encoding="utf-8")
         assert not loaded.search(text), page
-        # Neither a mark of a number nor one of the reference of a module is left.
-        assert "&lt;!--" not in text and "<p>:::" not in text, page
+        # Neither the reference of a module nor a link in place of a table is left.
+        assert "&lt;!--" not in text and "<p>:::" not in text and 'title="table ' not in text, page
     for path in tmp_path.rglob("*.css"):
         assert not re.search(r"url\(\"?https?:|@import", path.read_text(encoding="utf-8")), path
 
@@ -102,3 +101,26 @@ def test_versions_agree():
     cited = yaml.safe_load(read("CITATION.cff"))
     assert cited["version"] == psfdae.__version__
     assert re.search(r"^## (\S+)", read("CHANGELOG.md"), re.M)[1] == psfdae.__version__
+
+
+def anchors(page):
+    """Anchors of the headings of a page, as GitHub makes them."""
+    # A comment in a code block is no heading.
+    text = re.sub(r"^```.*?^```", "", read(page), flags=re.M | re.S)
+    headings = re.findall(r"^#+ (.*)", text.lower(), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in headings}
+
+
+def test_pages_named_in_the_code_exist():
+    """Links of docstrings, comments and messages; the site checks the links of pages."""
+    links = set()
+    # Text files alone; the files of config/ are checked with its own page.
+    for name in ("src", "workflow", "profiles", "studies", "tests"):
+        for path in (ROOT / name).rglob("*"):
+            if path.suffix in {".py", ".smk", ".yaml", ".rst", ".md", ".sh"}:
+                text = path.read_text(encoding="utf-8")
+                links |= set(re.findall(r"\bdocs/(\w+\.(?:md|ipynb))(?:#([\w-]+))?", text))
+    assert len(links) > 10
+    for name, anchor in links:
+        assert (ROOT / "docs" / name).is_file(), name
+        assert not anchor or anchor in anchors(f"docs/{name}"), (name, anchor)

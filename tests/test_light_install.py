@@ -20,11 +20,7 @@ from workflow_runs import captured
 
 pytestmark = pytest.mark.slow
 
-PAGES = ("README", "docs/tutorial", "docs/train", "docs/predict")
-PAGES += ("docs/photometry", "docs/exposures", "docs/python")
-
-WITH_EXTRA = ("simulate", "fit")
-"""Commands of these pages that need the extra `paper`; another environment runs them."""
+PAGES = ("README", "docs/training", "docs/photometry", "docs/python")
 
 OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
 """First words of lines that install psfdae or build the reproduction."""
@@ -36,7 +32,7 @@ EXAMPLE = "psfdae example field --out image.fits --catalogue stars.csv"
 NOTEBOOK = ROOT / "docs/first_session.ipynb"
 
 PREPARATION = {
-    **dict.fromkeys(("README", "docs/exposures"), EXAMPLE),
+    "README": EXAMPLE,
     "docs/python": f"""{EXAMPLE}
 python - <<'END'
 import numpy as np
@@ -90,18 +86,16 @@ def script_of(page):
             lines += ["python - <<'END'", session, body, "END"]
         if language == "sh":
             lines += body.splitlines()
-    return "\n".join(filter(None, (shell_line(line, page) for line in lines)))
+    return "\n".join(filter(None, (shell_line(line) for line in lines)))
 
 
-def shell_line(line, page):
-    """A line of a script, made quick; one that needs an extra is run in this environment."""
+def shell_line(line):
+    """A line of a script, made quick."""
     words = shlex.split(line, comments=True) if re.match(r"[\w.]+ ", line) else []
     if not words or words[0] not in ("psfdae", *OTHER_PROGRAMS):
         return line
     if words[0] in OTHER_PROGRAMS:
         return ""
-    if words[1] in WITH_EXTRA:
-        return f"{shlex.quote(sys.executable)} -m {line}"
     small = SMALL.get(words[1], "")
     sparse = "cp image.fits sparse.fits\n" if "sparse.fits" in words[:4] else ""
     return f"{sparse}{line} {small}"

@@ -1,4 +1,4 @@
-"""The tutorial docs/own_telescope.md, from the telescope's file to restored stars."""
+"""The page docs/own_telescope.md, from the telescope's file to PSFs and its state."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ TINY = {
     "fit": ["train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]", *TRAINED],
     "bundle": TRAINED,
     "predict": ["--threads", "1", "--quiet"],
+    "wavefront": ["--quiet"],
 }
 """Words that make each command small."""
 

@@ -187,10 +187,10 @@ def test_what_cannot_be_used_ends_in_one_line_and_code_2(bad, monkeypatch, words
 
 
 def test_page_lists_all_flags_and_columns():
-    text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
+    text = " ".join((ROOT / "docs/photometry.md").read_text(encoding="utf-8").split())
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
-    other_pages = [ROOT / f"docs/{name}.md" for name in ("train", "photometry", "python")]
+    other_pages = [ROOT / f"docs/{name}.md" for name in ("training", "input", "python")]
     all_text = text + "".join(path.read_text(encoding="utf-8") for path in other_pages)
     for name in COLUMNS:
         assert f"`{name}`" in all_text, name
@@ -198,4 +198,4 @@ def test_page_lists_all_flags_and_columns():
         assert f"| `{extension}` |" in text
     assert f"by up to {stage.StarModel.margin_px} px" in text
     assert f"more than {100 * SCALE_TOLERANCE:g} %" in text
-    assert f"1/{SNR_TOLERANCE:g} of the least" in text
+    assert f"1/{SNR_TOLERANCE:g} of the minimum" in text

@@ -432,7 +432,7 @@ def test_python_lines_of_the_page_run(monkeypatch, capsys):
     angle = field_of(telescope, 7, rng)
     mean = build_terms(telescope, angle).mean
     counts, _ = imaged(telescope, angle, mean, np.zeros((7, 2)), 80.0, rng)
-    (lines,) = blocks(read("docs/wavefront.md"), "python")
+    (lines,) = blocks(read("docs/own_telescope.md"), "python")
     monkeypatch.chdir(config_dir().parent)
     exec(compile(lines, "page", "exec"), {"stamps": counts, "field_deg": angle})
     assert "z8.constant" in capsys.readouterr().out

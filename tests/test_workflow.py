@@ -83,9 +83,9 @@ def test_figures_show_stars_that_the_tables_measure(smoke):
             assert np.isclose(errors[:, None], rows.mse.to_numpy(), rtol=1e-5).any(axis=1).all()
 
 
-def test_the_data_card_describes_the_files(smoke):
-    """Arrays, their types, units and meanings; the card adds words in brackets."""
-    tables = re.split(r"^`(\w+)` \(", read("docs/data_card.md"), flags=re.M)[1:]
+def test_the_page_of_the_scenes_describes_their_files(smoke):
+    """Arrays, their types, units and meanings; the page adds words in brackets."""
+    tables = re.split(r"^`(\w+)` \(", read("docs/scenes.md"), flags=re.M)[1:]
     card = {
         (kind, name): (dtype, unit, about.partition(" (in scene")[0])
         for kind, text in zip(tables[::2], tables[1::2], strict=True)
@@ -96,7 +96,7 @@ def test_the_data_card_describes_the_files(smoke):
     described = {kind for kind, _ in card}
     arrays = set()
     for path in sorted((smoke / "results/data").rglob("*.h5")):
-        assert f"{path.parent.name}/{path.name}" in read("docs/data_card.md")
+        assert f"{path.parent.name}/{path.name}" in read("docs/scenes.md")
         with h5py.File(path) as file:
             kind = file.attrs["kind"]
             for name, array in file.items() if kind in described else ():

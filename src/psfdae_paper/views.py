@@ -62,7 +62,7 @@ def note(experiment: str, names: set[str]) -> str:
         # The workflow type hides pages that are for language models.
         query = urlencode({"viewStateShareKey": name, "workflowType": "machine_learning"})
         links.append(f"[{name}](#/experiments/{experiment}/runs?{query})")
-    return f"Runs of {', '.join(links)}; docs/compare.md says what the columns mean."
+    return f"Runs of {', '.join(links)}; docs/sweeps.md says what the columns mean."
 
 
 def _view(records: Sequence[TrackedRun], condition: str) -> str:

@@ -14,4 +14,4 @@ split, *words = sys.argv[1:]
 lattice = stars.star_grid
 # Each fifth is a residue of the lattice, so that moving it holds out the next one.
 stars.star_grid = lambda position: lattice(position) + np.array([int(split), 0])
-main(["from-stars", *words])
+main(["train", *words])

@@ -1,7 +1,7 @@
 #!/bin/sh
 # usage: run.sh IMAGE LIST.csv "SPLITS" [WORDS...]
 # All that compare.py needs, in the current folder; what is there stays. SPLITS are of 0 to 4, and
-# "0 1" for instance leaves the others to another process; WORDS go to psfdae from-stars. The
+# "0 1" for instance leaves the others to another process; WORDS go to psfdae train. The
 # variable SETTINGS, "psfex-0.5-2 epsf-1-0" for instance, leaves out other settings.
 set -eu
 

@@ -102,7 +102,7 @@ def _centroid(star):
 def places(
     image: Annotated[File, {"argument": True}, "FITS image of `field`."],
     truth: Annotated[File, "NPZ of `field`."],
-    selection: Annotated[File, "selection.csv of from-stars on image and list."],
+    selection: Annotated[File, "selection.csv of train on image and list."],
     bundle: Annotated[File, "Its model, of the method field."],
     out: Annotated[File, "CSV with the errors of each package."],
     packages: Annotated[
@@ -159,11 +159,11 @@ def places(
 @command("errors")
 def errors(
     truth: Annotated[File, {"argument": True}, "NPZ of `field`."],
-    selection: Annotated[File, "selection.csv of from-stars on a part of its list."],
+    selection: Annotated[File, "selection.csv of train on a part of its list."],
     bundle: Annotated[File, "Its model, of the method field."],
     out: Annotated[File, "CSV with the parts of the errors that are within the stated ones."],
 ) -> None:
-    """Do the stated errors hold, for stars that from-stars was not given?
+    """Do the stated errors hold, for stars that train was not given?
 
     They are drawn anew with noise of S/N 5 to 50. Of each star, a model knows where it stands.
     `flux` and `psf` are the parts of fluxes and pixels within the stated errors, with standard

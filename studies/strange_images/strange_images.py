@@ -2,7 +2,7 @@
 
     python strange_images.py TABLE FOLDER [KIND[:SEED] ...]      # without kinds: all
 
-Each kind is an image with known stars, made with numpy. `from-stars --method field` and
+Each kind is an image with known stars, made with numpy. `train --method field` and
 `photometry` run on it with default settings, and a row of TABLE compares the fluxes with the true
 ones. Rows of TABLE of the same kind and seed are replaced; FOLDER keeps images, models and what was
 printed.
@@ -516,7 +516,7 @@ def judged(kind: str, seed: int, case: Case, folder: Path) -> dict[str, object]:
         stars += ["--origin", "0"] if "x" in case.star_list.colnames else []
     row: dict[str, object] = {"kind": kind, "seed": seed}
     model = ["--method", "field", "--out", place / "model", "--overwrite"]
-    fit = run(["from-stars", image, *stars, *model])
+    fit = run(["train", image, *stars, *model])
     (place / "from_stars.txt").write_text(fit.text)
     row |= {"from_stars": fit.code, "cpu_s": fit.cpu_s, "refusal": fit.refusal[:200]}
     if fit.code:

@@ -31,7 +31,7 @@ def adapt_command(
     overwrite : bool
         Replace a file that exists.
     model : Path
-        Bundle of from-stars --method field, of another exposure.
+        Model of train --method field, of another exposure.
     out : Path
         Bundle of IMAGE, by custom NAME.psf.safetensors.
     """

@@ -48,7 +48,7 @@ def photometry_command(
     overwrite : bool
         Replace files that exist.
     model : Path
-        Bundle of from-stars --method field, .psf of PSFEx, or grid of STDPSF or STPSF.
+        Model of train --method field, .psf of PSFEx, or grid of STDPSF or STPSF.
     out : Path
         Table of the stars: .fits, .ecsv or .csv.
     """

@@ -71,7 +71,7 @@ def predict_command(
     fixed_positions : bool
         The star list's centres are exact; for models that measure centres (field).
     model : Path, optional
-        Model bundle, or folder of from-stars. [default: the shipped one]
+        Model bundle, or folder of train. [default: the shipped one]
     plot : Path, optional
         PNG with a map of the PSF over the field.
     overwrite : bool
@@ -136,7 +136,7 @@ def predict_command(
 def bundle_of_image(model: Path | None, name: str) -> Path | None:
     """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
 
-    `from-stars` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
+    `train` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
     one bundle in the subfolder NAME.
 
     Raises

@@ -28,7 +28,7 @@ def psf(
 ) -> None:
     """Write the PSFs of MODEL at places of the image.
 
-    MODEL is of from-stars --method field, a .psf of PSFEx, or a grid of STDPSF or STPSF.
+    MODEL is of train --method field, a .psf of PSFEx, or a grid of STDPSF or STPSF.
 
     Each image of the cube is a PSF of flux 1 with its centre in the middle, sampled at parts of
     a pixel. The header names the places, y before x, as the files of STScI's STPSF do; photutils

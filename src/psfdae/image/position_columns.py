@@ -122,7 +122,7 @@ def choose_positions(names: Sequence[str]) -> Positions:
     ColumnError
         If there are none, or those of several programs.
     """
-    # Tables of psfdae itself (predict, photometry, from-stars, detect) count from 0. They have
+    # Tables of psfdae itself (predict, photometry, train, detect) count from 0. They have
     # further columns of their own, and may have some of other programs.
     tables = ("shift_x shift_y", "x_error y_error flux_model", "snr verdict part", "flux_iso")
     for further_columns in tables:

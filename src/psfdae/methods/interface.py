@@ -3,7 +3,7 @@
 Each method is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its
 settings; files with other values are `config/<group>/default.yaml`. The list `methods` of
 `config/config.yaml` names the methods of the reproduction. Rules, tables, figures, sweeps, runs of
-MLflow, bundles and `from-stars` get all information from the classes: label and colour, inputs,
+MLflow, bundles and `train` get all information from the classes: label and colour, inputs,
 files of a fit, and form in a bundle.
 
 A method has at least `look`, `fit` and `predict`; the base class has defaults for the rest. A

@@ -337,7 +337,7 @@ def run_network(
         PSFs of about sum 1, neither clipped nor renormalised.
     """
     # Small batches, such as 64 images of 16 × 16 pixels with 16 channels: batches of a thousand,
-    # which do not fit into the cache, take up to twice the time (docs/benchmark.md).
+    # which do not fit into the cache, take up to twice the time (docs/results.md).
     batch = batch or max(1, 2**18 // (max(model.widths) * noisy.shape[-1] ** 2))
     model.eval()
     psf = np.empty(noisy.shape, dtype=np.float32)
