@@ -25,10 +25,11 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.stamps import cut_image
 from psfdae.photometry import crowded
+from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.photon_noise import measure_gain, with_measured_gain
 from psfdae.photometry.wings_fit import StarFluxes, draw_tents, wings_of
 from psfdae.psf.grid import PsfGrid
-from psfdae.psf.wings import Wings
+from psfdae.psf.wings import Wings, compute_prior_profile
 from psfdae.training.neighbours import draw_other_stars
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -170,6 +171,8 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, phot):
     [
         {"profile": [10**400] * len(RADIUS)},
         {"covariance": (-np.eye(len(RADIUS))).tolist()},
+        {"profile": [1.0] * len(RADIUS)},
+        {"outer_share": 0.0},
     ],
 )
 def test_damaged_wings_are_refused(sky, changed):
@@ -218,6 +221,36 @@ def test_the_light_of_wings_is_the_sum_over_pixels():
     total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in bands)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
+
+
+def test_wings_are_round_up_to_their_end():
+    wings = Wings(RADIUS, np.full(len(RADIUS), 1e-4), np.eye(len(RADIUS)), 1.0)
+    star = StarFluxes(np.array([[40.0, 40.0]]), np.ones(1), np.ones(1))
+    bands = draw_tents((81, 81), star, wings)
+    light = np.concatenate([np.tensordot(wings.profile, tented, 1) for _, tented in bands])
+    assert light[40, 64] > 0.0 == light[40, 66]
+    for mirrored in (light[::-1], light[:, ::-1], light.T):
+        assert mirrored == pytest.approx(light)
+
+
+def test_expected_wings_fall_as_the_fifth_power():
+    """So does a profile that has the outer share; the stamp lacks its light at 1.5 half sides."""
+    r = np.linspace(0.7 * RADIUS[0], RADIUS[0], 2001)
+    share = np.trapezoid(2.0 * np.pi * r * 2e-4 * (r / RADIUS[0]) ** -5, r)
+    expected, sigma = compute_prior_profile(RADIUS, share)
+    top = RADIUS[:-1] / RADIUS[0]
+    assert expected[1:] * top**-3 == pytest.approx(2e-4 * top**-5, rel=1e-4)
+    assert expected[0] == pytest.approx(2e-4 * 1.5**-5, rel=1e-4)
+    assert sigma[1:] == pytest.approx(np.hypot(1e-4, 1e-3 / (2.0 * np.pi * RADIUS[0] ** 2)))
+
+
+def test_the_part_of_the_flux_in_the_model_has_the_error_of_the_wings():
+    wings = Wings(RADIUS, np.full(len(RADIUS), 1e-3), 1e-12 * np.eye(len(RADIUS)), 0.03)
+    light, sigma = wings.light()
+    part, error = CrowdedPhotometry(*[None] * 4, wings, None).part_of_model()
+    assert part == pytest.approx(1.0 / (1.0 + light)) and light > 0.2
+    half_width = 0.5 * (1.0 / (1.0 + light - sigma) - 1.0 / (1.0 + light + sigma))
+    assert error == pytest.approx(half_width, rel=1e-3)
 
 
 def test_the_gain_is_seen_in_the_pixels_of_stars(sky):

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae.denoise.bundle import read_bundle
-from psfdae.image.camera import camera_values
+from psfdae.image.camera import camera_values, sky_sample
 from psfdae.image.detection import Sky
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
@@ -92,6 +92,23 @@ def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
     assert stars["FLUX_ISO"] == pytest.approx(np.full(3, 1e3 * 2 * np.pi * 1.5**2), rel=0.02)
     smooth, limit = replace(sky, flat=rng.normal(size=shape))._above(2.0)
     assert smooth.std() == pytest.approx(limit[0, 0] / 2.0, rel=0.05)
+
+
+def test_pixels_off_an_image_are_on_no_source():
+    row, column = np.indices((60, 80))
+    star = 500.0 * np.exp(-0.5 * ((column - 78) ** 2 + (row - 58) ** 2) / 1.5**2)
+    nothing = np.zeros(star.shape, bool)
+    sky = Sky(star, 0.0 * star, np.ones(star.shape), nothing, np.nan)
+    column, row = np.array([79, 80, 79, -1, 79, 5]), np.array([59, 59, 60, 59, -1, 5])
+    assert sky.covered(column, row, 2.0).tolist() == [True, *[False] * 5]
+
+
+def test_the_sky_is_sampled_evenly_over_the_rows(tmp_path):
+    """The median of a sky that rises by 1 count a row is the middle row's."""
+    rise = np.indices((640, 64))[0] + np.random.default_rng(2).normal(0.0, 2.0, (640, 64))
+    sample = sky_sample(find_image(write(tmp_path / "rise.fits", rise)))
+    assert sample.level == pytest.approx(319.5, abs=5.0)
+    assert sample.highest == pytest.approx(rise.max())
 
 
 def test_commands_need_no_list_and_no_card(field, tmp_path):

@@ -25,6 +25,12 @@ def pair(gaussian_stars):
     return gaussian_stars + rng.normal(size=gaussian_stars.shape) * 0.01, gaussian_stars
 
 
+@pytest.mark.parametrize("data_range", [0.0, -1.0])
+def test_ssim_needs_a_range_above_0(pair, data_range):
+    with pytest.raises(ValueError, match="must be positive"):
+        ssim(*pair, 1.0, data_range)
+
+
 def test_ssim_is_scikit_image_s_with_one_range_and_with_one_of_each_star(pair):
     noisy, clean = (a[:20].astype(np.float64) for a in pair)
     peak = clean.max(axis=(1, 2)) - clean.min(axis=(1, 2))

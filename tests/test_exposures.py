@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from astropy.table import Table
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import PredictionError, Stars, load_model
+from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.methods.field.search import fit_field
 from psfdae.methods.field.spline import deformations
@@ -20,6 +22,7 @@ from psfdae.report.validation import validate
 from psfdae.training.exposures import adapt_to_exposures, exposure
 from psfdae.training.from_image import collect_stars
 from psfdae.training.settings import from_words
+from psfdae.training.star_choice import require_one_camera
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP = 450, 100.0, 10
@@ -253,6 +256,14 @@ def test_several_images_that_belong_to_no_training_are_refused(sky, night, tmp_p
         ([rich, poor, "--detect", "--out", out], "--overwrite"),
     ):
         assert message in refused("train", "--out", tmp_path / "m", *words, *FEW_STARS)
+
+
+def test_a_cube_of_stamps_cannot_join_an_image():
+    image = SimpleNamespace(path="i.fits", shape=(9, 9))
+    cube = SimpleNamespace(path="c.fits", shape=None)
+    require_one_camera([cube])
+    with pytest.raises(ObservationError, match=r"c\.fits: a cube of stamps"):
+        require_one_camera([cube, image])
 
 
 def test_wings_of_several_images_are_one_profile():

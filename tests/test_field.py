@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import photutils
@@ -21,7 +22,7 @@ from psfdae.denoise.bundle import read_bundle, write_bundle
 from psfdae.methods.field import FieldMixture, select_fit_stars
 from psfdae.methods.field.nodes import node_step
 from psfdae.methods.field.posterior import log_node_prior
-from psfdae.methods.field.prior import PosteriorLimits
+from psfdae.methods.field.prior import FieldPrior, PosteriorLimits
 from psfdae.methods.field.search import fit_field
 from psfdae.methods.interface import TrainingSet
 from psfdae.psf.interface import PredictionError
@@ -519,6 +520,19 @@ def test_bad_pixels_are_left_out(image):
     clean, repaired = (model.predict(s, position=faint.position) for s in (faint.stamps, spoilt))
     assert np.median(np.abs(repaired.flux / clean.flux - 1)) < 0.03
     assert (repaired.flags & 1).all()
+
+
+def test_the_variance_of_residuals_is_a_mean_over_the_middle_of_the_stamp():
+    """Squares of modes and the rest of the variance: 2² + 1 in the middle 4 × 4 px of 8 × 8."""
+    middle = np.pad(np.ones((4, 4)), 2).ravel()
+
+    class FixedResiduals(FieldPrior):
+        def residuals_at(self, centre):
+            return 0.0 * middle, np.stack([2.0 * middle, 0.0 * middle]), middle
+
+    model = SimpleNamespace(method=object.__new__(FixedResiduals), stamp_px=8)
+    for side_px, expected in ((4, 5.0), (8, 5.0 / 4.0), (12, 5.0 / 4.0), (2, 5.0)):
+        assert StarModel.residual_variance(model, side_px) == pytest.approx(expected)
 
 
 @pytest.fixture(scope="module")

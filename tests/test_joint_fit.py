@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 
-from psfdae.photometry.joint_fit import chains, fit_stars, standard_errors
+from psfdae.photometry.joint_fit import _normal_matrix, chains, fit_stars, standard_errors
 from psfdae.psf.grid import PsfGrid
+from psfdae.stars.bright_stars import magnitude
 
 SIGMA_PX, FWHM_PX, BOX_PX = 1.2, 2.83, 7
 
@@ -30,6 +33,22 @@ def image_of(psfs, place, flux, size=120):
     for (x, y), light in zip(corner + side, flux[:, None, None] * stamp, strict=True):
         image[y : y + side, x : x + side] += light
     return image[side:-side, side:-side]
+
+
+def test_psfs_change_with_the_magnitude_as_a_parabola(psfs):
+    """The ends hold beyond the three magnitudes, and the middle one without a flux."""
+    layer = np.array([-1.0, 0.0, 1.0])
+    light = 1.0 + 0.2 * layer - 0.1 * layer**2
+    grid = replace(
+        psfs,
+        psfs=light[:, None, None, None, None] * psfs.psfs,
+        magnitudes=magnitude(np.array(1e4)) + 2.0 * layer,
+    )
+    place, corner = np.full((4, 2), 30.2), np.full((4, 2), 27)
+    flux = np.append(1e4 * 10.0 ** (-0.8 * np.array([-2.0, 0.4, 2.0])), np.nan)
+    ratio = grid.stamps(place, corner, 7, flux)[:, 0] / psfs.stamps(place, corner, 7)[:, 0]
+    expected = np.array([0.7, 1.064, 1.1, 1.0])[:, None, None]
+    assert ratio == pytest.approx(expected * np.ones((4, 7, 7)), rel=1e-6)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-18])
@@ -92,6 +111,14 @@ def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
     start, origin = place - [1.5, 0.0], place - [3.0, 0.0]
     fit = fit_stars(psfs, image, *weight_and_mask, start, None, BOX_PX, 2.0, origin)
     assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
+
+
+def test_the_normal_matrix_has_1_on_its_diagonal_whatever_the_prior():
+    rng, prior = np.random.default_rng(2), np.array([0.0, 3.0, 50.0])
+    design, boxes = rng.normal(size=(2, 3, 4, 4)), np.arange(32).reshape(2, 4, 4)
+    matrix, unit = _normal_matrix(design, boxes, prior)
+    assert matrix.diagonal() == pytest.approx(np.ones(6), rel=2e-6)
+    assert unit**2 == pytest.approx(np.square(design).sum(axis=(2, 3)) + prior)
 
 
 def test_chains_of_neighbours():

@@ -25,7 +25,7 @@ PAGES = ("README", "docs/training", "docs/photometry", "docs/python")
 OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
 """First words of lines that install psfdae or build the reproduction."""
 
-SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
+SMALL = {"example": "--side=700 --bright=60 --faint=80"}
 """Options that make a command quick."""
 
 EXAMPLE = "psfdae example field --out image.fits --catalogue stars.csv"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,8 +20,11 @@ from psfdae.optics.wavefronts import zernike_images
 from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson_information
+from psfdae.sensing.joint import twin_numbers
+from psfdae.sensing.plot import bright_separate_stars
+from psfdae.sensing.results import build_stamps
 from psfdae.sensing.sampling import Chains, sample_around
-from psfdae.sensing.stars import SensingError, StarOptics
+from psfdae.sensing.stars import Photons, SensingError, StarOptics
 from psfdae.telescope.field import build_terms, model_telescope
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
@@ -320,6 +324,8 @@ def test_bad_stars_stop_nobody_and_are_kept_as_rows():
     assert wavefronts.explained[[0, 2]].all() and not wavefronts.explained[[1, 5]].any()
     assert wavefronts.chi2[-1] > 3.0
     assert np.isnan(wavefronts.psf()[1]).all() and np.isfinite(wavefronts.draws).all()
+    # Values of smaller pixels are those of a whole pixel.
+    assert wavefronts.psf(2)[0].mean() == pytest.approx(wavefronts.psf()[0].mean(), rel=0.02)
     assert np.isnan(wavefronts.table["z4"][wavefronts.table["id"] == 1]).all()
     with pytest.raises(SensingError, match="no star has enough"):
         sensed(counts[1:2], telescope, angle[1:2])
@@ -436,3 +442,39 @@ def test_python_lines_of_the_page_run(monkeypatch, capsys):
     monkeypatch.chdir(config_dir().parent)
     exec(compile(lines, "page", "exec"), {"stamps": counts, "field_deg": angle})
     assert "z8.constant" in capsys.readouterr().out
+
+
+def test_the_twin_of_a_telescope_has_its_even_coefficients_negated():
+    """Each number is a coefficient, twice as large in the second star."""
+    slopes = np.eye(3) * np.array([1.0, 2.0])[:, None, None]
+    posterior = SimpleNamespace(
+        search=SimpleNamespace(
+            optics=SimpleNamespace(terms=SimpleNamespace(is_even=np.array([True, False, True])))
+        ),
+        coefficients=lambda t: np.einsum("nqk,q->nk", slopes, t),
+        slopes=lambda t: slopes,
+    )
+    twin = twin_numbers(posterior, np.array([0.5, -1.0, 0.2]))
+    assert twin == pytest.approx([-0.5, -1.0, -0.2])
+
+
+def test_bad_pixels_are_not_in_the_noise_of_the_sky():
+    counts = np.random.default_rng(1).normal(SKY, 5.0, (3, 16, 16))
+    counts[0, :, 9:] = np.nan
+    photons = Photons.from_stamps(build_stamps(counts, None, None))
+    assert photons.sky_noise == pytest.approx(np.full(3, 5.0), rel=0.4)
+    assert photons.sky_level == pytest.approx(np.full(3, SKY), abs=5.0)
+    assert photons.pixels.tolist() == [16 * 9, 256, 256]
+
+
+def test_the_map_shows_the_brightest_star_of_each_cell():
+    """Stars without wavefront, or whose wavefront does not explain them, are left out."""
+    wavefronts = SimpleNamespace(
+        star=np.array([0, 1, 2, 4]),
+        explained=np.array([True, True, True, True, False]),
+        snr=np.array([10.0, 30.0, 5.0, 90.0, 80.0]),
+        field_deg=np.array([[0.0, 0.0], [0.05, 0.0], [0.15, 0.0], [0.4, 0.0], [0.6, 0.0]]),
+    )
+    assert bright_separate_stars(wavefronts, 0.1).tolist() == [1, 2]
+    assert bright_separate_stars(wavefronts, 0.04).tolist() == [1, 0, 2]
+    assert bright_separate_stars(wavefronts, 0.0).tolist() == [1]

@@ -9,11 +9,12 @@ from astropy.table import Table
 
 import psfdae
 from command_line import printed
+from psfdae.denoise.error_model import ModelErrors
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.errors import excess_scatter
-from psfdae.photometry.crowded import photometry, star_flags
+from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
 from psfdae.training.calibration import fit_model_errors
 from psfdae.training.fitting import described, fit_method
 from psfdae.training.packing import add_wings, build_uncalibrated
@@ -170,6 +171,33 @@ def test_flags_of_photometry():
     stars["photutils_flags"][:2] = [32, 8]
     flags = star_flags(stars, bad, saturated, 5, 3.0)
     assert flags[:2].tolist() == [of.OFF_CENTRE, of.TRUNCATED | of.POOR_FIT]
+
+
+def test_a_star_whose_box_ends_at_the_edge_is_not_truncated():
+    """An image of 30 columns and 20 rows, boxes of 5 px."""
+    x = np.array([2.0, 15.0, 27.0, 15.0, 1.0, 15.0, 28.0, 15.0])
+    y = np.array([10.0, 2.0, 10.0, 17.0, 10.0, 1.0, 10.0, 18.0])
+    stars = Table({"x": x, "y": y, "flux": np.full(8, 9.0), "flux_error": np.ones(8)})
+    stars["chi2"], stars["photutils_flags"] = np.ones(8), np.zeros(8, int)
+    flags = star_flags(stars, *np.zeros((2, 20, 30), bool), 5, 0.5)
+    assert flags.tolist() == [0] * 4 + [psfdae.StarFlag.TRUNCATED] * 4
+
+
+def test_the_doubt_by_the_psf_is_from_stars_within_the_reach_of_their_stamps():
+    """1.5 % of a neighbour's light, spread over its stamp, on the noise-equivalent area."""
+    place = np.array([[10.0, 10.0], [21.0, 10.0], [34.0, 10.0], [80.0, 10.0], [82.0, 10.0]])
+    flux = np.array([100.0, 200.0, 400.0, 300.0, -50.0])
+    doubt = _psf_doubt(place, flux, 16, 8.0)
+    share = 0.015 * 8.0 / 16**2
+    assert doubt == pytest.approx(share * np.array([200.0, 100.0, 0.0, 0.0, 0.0]))
+
+
+def test_errors_of_fluxes_grow_from_the_middle_of_the_field():
+    """v = a + b u² + c w² + d u² w², and the mean over the field where a position is not known."""
+    errors = ModelErrors(middle=np.array([100.0, 50.0]), growth=np.array([0.5, 2e-3, 3e-3, 1e-5]))
+    place = np.array([[100.0, 50.0], [110.0, 50.0], [100.0, 30.0], [90.0, 70.0], [np.nan, 50.0]])
+    variance = [0.5, 0.5 + 0.2, 0.5 + 1.2, 0.5 + 0.2 + 1.2 + 0.4, 1.0]
+    assert errors.flux_factor(place) == pytest.approx(np.sqrt(variance))
 
 
 def test_the_scatter_beyond_errors_is_found_and_0_where_there_is_none():
