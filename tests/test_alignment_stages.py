@@ -125,7 +125,7 @@ def test_same_configuration_gives_the_same_bytes(results, tmp_path):
             ["config", "dataset=alignment", "telescope=example_zernike"],
             "zernike: brings its own",
         ),
-        (["config", "dataset=alignment", "prescription=newtonian"], "secondary: missing"),
+        (["config", "dataset=alignment", "~prescription.secondary"], "behind a secondary"),
         (["alignment", "model", "--out=x.h5", "alignment.field_radius_deg=0.8"], "field (0.8, 0)°"),
         (["alignment", "train-network", "--kind=dae_retrained", *TRAINING], "--dae"),
     ],

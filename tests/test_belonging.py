@@ -41,7 +41,7 @@ def at(tmp_path_factory):
     for name, overrides in (("", ()), ("2", ("telescope.pixel_scale_arcsec=0.15",))):
         done("templates", "--out", at / f"t{name}.h5", *SIZES, *overrides)
         stars = ("stars", "--templates", at / f"t{name}.h5", "--out", at / f"s{name}.h5")
-        done(*stars, "stars=seidel_10pct", *SIZES, *overrides)
+        done(*stars, "dataset=dataset3", *SIZES, *overrides)
     done("stars", "--templates", at / "t.h5", "--out", at / "fresh.h5", *SIZES, "stars.name=fresh")
     done("fit", "pca_som", "--stars", at / "s.h5", "--out", at / "pca_som.h5", *SIZES)
     done("fit", "dae", "--stars", at / "s.h5", "--out", at / "dae", *SIZES)
@@ -59,7 +59,7 @@ def evaluate(at, stars="s.h5", dae="dae"):
     [
         ("telescope.pixel_scale_arcsec=0.2", "telescope.pixel_scale_arcsec", (0.1, 0.2)),
         ("wavefront.coma=5.0", "wavefront.coma", (4.0, 5.0)),
-        ("stars=turbulence", "scene.name", ("seidel", "turbulence")),
+        ("dataset=dataset7", "scene.name", ("seidel", "turbulence")),
     ],
 )
 def test_stars_need_templates_of_their_own_scene(at, override, key, values):
@@ -105,7 +105,7 @@ def test_a_bundle_holds_the_very_stars_of_the_training(at):
 def test_bounds_need_stars_of_the_scene_of_their_templates(at):
     inputs = ("--dataset", "d", "--stars", at / "s.h5", "--templates", at / "t.h5")
     out = ("--growth", at / "g.csv", "--per-star", at / "p.parquet", "--out", at / "out.csv")
-    key, override = "stars.aberration_fraction", "stars=seidel_50pct"
+    key, override = "stars.aberration_fraction", "dataset=dataset5"
     differs(
         at, "bounds", *inputs, *out, *SIZES, override, file=at / "s.h5", key=key, values=(0.1, 0.5)
     )

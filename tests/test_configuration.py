@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 
@@ -10,13 +11,13 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.base.settings import ConfigError, as_overrides, dump_deciding
+from psfdae.base.settings import ConfigError, as_overrides, dump_deciding, leaves
 from psfdae.methods import list_groups
-from psfdae.methods.networks.settings import DaeSettings, Train
 from psfdae.methods.networks.training import fingerprint
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, simulation_changes
+from psfdae_paper.workflow.datasets import stars_choice
 from workflow_runs import captured
 
 DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {"alignment"})
@@ -43,7 +44,7 @@ def settings_of(dataset):
 def test_a_dataset_with_another_simulation_than_its_stars_is_named(override, key):
     """Datasets share the stars of a file: a change in a dataset alone would have no effect."""
     changes = simulation_changes(
-        compose.compose(("dataset=dataset3", override)), compose.compose(("stars=seidel_10pct",))
+        compose.compose(("dataset=dataset3", override)), compose.compose(("dataset=dataset1",))
     )
     assert key in [name for name, *_ in changes]
     assert all(name.startswith(key.split(".")[0]) for name, *_ in changes)
@@ -52,26 +53,69 @@ def test_a_dataset_with_another_simulation_than_its_stars_is_named(override, key
 @pytest.mark.parametrize("dataset", sorted({*DATASETS} - {"from_stars"}))
 def test_datasets_have_the_simulation_of_their_stars(dataset):
     tree = compose.compose((f"dataset={dataset}",))
-    if tree["scene"]["name"] != "telescope":  # a telescope's stars are those of one dataset
-        assert not simulation_changes(tree, compose.compose((f"stars={tree['stars']['name']}",)))
+    first = compose.compose((stars_choice(tree["stars"]["name"]),))
+    assert not simulation_changes(tree, first)
 
 
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_every_dataset_composes_as_its_file(dataset):
     config = settings_of(dataset)
     assert config.dataset.name == dataset
-    if dataset != "from_stars":  # its stars are of an image
-        assert (config_dir() / f"noise/{config.noise.name}.yaml").is_file()
-        assert (config_dir() / f"stars/{config.stars.name}.yaml").is_file()
 
 
-def test_files_name_every_key_of_the_network_and_its_training():
-    """Who opens the folder to change a value finds the key, and the value that is used."""
-    for name, group in (("dae/width16", DaeSettings), ("train/onecycle", Train)):
-        tree = yaml.safe_load((config_dir() / f"{name}.yaml").read_text(encoding="utf-8"))
-        assert tree.keys() == group.model_fields.keys()
-        differing = {key for key, value in tree.items() if value != group.model_fields[key].default}
-        assert differing == ({"epochs", "crop_epochs"} if group is Train else set())
+def files_of_a_dataset(dataset):
+    """The files that a dataset is composed of, weakest first, and the text of each."""
+    own = config_dir() / f"dataset/{dataset}.yaml"
+    defaults = yaml.safe_load(own.read_text(encoding="utf-8"))["defaults"]
+    groups = [entry for entry in defaults if isinstance(entry, dict)]
+    named = [
+        config_dir() / f"{k.strip('/')}/{v}.yaml" for group in groups for k, v in group.items()
+    ]
+    return [config_dir() / "config.yaml", *named, own]
+
+
+@pytest.mark.parametrize("dataset", [*DATASETS, "alignment", "_telescope"])
+def test_the_value_of_a_key_is_in_the_dataset_s_file_one_that_it_names_or_the_root(dataset):
+    """Whoever looks for a value opens two files, and finds the key with the value that is used."""
+    written = {}
+    for path in files_of_a_dataset(dataset):
+        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        tree.pop("defaults", None)
+        written |= dict(leaves({"telescope": tree} if path.parent.name == "telescope" else tree))
+    composed = dict(leaves(compose.compose((f"dataset={dataset}",))))
+    # Groups that scene 3 does not read have the defaults of their classes.
+    unread = ("framing", "parts", "dataset") if dataset == "alignment" else ()
+    missing = [k for k in composed.keys() - written.keys() if k.partition(".")[0] not in unread]
+    assert not missing
+    for key, value in written.items():
+        if not str(value).startswith("${"):
+            assert composed[key] == value or composed[key] == float(value), key
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        path.relative_to(config_dir()).as_posix()
+        for path in sorted(config_dir().rglob("*.yaml"))
+        if path.parent.name not in ("preset", "sweep")
+    ],
+)
+def test_every_key_has_a_comment(path):
+    """On its line, above it, or above the group of numbers that it is one of."""
+    lines = (config_dir() / path).read_text(encoding="utf-8").splitlines()
+    bare = [
+        line
+        for before, line in zip(["", *lines], lines, strict=False)
+        if re.match(r" *\w+: *[^ #]", line)
+        and "#" not in line
+        and not before.lstrip().startswith("#")
+    ]
+    assert not bare
+
+
+def test_the_folder_has_few_files_and_a_short_page():
+    assert len([*config_dir().rglob("*.yaml")]) <= 40
+    assert len((config_dir() / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
 
 def test_settings_of_the_paper():
@@ -97,7 +141,7 @@ def test_settings_of_the_paper():
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
         ("train.lrr=1", r"^train\.lrr: unknown key; did you mean train\.lr\?$"),
         ("snr_min=20", r"^snr_min: unknown key; did you mean calibration_stars\.snr_min\?$"),
-        ("dae=width17", "^dae=width17: no such option; .*width32.*; did you mean width16"),
+        ("preset=fsat", "^preset=fsat: no such option; .*smoke.*; did you mean fast"),
         ("trian=onecycle", r"^trian: unknown key; did you mean train\?$"),
         ("train.lr", "^train.lr: expected key=value"),
         ("trian.lr=0.1", r"trian\.lr"),
@@ -163,8 +207,8 @@ def test_overrides_reach_the_datasets_that_know_them():
     ):
         dataset_overrides = compose.overrides_for(overrides, [f"dataset={dataset}"])
         assert dataset_overrides == (scene_override, *common)
-    # What chooses another wavefront decides which keys there are.
-    overrides = ["wavefront=seidel", "wavefront.coma=3"]
+    # Another telescope decides which keys there are.
+    overrides = ["telescope=example_zernike", "telescope.aberrations.jitter_waves=0.1"]
     assert compose.overrides_for(overrides, ["dataset=dataset8"]) == tuple(overrides)
 
 

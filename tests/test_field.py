@@ -19,6 +19,7 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae import load_model
 from psfdae.denoise.bundle import read_bundle, write_bundle
+from psfdae.denoise.star_model import StarModel
 from psfdae.methods.field import FieldMixture, select_fit_stars
 from psfdae.methods.field.nodes import node_step
 from psfdae.methods.field.posterior import log_node_prior

@@ -152,4 +152,4 @@ def test_words_and_files_of_the_configuration_mean_the_same():
     assert make_settings(load_stage(groups, (DATASET_CHOICE,))) == from_words()
     word = "calibration_stars.snr_levels=[5,10]"
     assert from_words([word]).calibration_stars.snr_levels == [5.0, 10.0]
-    assert from_words([word, "train=onecycle"]).calibration_stars.snr_levels == [5.0, 10.0]
+    assert from_words([word, "preset=fast"]).calibration_stars.snr_levels == [5.0, 10.0]

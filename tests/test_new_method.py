@@ -77,8 +77,8 @@ rule count_fields:
     output:
         f"{RESULTS}/fields.txt",
     params:
-        config=lambda w: settings("count-fields", "dataset=dataset3"),
-        source=source_hash("count-fields"),
+        config=lambda w: settings(RUN, "count-fields", "dataset=dataset3"),
+        source=code_of("count-fields"),
     shell:
         "psfdae count-fields --config {params.config} --out {output}"
 """
@@ -187,13 +187,11 @@ def test_a_dataset_is_one(tree, tmp_path):
     assert {"templates", "stars", "train", "evaluate", "track"} <= set(jobs)
 
 
-def test_a_dataset_with_stars_of_its_own_is_two(tree, tmp_path):
-    """A file of stars serves several datasets, so that none changes it for itself."""
+def test_stars_of_its_own_have_a_name_of_their_own(tree, tmp_path):
+    """Datasets share the stars of a name, so that none changes them for itself."""
     path, text = tree / "config/dataset/other.yaml", DATASET.replace("mine", "other")
     path.write_text(f"{text}stars: {{aberration_fraction: 0.25}}\n")
     refusal = snakemake(tmp_path, "--dry-run", "other", root=tree, check=False)
     assert "psfdae: dataset=other: stars.aberration_fraction = 0.25, but its stars" in refusal
-    stars = "defaults: [seidel_10pct, _self_]\nname: own\naberration_fraction: 0.25\n"
-    (tree / "config/stars/own.yaml").write_text(stars)
-    path.write_text(text.replace("  - dataset3\n", "  - dataset3\n  - override /stars: own\n"))
+    path.write_text(f"{text}stars: {{name: own, aberration_fraction: 0.25}}\n")
     assert planned(tmp_path, "other", root=tree)["stars"] == 1

@@ -11,7 +11,7 @@ from psfdae_paper.source import source_hash
 
 METHODS = ("dae", "gmm", "lmmse", "pca_som")
 PLACES = {"pca_som": "psfdae_paper.methods.pca_som"}
-ALIGNERS = ("alignment train-network", "alignment train-dae")
+ESTIMATORS = ("alignment train-network", "alignment train-dae")
 TABLE = "psfdae_paper/evaluation/paper/tables_psf.csv"
 
 
@@ -19,7 +19,7 @@ def hashes():
     """Hashes of what takes long (stars, fits, trainings of scene 3) and of the tables."""
     source.module_digest.cache_clear()
     fits = {name: PLACES.get(name, f"psfdae.methods.{name}") for name in METHODS}
-    commands = ("stars", "alignment states", *ALIGNERS, "paper-tables")
+    commands = ("stars", "alignment states", *ESTIMATORS, "paper-tables")
     return {name: source_hash("fit", module) for name, module in fits.items()} | {
         name: source_hash(name) for name in commands
     }
@@ -75,11 +75,11 @@ def test_comments_docstrings_and_formatting_change_no_hash(changed):
     ("path", "repeated"),
     [
         ("psfdae/methods/gmm.py", {"gmm"}),
-        ("psfdae/methods/networks/dae.py", {"dae", *ALIGNERS}),
+        ("psfdae/methods/networks/dae.py", {"dae", *ESTIMATORS}),
         ("psfdae_paper/methods/pca_som.py", {"pca_som"}),
         ("psfdae_paper/stars/scenes.py", {"stars"}),
-        ("psfdae/stars/noise.py", {*METHODS, *ALIGNERS, "paper-tables"}),
-        ("psfdae/optics/propagation.py", {"stars", "alignment states", *ALIGNERS}),
+        ("psfdae/stars/noise.py", {*METHODS, *ESTIMATORS, "paper-tables"}),
+        ("psfdae/optics/propagation.py", {"stars", "alignment states", *ESTIMATORS}),
         (TABLE, {"paper-tables"}),
     ],
 )

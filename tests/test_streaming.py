@@ -90,7 +90,7 @@ def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, mon
 
 def test_search_is_exact_for_large_pixels():
     """Scene 2's pixel is 1.6 λ/D wide: point samples would shift its brightest pixels."""
-    config = load_stage(STATIC, ["scene=turbulence", "optics.threads=1"])
+    config = load_stage(STATIC, ["dataset=dataset7", "optics.threads=1"])
     source = template_wavefronts(config)
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.
     source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]
@@ -145,7 +145,9 @@ def test_number_of_cpus_does_not_change_a_product(tmp_path):
     """Two threads of linear algebra, as configured, on two CPUs and on one."""
     sizes = ["grid.points=3", "stars.count=48", "optics.threads=2"]
     templates = tmp_path / "templates.h5"
-    assert psfdae("paper", "templates", "--out", templates, "scene=seidel", *sizes).exit_code == 0
+    assert (
+        psfdae("paper", "templates", "--out", templates, "dataset=dataset3", *sizes).exit_code == 0
+    )
     products = []
     for cpus, threads in (("0,1", "2"), ("0", "1")):
         out = tmp_path / f"{threads}.h5"

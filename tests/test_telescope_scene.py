@@ -130,10 +130,11 @@ def test_ray_traced_stamps_are_those_of_scene_3(traced):
 
 def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     small = ["grid.points=3", "stars.count=24", "stars.name=seidel_10pct"]
-    words = [OWN_TELESCOPE, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
-    words += ["framing=stamp16", "stars.search_px=24"]
+    words = [OWN_TELESCOPE, "telescope=example_seidel", "grid.spacing_deg=1.1"]
+    words += ["optics.pupil_samples=[158,222,254,318,398]", "framing.subpixel=false"]
+    words += ["framing.search_px=24", "stars.search_px=24"]
     products = []
-    for name, choice in (("paper", ["stars=seidel_10pct"]), ("telescope", words)):
+    for name, choice in (("paper", ["dataset=dataset3"]), ("telescope", words)):
         fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
         stars.templates(load_stage(STATIC, [*choice, *small]), fields)
         stars.stars(load_stage(SIMULATION, [*choice, *small]), fields, out)

@@ -50,7 +50,7 @@ LISTED = "image.fits --catalogue stars.csv --origin 0"
         ("config dataset=datset3", "did you mean dataset3?"),
         ("config datset=dataset3", "did you mean dataset?"),
         ("config preset=fsat", "did you mean fast?"),
-        ("config dae=width17", "did you mean width16?"),
+        ("config telescope=wfsta", "did you mean wfsat?"),
         ("config train.lrr=1", "did you mean train.lr?"),
         ("config -m train.lr=1e-3,2e-3", "snakemake sweep --config sweep=NAME"),
         ("config --multirun", "snakemake sweep --config sweep=NAME"),

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from psfdae.commands.cli import command_modules
+from psfdae.commands.cli import command_modules, full_name
 
 SOURCES = Path(__file__).resolve().parents[1]
 """Folder of the packages."""
@@ -48,13 +48,13 @@ def source_hash(*names: str) -> str:
     """
     # A command is hashed by the module of its function.
     commands = command_modules()
-    queue = [commands[name][0] if name in commands else name for name in names]
+    queue = [commands.get(full_name(name), (name,))[0] for name in names]
     # Breadth-first search of the imports; the list grows while it is processed.
     digests = dict.fromkeys(queue)
     for name in queue:
-        digests[name], modules = module_digest(name)
-        queue += [module for module in modules if module not in digests]
-        digests |= {module: digests.get(module) for module in modules}
+        digests[name], imports = module_digest(name)
+        queue += [module for module in imports if module not in digests]
+        digests |= {module: digests.get(module) for module in imports}
     lines = "\n".join(f"{name} {digest}" for name, digest in sorted(digests.items()))
     return hashlib.sha256(lines.encode()).hexdigest()[:16]
 
@@ -74,7 +74,8 @@ def module_digest(name: str) -> tuple[str, list[str]]:
     # The syntax tree has neither comments nor formatting. Statements that are only a constant, such
     # as docstrings, are taken out.
     tree = ast.parse(path.read_bytes())
-    for node in ast.walk(tree):
+    nodes = [*ast.walk(tree)]
+    for node in nodes:
         if isinstance(body := getattr(node, "body", None), list):
             is_constant = [isinstance(getattr(s, "value", None), ast.Constant) for s in body]
             node.body = [  # type: ignore[attr-defined]
@@ -88,7 +89,7 @@ def module_digest(name: str) -> tuple[str, list[str]]:
     program_folder = path.parent if name.endswith(".py") else None
     # Code and tables together.
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    return digest, [*find_imports(tree, program_folder)]
+    return digest, [*find_imports(nodes, program_folder)]
 
 
 def _path(module: str) -> Path | None:
@@ -99,18 +100,29 @@ def _path(module: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def find_imports(tree: ast.Module, program_folder: Path | None) -> Iterator[str]:
-    """Yield the modules of the packages that a module imports, and files next to a program."""
+def find_imports(nodes: list[ast.AST], program_folder: Path | None) -> Iterator[str]:
+    """Yield the modules of the packages that a module imports, and files next to a program.
+
+    Parameters
+    ----------
+    nodes : list of ast.AST
+        All nodes of the module's syntax tree. A walk through the tree takes longer than all else
+        here, so that there is one for all questions.
+    program_folder : Path or None
+        Folder of a program, whose files it imports without a package.
+    """
     # Nodes below annotations of arguments and variables, return types and decorators: names that
     # only these use are taken not to decide a result.
-    ignored_nodes = set()
-    for node in ast.walk(tree):
-        parts = [getattr(node, name, None) for name in ("annotation", "returns")]
-        for part in [*parts, *getattr(node, "decorator_list", ())]:
-            ignored_nodes |= {id(child) for child in ast.walk(part)} if part else set()
-    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name))
-    used_names = {node.id for node in names if id(node) not in ignored_nodes}
-    for node in ast.walk(tree):
+    ignored_nodes: set[ast.AST] = set()
+    for node in nodes:
+        if isinstance(node, (ast.arg, ast.AnnAssign)) and node.annotation:
+            ignored_nodes.update(ast.walk(node.annotation))
+        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            parts = [getattr(node, "returns", None), *node.decorator_list]
+            ignored_nodes.update(child for part in parts if part for child in ast.walk(part))
+    names = (node for node in nodes if isinstance(node, ast.Name))
+    used_names = {node.id for node in names if node not in ignored_nodes}
+    for node in nodes:
         # `from a import b` imports the module a.b if there is one, else the module a.
         if isinstance(node, ast.Import):
             candidates = [[alias.name] for alias in node.names]

@@ -19,7 +19,7 @@ from psfdae.base.settings import Group
 from psfdae.commands.cli import program
 from psfdae.methods import list_groups, method
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import config_dir, load_file, part
+from psfdae_paper.configuration.compose import load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
 
@@ -28,7 +28,7 @@ Settings = dict[str, dict[PointName, list[str]]]
 
 
 class Points(Group):
-    """Methods that are timed, and settings other than those in use (`config/knee/points.yaml`).
+    """Methods that are timed, and settings other than those in use (`points.yaml`).
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Points(Group):
 
 def load_points():
     """Read and check the file; raises ConfigError."""
-    return load_file(Points, config_dir() / "knee" / "points.yaml")
+    return load_file(Points, Path(__file__).with_name("points.yaml"))
 
 
 def method_class(name):

@@ -1,14 +1,14 @@
 # Scene 3: states of misalignment, their stamps, the networks, estimates, fits and bounds.
 wildcard_constraints:
     states="grid|uniform|train",
-    test_set="|".join(ALIGNMENT_SETS),
-    network="|".join(trained_networks()),
+    test_set=any_of(alignment.TEST_SETS),
+    network=any_of(trained_networks()),
     level=r"[0-9.e-]+",
 
 
 rule alignment_model:
     output:
-        f"{ALIGNMENT_DATA}/model.h5",
+        f"{RESULTS}/data/alignment/model.h5",
     log:
         f"{RESULTS}/logs/alignment/model.log",
     benchmark:
@@ -16,8 +16,8 @@ rule alignment_model:
     # The longest chain of jobs of a whole run goes through these networks: it starts first.
     priority: 120
     params:
-        config=lambda w: settings("alignment model"),
-        source=source_hash("alignment model"),
+        config=lambda w: settings(RUN, "alignment model"),
+        source=code_of("alignment model"),
     message:
         "Fitting the wavefront of scene 3 to ray-traced states"
     shell:
@@ -29,20 +29,20 @@ rule alignment_states:
     input:
         model=lambda w: rules.alignment_model.output if w.states == "train" else [],
     output:
-        f"{ALIGNMENT_DATA}/{{states}}.h5",
+        f"{RESULTS}/data/alignment/{{states}}.h5",
     log:
         f"{RESULTS}/logs/alignment/{{states}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{states}}.tsv"
     priority: 120
-    threads: lambda w: alignment_config().optics.threads
+    threads: lambda w: alignment.alignment_config(RUN).optics.threads
     resources:
         mem_mb=1000,
     params:
         kind=lambda w: w.states,
-        config=lambda w: settings("alignment states"),
+        config=lambda w: settings(RUN, "alignment states"),
         inputs=as_options,
-        source=source_hash("alignment states"),
+        source=code_of("alignment states"),
     message:
         "Simulating the stamps of scene 3, set {wildcards.states}"
     shell:
@@ -53,8 +53,8 @@ rule alignment_states:
 rule alignment_telescope:
     input:
         model=rules.alignment_model.output,
-        grid=f"{ALIGNMENT_DATA}/grid.h5",
-        uniform=f"{ALIGNMENT_DATA}/uniform.h5",
+        grid=f"{RESULTS}/data/alignment/grid.h5",
+        uniform=f"{RESULTS}/data/alignment/uniform.h5",
     output:
         f"{RESULTS}/tables/alignment_telescope.csv",
     log:
@@ -62,9 +62,9 @@ rule alignment_telescope:
     benchmark:
         f"{RESULTS}/benchmarks/alignment/telescope.tsv"
     params:
-        config=lambda w: settings("alignment telescope"),
+        config=lambda w: settings(RUN, "alignment telescope"),
         inputs=as_options,
-        source=source_hash("alignment telescope"),
+        source=code_of("alignment telescope"),
     message:
         "Tabulating key figures of scene 3"
     shell:
@@ -74,23 +74,23 @@ rule alignment_telescope:
 
 rule alignment_dae:
     input:
-        grid=f"{ALIGNMENT_DATA}/grid.h5",
-        train=f"{ALIGNMENT_DATA}/train.h5",
+        grid=f"{RESULTS}/data/alignment/grid.h5",
+        train=f"{RESULTS}/data/alignment/train.h5",
     output:
-        **network_files("dae", "dae.safetensors"),
+        **alignment.network_files(RUN, "dae", "dae.safetensors"),
     log:
         f"{RESULTS}/logs/alignment/dae.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/dae.tsv"
     priority: 120
-    threads: lambda w: alignment_config().dae_train.threads
+    threads: lambda w: alignment.alignment_config(RUN).dae_train.threads
     resources:
         mem_mb=1500,
         runtime=60,
     params:
-        config=lambda w: settings("alignment train-dae"),
+        config=lambda w: settings(RUN, "alignment train-dae"),
         inputs=as_options,
-        source=source_hash("alignment train-dae"),
+        source=code_of("alignment train-dae"),
         folder=subpath(output.weights, parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
         checkpoint=f"{RESULTS}/checkpoints/alignment-dae.pt",
@@ -103,24 +103,23 @@ rule alignment_dae:
 
 rule alignment_network:
     input:
-        states=lambda w: f"{ALIGNMENT_DATA}/{ESTIMATORS[w.network].states}.h5",
-        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"]
-        * ESTIMATORS[w.network].denoised,
+        states=lambda w: alignment.training_states(RUN, w.network),
+        dae=lambda w: alignment.network_dae(RUN, w.network),
     output:
-        **network_files("{network}", "network.safetensors"),
+        **alignment.network_files(RUN, "{network}", "network.safetensors"),
     log:
         f"{RESULTS}/logs/alignment/{{network}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{network}}.tsv"
     priority: 120
-    threads: lambda w: getattr(alignment_config(), f"train_{w.network}").threads
+    threads: lambda w: getattr(alignment.alignment_config(RUN), f"train_{w.network}").threads
     resources:
         mem_mb=1600,
         runtime=60,
     params:
-        config=lambda w: settings("alignment train-network", kind=w.network),
+        config=lambda w: settings(RUN, "alignment train-network", kind=w.network),
         inputs=as_options,
-        source=source_hash("alignment train-network"),
+        source=code_of("alignment train-network"),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.network}.pt",
     message:
@@ -133,10 +132,10 @@ rule alignment_network:
 
 rule alignment_bound:
     input:
-        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        states=f"{RESULTS}/data/alignment/{{test_set}}.h5",
         model=rules.alignment_model.output,
     output:
-        f"{ALIGNMENT}/bounds/{{test_set}}.h5",
+        f"{RESULTS}/alignment/bounds/{{test_set}}.h5",
     log:
         f"{RESULTS}/logs/alignment/bound_{{test_set}}.log",
     benchmark:
@@ -145,9 +144,9 @@ rule alignment_bound:
         mem_mb=1500,
         runtime=20,
     params:
-        config=lambda w: settings("alignment bound"),
+        config=lambda w: settings(RUN, "alignment bound"),
         inputs=as_options,
-        source=source_hash("alignment bound"),
+        source=code_of("alignment bound"),
     message:
         "Bounding the errors of misalignments, set {wildcards.test_set}"
     shell:
@@ -158,26 +157,26 @@ rule alignment_bound:
 rule alignment_estimate:
     input:
         **{
-            network: f"{ALIGNMENT}/{network}/network.safetensors"
+            network: f"{RESULTS}/alignment/{network}/network.safetensors"
             for network in trained_networks()
         },
-        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        states=f"{RESULTS}/data/alignment/{{test_set}}.h5",
         dae=rules.alignment_dae.output.weights,
     output:
-        out=f"{ALIGNMENT}/estimates/{{test_set}}.h5",
-        times=f"{ALIGNMENT}/estimates/{{test_set}}_times.csv",
+        out=f"{RESULTS}/alignment/estimates/{{test_set}}.h5",
+        times=f"{RESULTS}/alignment/estimates/{{test_set}}_times.csv",
     log:
         f"{RESULTS}/logs/alignment/estimate_{{test_set}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/estimate_{{test_set}}.tsv"
-    threads: lambda w: alignment_config().evaluation.threads
+    threads: lambda w: alignment.alignment_config(RUN).evaluation.threads
     resources:
         mem_mb=1500,
         runtime=20,
     params:
-        config=lambda w: settings("alignment estimate"),
+        config=lambda w: settings(RUN, "alignment estimate"),
         inputs=as_options,
-        source=source_hash("alignment estimate"),
+        source=code_of("alignment estimate"),
     message:
         "Estimating misalignments with the networks, set {wildcards.test_set}"
     shell:
@@ -187,13 +186,13 @@ rule alignment_estimate:
 
 rule alignment_fit:
     input:
-        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
-        train=f"{ALIGNMENT_DATA}/train.h5",
+        states=f"{RESULTS}/data/alignment/{{test_set}}.h5",
+        train=f"{RESULTS}/data/alignment/train.h5",
         model=rules.alignment_model.output,
-        network=f"{ALIGNMENT}/{ESTIMATORS['max_likelihood'].network}/network.safetensors",
+        network=alignment.likelihood_network(RUN),
     output:
-        out=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}.h5",
-        times=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}_times.csv",
+        out=f"{RESULTS}/alignment/fits/{{test_set}}_{{level}}.h5",
+        times=f"{RESULTS}/alignment/fits/{{test_set}}_{{level}}_times.csv",
     log:
         f"{RESULTS}/logs/alignment/fit_{{test_set}}_{{level}}.log",
     benchmark:
@@ -202,9 +201,9 @@ rule alignment_fit:
         mem_mb=1500,
         runtime=20,
     params:
-        config=lambda w: settings("alignment fit"),
+        config=lambda w: settings(RUN, "alignment fit"),
         inputs=as_options,
-        source=source_hash("alignment fit"),
+        source=code_of("alignment fit"),
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"
     shell:

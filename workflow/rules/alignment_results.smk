@@ -3,10 +3,12 @@
 
 rule alignment_tables:
     input:
-        states=f"{ALIGNMENT_DATA}/uniform.h5",
-        estimates=expand(rules.alignment_estimate.output.out, test_set=ALIGNMENT_SETS),
-        fit=lambda w: fits_of(*ALIGNMENT_SETS),
-        bound=expand(rules.alignment_bound.output, test_set=ALIGNMENT_SETS),
+        states=f"{RESULTS}/data/alignment/uniform.h5",
+        estimates=expand(
+            rules.alignment_estimate.output.out, test_set=alignment.TEST_SETS
+        ),
+        fit=lambda w: alignment.fit_files(RUN, *alignment.TEST_SETS),
+        bound=expand(rules.alignment_bound.output, test_set=alignment.TEST_SETS),
     output:
         errors=f"{RESULTS}/tables/alignment_errors.csv",
         correlation=f"{RESULTS}/tables/alignment_correlation.csv",
@@ -16,7 +18,7 @@ rule alignment_tables:
         f"{RESULTS}/benchmarks/alignment/tables.tsv"
     params:
         inputs=as_options,
-        source=source_hash("alignment tables"),
+        source=code_of("alignment tables"),
     message:
         "Tabulating errors of misalignments"
     shell:
@@ -24,24 +26,21 @@ rule alignment_tables:
         " --correlation {output.correlation} > {log} 2>&1"
 
 
-ALIGNMENT_PAPER_TABLES = {
-    "0.002": "table of errors at λ = 0.002",
-    "0.005": "table of errors at λ = 0.005",
-    "correlation": "table of correlations",
-}
-
-
 rule alignment_paper_tables:
     input:
         errors=rules.alignment_tables.output.errors,
         correlation=rules.alignment_tables.output.correlation,
     output:
-        [f"{RESULTS}/tables/alignment_paper_{t}.md" for t in ALIGNMENT_PAPER_TABLES],
+        [f"{RESULTS}/tables/alignment_paper_{t}.md" for t in alignment.PAPER_TABLES],
         [
-            of_scene3(
-                f"tables/alignment_paper_{t}.csv", "tables", shown, "alignment_tables"
+            report(
+                f"{RESULTS}/tables/alignment_paper_{t}.csv",
+                caption="../report/alignment_tables.rst",
+                category=datasets.SCENE_HEADINGS["scene3"],
+                subcategory="tables",
+                labels={"figure": shown},
             )
-            for t, shown in ALIGNMENT_PAPER_TABLES.items()
+            for t, shown in alignment.PAPER_TABLES.items()
         ],
     log:
         f"{RESULTS}/logs/alignment/paper_tables.log",
@@ -51,7 +50,7 @@ rule alignment_paper_tables:
     params:
         inputs=as_options,
         folder=subpath(output[0], parent=True),
-        source=source_hash("alignment paper-tables"),
+        source=code_of("alignment paper-tables"),
     message:
         "Setting the paper's tables of scene 3 beside ours"
     shell:
@@ -62,11 +61,14 @@ rule alignment_paper_tables:
 rule alignment_time:
     input:
         times=lambda w: [
-            *expand(rules.alignment_estimate.output.times, test_set=ALIGNMENT_SETS),
-            *fits_of(*ALIGNMENT_SETS, what="times"),
+            *expand(
+                rules.alignment_estimate.output.times, test_set=alignment.TEST_SETS
+            ),
+            *alignment.fit_files(RUN, *alignment.TEST_SETS, ending="_times.csv"),
         ],
         histories=expand(
-            f"{ALIGNMENT}/{{name}}/history.csv", name=["dae", *trained_networks()]
+            f"{RESULTS}/alignment/{{name}}/history.csv",
+            name=["dae", *trained_networks()],
         ),
     output:
         f"{RESULTS}/tables/alignment_time.csv",
@@ -80,7 +82,7 @@ rule alignment_time:
         histories=lambda w, input: [
             f"--history={Path(path).parent.name}={path}" for path in input.histories
         ],
-        source=source_hash("alignment time-table"),
+        source=code_of("alignment time-table"),
     message:
         "Tabulating what the estimates of scene 3 cost"
     shell:
@@ -90,13 +92,15 @@ rule alignment_time:
 
 rule figure_alignment_predicted:
     input:
-        estimates=f"{ALIGNMENT}/estimates/uniform.h5",
-        fit=lambda w: fits_of("uniform"),
+        estimates=f"{RESULTS}/alignment/estimates/uniform.h5",
+        fit=lambda w: alignment.fit_files(RUN, "uniform"),
     output:
-        of_scene3(
-            "figures/alignment/predicted.png",
-            "estimates",
-            "estimates against the truth",
+        report(
+            f"{RESULTS}/figures/alignment/predicted.png",
+            caption="../report/figure_alignment_predicted.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="estimates",
+            labels={"figure": "estimates against the truth"},
         ),
     log:
         f"{RESULTS}/logs/alignment/figure_predicted.log",
@@ -104,7 +108,7 @@ rule figure_alignment_predicted:
         f"{RESULTS}/benchmarks/alignment/figure_predicted.tsv"
     params:
         inputs=as_options,
-        source=source_hash("alignment figure predicted"),
+        source=code_of("alignment figure predicted"),
     message:
         "Drawing estimates against the truth"
     shell:
@@ -113,12 +117,16 @@ rule figure_alignment_predicted:
 
 rule figure_alignment_errors:
     input:
-        estimates=f"{ALIGNMENT}/estimates/uniform.h5",
-        fit=lambda w: fits_of("uniform"),
-        bound=f"{ALIGNMENT}/bounds/uniform.h5",
+        estimates=f"{RESULTS}/alignment/estimates/uniform.h5",
+        fit=lambda w: alignment.fit_files(RUN, "uniform"),
+        bound=f"{RESULTS}/alignment/bounds/uniform.h5",
     output:
-        of_scene3(
-            "figures/alignment/errors.png", "estimates", "errors against misalignment"
+        report(
+            f"{RESULTS}/figures/alignment/errors.png",
+            caption="../report/figure_alignment_errors.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="estimates",
+            labels={"figure": "errors against misalignment"},
         ),
     log:
         f"{RESULTS}/logs/alignment/figure_errors.log",
@@ -126,7 +134,7 @@ rule figure_alignment_errors:
         f"{RESULTS}/benchmarks/alignment/figure_errors.tsv"
     params:
         inputs=as_options,
-        source=source_hash("alignment figure errors"),
+        source=code_of("alignment figure errors"),
     message:
         "Drawing errors against misalignment"
     shell:
@@ -137,8 +145,12 @@ rule figure_alignment_correlation:
     input:
         correlation=rules.alignment_tables.output.correlation,
     output:
-        of_scene3(
-            "figures/alignment/correlation.png", "estimates", "correlations of errors"
+        report(
+            f"{RESULTS}/figures/alignment/correlation.png",
+            caption="../report/figure_alignment_correlation.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="estimates",
+            labels={"figure": "correlations of errors"},
         ),
     log:
         f"{RESULTS}/logs/alignment/figure_correlation.log",
@@ -146,7 +158,7 @@ rule figure_alignment_correlation:
         f"{RESULTS}/benchmarks/alignment/figure_correlation.tsv"
     params:
         inputs=as_options,
-        source=source_hash("alignment figure correlation"),
+        source=code_of("alignment figure correlation"),
     message:
         "Drawing correlations of errors"
     shell:
@@ -155,25 +167,27 @@ rule figure_alignment_correlation:
 
 rule figure_alignment_stamps:
     input:
-        states=f"{ALIGNMENT_DATA}/uniform.h5",
+        states=f"{RESULTS}/data/alignment/uniform.h5",
         dae=rules.alignment_dae.output.weights,
     output:
-        of_scene3(
-            "figures/alignment/stamps.png",
-            "telescope and stamps",
-            "stamps before and after the DAE",
+        report(
+            f"{RESULTS}/figures/alignment/stamps.png",
+            caption="../report/figure_alignment_stamps.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="telescope and stamps",
+            labels={"figure": "stamps before and after the DAE"},
         ),
     log:
         f"{RESULTS}/logs/alignment/figure_stamps.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/figure_stamps.tsv"
-    threads: lambda w: alignment_config().evaluation.threads
+    threads: lambda w: alignment.alignment_config(RUN).evaluation.threads
     resources:
         mem_mb=1000,
     params:
-        config=lambda w: settings("alignment figure stamps"),
+        config=lambda w: settings(RUN, "alignment figure stamps"),
         inputs=as_options,
-        source=source_hash("alignment figure stamps"),
+        source=code_of("alignment figure stamps"),
     message:
         "Drawing stamps of scene 3"
     shell:
@@ -184,8 +198,12 @@ rule figure_alignment_stamps:
 rule figure_alignment_twin:
     output:
         table=f"{RESULTS}/tables/alignment_twin.csv",
-        out=of_scene3(
-            "figures/alignment/twin.png", "telescope and stamps", "twin ambiguity"
+        out=report(
+            f"{RESULTS}/figures/alignment/twin.png",
+            caption="../report/figure_alignment_twin.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="telescope and stamps",
+            labels={"figure": "twin ambiguity"},
         ),
     log:
         f"{RESULTS}/logs/alignment/figure_twin.log",
@@ -194,23 +212,10 @@ rule figure_alignment_twin:
     resources:
         mem_mb=1000,
     params:
-        config=lambda w: settings("alignment figure twin"),
-        source=source_hash("alignment figure twin"),
+        config=lambda w: settings(RUN, "alignment figure twin"),
+        source=code_of("alignment figure twin"),
     message:
         "Drawing the twin ambiguity"
     shell:
         "psfdae paper alignment figure twin --config {params.config} --table={output.table}"
         " --out={output.out} > {log} 2>&1"
-
-
-ALIGNMENT_PRODUCTS = [
-    *rules.alignment_telescope.output,
-    *rules.alignment_tables.output,
-    *rules.alignment_paper_tables.output,
-    *rules.alignment_time.output,
-    *rules.figure_alignment_stamps.output,
-    *rules.figure_alignment_predicted.output,
-    *rules.figure_alignment_errors.output,
-    *rules.figure_alignment_twin.output,
-    *rules.figure_alignment_correlation.output,
-]

@@ -1,11 +1,11 @@
-PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
-SCENES = options("scene")
-OPTICS = ["propagation", "convergence", "machine"]
-
-
 rule propagation:
     output:
-        multiext(PROPAGATION, *(f"{name}.csv" for name in OPTICS)),
+        multiext(
+            f"{RESULTS}/benchmark/propagation/{{scene}}/",
+            "propagation.csv",
+            "convergence.csv",
+            "machine.csv",
+        ),
     log:
         f"{RESULTS}/logs/propagation/{{scene}}.log",
     benchmark:
@@ -16,10 +16,12 @@ rule propagation:
         runtime=30,
     params:
         config=lambda w: settings(
-            "propagation.measure", f"dataset={strictest_dataset(w.scene)}"
+            RUN,
+            "propagation.measure",
+            f"dataset={timings.strictest_dataset(RUN, w.scene)}",
         ),
-        source=lambda w: source_hash("workflow/benchmarks/propagation.py"),
-        program=program("propagation.measure"),
+        source=code_of("workflow/benchmarks/propagation.py"),
+        program=program_of("propagation.measure"),
         folder=subpath(output[0], parent=True),
     message:
         "Timing the optics of scene {wildcards.scene} against its error"
@@ -30,11 +32,14 @@ rule propagation:
 
 rule propagation_tables:
     input:
-        expand(rules.propagation.output[0], scene=SCENES),
+        expand(rules.propagation.output[0], scene=datasets.scene_names()),
     output:
         multiext(
             f"{RESULTS}/tables/benchmark_",
-            *(f"{name}.csv" for name in [*OPTICS, "peers"]),
+            "propagation.csv",
+            "convergence.csv",
+            "machine.csv",
+            "peers.csv",
         ),
     log:
         f"{RESULTS}/logs/propagation/tables.log",
@@ -43,22 +48,14 @@ rule propagation_tables:
     resources:
         mem_mb=1000,
     params:
-        source=source_hash("workflow/benchmarks/propagation.py"),
-        program=program("propagation.tables"),
+        source=code_of("workflow/benchmarks/propagation.py"),
+        program=program_of("propagation.tables"),
         folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
     message:
         "Joining the tables of the optics benchmark"
     shell:
         "python {params.program} {params.scenes:q} --out {params.folder} > {log} 2>&1"
-
-
-DRAWN = {
-    **{f"propagation_{scene}": f"error against time, {scene}" for scene in SCENES},
-    "costs": "all methods: error against time",
-    "inference": "speed of the network",
-    "scaling": "growth of the costs",
-}
 
 
 rule figure_benchmark:
@@ -70,19 +67,19 @@ rule figure_benchmark:
             caption="../report/figure_benchmark.rst",
             category="Benchmark: time against error",
             subcategory=lambda w: w.drawn.partition("_")[0],
-            labels=lambda w: {"figure": DRAWN[w.drawn]},
+            labels=lambda w: {"figure": timings.figures()[w.drawn]},
         ),
     log:
         f"{RESULTS}/logs/figures/benchmark/{{drawn}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/figure_{{drawn}}.tsv"
     wildcard_constraints:
-        drawn="|".join(DRAWN),
+        drawn=any_of([*timings.figures()]),
     params:
-        source=source_hash("workflow/benchmarks/figures.py"),
-        program=program("figures.draw"),
+        source=code_of("workflow/benchmarks/figures.py"),
+        program=program_of("figures.draw"),
         kind=lambda w: w.drawn.partition("_")[0],
-        scene=lambda w: [f"--scene={s}" for s in SCENES if w.drawn.endswith(f"_{s}")],
+        scene=lambda w: timings.scene_options(w.drawn),
     message:
         "Drawing the benchmark {wildcards.drawn}"
     shell:
@@ -98,65 +95,53 @@ rule benchmark:
         rules.benchmark_scaling.output,
         rules.prediction.input,
         rules.scaling.input,
-        expand(rules.figure_benchmark.output, drawn=DRAWN),
+        expand(rules.figure_benchmark.output, drawn=timings.figures()),
     localrule: True
 
 
-# The scatter of each method over its own random draws, for the same stars: a rule for each method
-# (seeds_dae, seeds_gmm, …), those that are plugged in included.
-SEEDS = f"{RESULTS}/seeds/{{dataset}}"
-
-for _method in registered():
-
-    rule:
-        name:
-            f"seeds_{_method.name}"
-        input:
-            lambda w, m=_method: [
-                path
-                for reference in dataset_config(w.dataset).dataset.references
-                if m.storage
-                for path in files_of(m, w.dataset, "random", reference)
-            ],
-            stars=lambda w: stars_of(w.dataset),
-        output:
-            f"{SEEDS}/{_method.name}.csv",
-        log:
-            f"{RESULTS}/logs/seeds/{{dataset}}-{_method.name}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}-{_method.name}.tsv"
-        # What takes longest is started first.
-        priority: _method.needs.minutes
-        threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
-        resources:
-            mem_mb=_method.needs.memory_mb,
-            runtime=5 * _method.needs.minutes,
-        params:
-            config=lambda w, m=_method: settings(
-                "trainings.seeds", f"dataset={w.dataset}", name=m.name
-            ),
-            source=lambda w, m=_method: program_code("trainings.seeds", [m.__module__]),
-            program=program("trainings.seeds"),
-            method=_method.name,
-            results=lambda w: RESULTS,
-            references=lambda w: [
-                f"--reference={r}"
-                for r in dataset_config(w.dataset).dataset.references
-            ],
-        message:
-            f"Fitting {_method.look.label} to {{wildcards.dataset}} with other seeds"
-        shell:
-            "python {params.program} {params.method} --config {params.config}"
-            " --dataset {wildcards.dataset} {params.references} --stars {input.stars}"
-            " --results {params.results} --out {output} > {log} 2>&1"
+# The scatter of a method over its own random draws, for the same stars.
+rule seeds_of_method:
+    input:
+        lambda w: fits.seed_fits(RUN, w),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        f"{RESULTS}/seeds/{{dataset}}/{{method}}.csv",
+    log:
+        f"{RESULTS}/logs/seeds/{{dataset}}-{{method}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}-{{method}}.tsv"
+    wildcard_constraints:
+        method=r"\w+",
+    threads: lambda w: fits.fit_threads(RUN, w.method)(w)
+    resources:
+        mem_mb=lambda w: fits.fit_resources(w.method)["mem_mb"],
+        runtime=lambda w: 5 * fits.fit_resources(w.method)["runtime"],
+    params:
+        config=lambda w: settings(
+            RUN, "trainings.seeds", f"dataset={w.dataset}", name=w.method
+        ),
+        source=lambda w: program_code("trainings.seeds", timings.timed_module(w.method)),
+        program=program_of("trainings.seeds"),
+        method=lambda w: w.method,
+        results=lambda w: RESULTS,
+        references=lambda w: [
+            f"--reference={r}"
+            for r in dataset_config(RUN, w.dataset).dataset.references
+        ],
+    message:
+        "Fitting {wildcards.method} to {wildcards.dataset} with other seeds"
+    shell:
+        "python {params.program} {params.method} --config {params.config}"
+        " --dataset {wildcards.dataset} {params.references} --stars {input.stars}"
+        " --results {params.results} --out {output} > {log} 2>&1"
 
 
 rule seed_scatter:
     input:
         lambda w: [
-            f"{SEEDS}/{name}.csv".format(dataset=dataset)
-            for dataset in default_datasets()
-            for name in names_of(dataset)
+            f"{RESULTS}/seeds/{dataset}/{name}.csv"
+            for dataset in default_datasets(RUN)
+            for name in fits.method_names(RUN, dataset)
         ],
     output:
         f"{RESULTS}/tables/seed_scatter.csv",
@@ -166,8 +151,8 @@ rule seed_scatter:
         f"{RESULTS}/benchmarks_on_request/seeds/scatter.tsv"
     localrule: True
     params:
-        source=program_code("trainings.scatter", []),
-        program=program("trainings.scatter"),
+        source=program_code_of("trainings.scatter"),
+        program=program_of("trainings.scatter"),
     message:
         "Pooling the scatter between seeds"
     shell:

@@ -1,22 +1,17 @@
-BOUNDS = f"{RESULTS}/bounds"
-HEADLINE_DATASET = "dataset3"
-HEADLINE = (HEADLINE_DATASET, "random", "realisation")
-
-
 rule bank:
     output:
-        f"{BOUNDS}/bank/{{stars}}.h5",
+        f"{RESULTS}/bounds/bank/{{stars}}.h5",
     log:
         f"{RESULTS}/logs/bounds/bank_{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/bank-{{stars}}.tsv"
-    threads: lambda w: composed(f"stars={w.stars}")["bounds"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.stars_choice(w.stars))["bounds"]["threads"]
     resources:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: settings("bank", f"stars={w.stars}"),
-        source=source_hash("bank"),
+        config=lambda w: settings(RUN, "bank", datasets.stars_choice(w.stars)),
+        source=code_of("bank"),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
@@ -25,25 +20,27 @@ rule bank:
 
 rule dataset_bounds:
     input:
-        stars=lambda w: stars_of(w.dataset),
-        templates=lambda w: templates_of(dataset_config(w.dataset).stars.name),
-        bank=lambda w: bank_of(w.dataset),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+        templates=lambda w: datasets.templates_file(
+            RUN, dataset_config(RUN, w.dataset).stars.name
+        ),
+        bank=lambda w: bounds.bank_files(RUN, w.dataset),
     output:
-        summary=f"{BOUNDS}/{{dataset}}.csv",
-        growth=f"{BOUNDS}/{{dataset}}_growth.csv",
-        per_star=f"{BOUNDS}/{{dataset}}.parquet",
+        summary=f"{RESULTS}/bounds/{{dataset}}.csv",
+        growth=f"{RESULTS}/bounds/{{dataset}}_growth.csv",
+        per_star=f"{RESULTS}/bounds/{{dataset}}.parquet",
     log:
         f"{RESULTS}/logs/bounds/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/{{dataset}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).bounds.threads
+    threads: lambda w: dataset_config(RUN, w.dataset).bounds.threads
     resources:
         mem_mb=1500,
         runtime=20,
     params:
-        config=lambda w: settings("bounds", f"dataset={w.dataset}"),
-        source=source_hash("bounds"),
-        bank=lambda w: [f"--bank={path}" for path in bank_of(w.dataset)],
+        config=lambda w: settings(RUN, "bounds", f"dataset={w.dataset}"),
+        source=code_of("bounds"),
+        bank=lambda w: [f"--bank={path}" for path in bounds.bank_files(RUN, w.dataset)],
     message:
         "Bounding the errors of {wildcards.dataset}"
     shell:
@@ -55,8 +52,8 @@ rule dataset_bounds:
 
 rule dataset_optics:
     input:
-        stars=lambda w: stars_of(w.dataset),
-        bank=lambda w: bank_of(w.dataset),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+        bank=lambda w: bounds.bank_files(RUN, w.dataset),
     output:
         summary=f"{RESULTS}/wavefront/{{dataset}}.csv",
         per_star=f"{RESULTS}/wavefront/{{dataset}}.parquet",
@@ -68,8 +65,8 @@ rule dataset_optics:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: settings("optics", f"dataset={w.dataset}"),
-        source=source_hash("optics"),
+        config=lambda w: settings(RUN, "optics", f"dataset={w.dataset}"),
+        source=code_of("optics"),
     message:
         "Restoring {wildcards.dataset} by the optics of the telescope"
     shell:
@@ -80,7 +77,7 @@ rule dataset_optics:
 
 rule psf_bounds:
     input:
-        expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
+        lambda w: bounds.dataset_files(RUN, ".csv"),
     output:
         f"{RESULTS}/tables/psf_bounds.csv",
     log:
@@ -89,7 +86,7 @@ rule psf_bounds:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
     localrule: True
     params:
-        source=source_hash("collect-bounds"),
+        source=code_of("collect-bounds"),
     message:
         "Collecting the bounds of all datasets"
     shell:
@@ -98,7 +95,7 @@ rule psf_bounds:
 
 use rule psf_bounds as psf_bounds_growth with:
     input:
-        expand(rules.dataset_bounds.output.growth, dataset=default_datasets()),
+        lambda w: bounds.dataset_files(RUN, "_growth.csv"),
     output:
         f"{RESULTS}/tables/psf_bounds_growth.csv",
     log:
@@ -113,8 +110,8 @@ use rule psf_bounds as psf_optics with:
     input:
         lambda w: [
             path
-            for dataset in default_datasets()
-            for path in optics_of(dataset, "csv")
+            for dataset in default_datasets(RUN)
+            for path in bounds.optics_files(RUN, dataset, "csv")
         ],
     output:
         f"{RESULTS}/tables/psf_optics.csv",
@@ -134,13 +131,13 @@ rule wavefront:
 
 rule psf_efficiency:
     input:
-        bounds=expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
-        best=expand(rules.dataset_bounds.output.per_star, dataset=default_datasets()),
+        bounds=lambda w: bounds.dataset_files(RUN, ".csv"),
+        best=lambda w: bounds.dataset_files(RUN, ".parquet"),
         methods=lambda w: [
             path
-            for dataset in default_datasets()
-            for path in per_star_of(dataset, ["random"])
-            + optics_of(dataset, "parquet")
+            for dataset in default_datasets(RUN)
+            for path in datasets.star_errors(RUN, dataset, ["random"])
+            + bounds.optics_files(RUN, dataset, "parquet")
         ],
     output:
         f"{RESULTS}/tables/psf_efficiency.csv",
@@ -153,7 +150,7 @@ rule psf_efficiency:
     params:
         bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
         best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
-        source=source_hash("efficiency"),
+        source=code_of("efficiency"),
     message:
         "Comparing all methods with the bounds"
     shell:
@@ -174,7 +171,7 @@ rule paper_rows:
     localrule: True
     params:
         inputs=as_options,
-        source=source_hash("paper-rows"),
+        source=code_of("paper-rows"),
     message:
         "Setting the paper's errors beside the bounds"
     shell:
@@ -198,7 +195,7 @@ rule figure_bounds:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
     params:
-        source=source_hash("figure bounds"),
+        source=code_of("figure bounds"),
     message:
         "Drawing {wildcards.dataset}: errors above the bounds"
     shell:
@@ -223,7 +220,7 @@ rule figure_efficiency:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
     params:
-        source=source_hash("figure efficiency"),
+        source=code_of("figure efficiency"),
     message:
         "Drawing {wildcards.dataset}: efficiency"
     shell:
@@ -248,7 +245,7 @@ rule figure_bank_growth:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
     params:
-        source=source_hash("figure bank-growth"),
+        source=code_of("figure bank-growth"),
     message:
         "Drawing {wildcards.dataset}: growth of the bank"
     shell:
@@ -258,7 +255,7 @@ rule figure_bank_growth:
 
 rule figure_headline:
     input:
-        restored="{}/evaluation/{}/{}-{}.h5".format(RESULTS, *HEADLINE),
+        restored=f"{RESULTS}/evaluation/{HEADLINE_DATASET}/random-realisation.h5",
         bounds=rules.psf_bounds.output,
         efficiency=rules.psf_efficiency.output,
     output:
@@ -276,8 +273,8 @@ rule figure_headline:
     resources:
         runtime=5,
     params:
-        source=lambda w: estimators_source("figure headline", HEADLINE_DATASET),
-        level=lambda w: shown_levels(HEADLINE_DATASET)[-1],
+        source=lambda w: fits.estimators_code(RUN, "figure headline", HEADLINE_DATASET),
+        level=lambda w: datasets.shown_levels(RUN, HEADLINE_DATASET)[-1],
     message:
         "Drawing the figure of the README"
     shell:
@@ -289,7 +286,11 @@ rule figure_headline:
 rule bounds:
     input:
         # The tables of the bounds have the datasets of the default target.
-        rules.figure_headline.output if HEADLINE_DATASET in default_datasets() else [],
+        lambda w: (
+            rules.figure_headline.output
+            if HEADLINE_DATASET in default_datasets(RUN)
+            else []
+        ),
         rules.psf_bounds.output,
         rules.psf_bounds_growth.output,
         rules.wavefront.input,
@@ -297,7 +298,7 @@ rule bounds:
         rules.paper_rows.output,
         lambda w: [
             file
-            for dataset in default_datasets()
-            for file in bound_figures_of(dataset)
+            for dataset in default_datasets(RUN)
+            for file in bounds.bound_figures(RUN, dataset)
         ],
     localrule: True

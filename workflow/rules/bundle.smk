@@ -1,44 +1,39 @@
-# A rule for each method whose fit can be packed: bundle (DAE), bundle_gmm, …; a method that is
-# plugged in gets its rule here, too.
-for _method in (m for m in registered() if m.storage and m.packing):
-    _suffix = fit_files.get_bundle_suffix(_method)
-    _stem = f"{{dataset}}-{{split}}-{{reference}}{_suffix}"
-
-    rule:
-        name:
-            f"bundle{_suffix}".replace("-", "_")
-        input:
-            stars=lambda w: stars_of(w.dataset),
-            model=lambda w, m=_method: files_of(m, w.dataset, w.split, w.reference),
-        output:
-            f"{RESULTS}/bundles/{_stem}.psf.safetensors",
-        log:
-            f"{RESULTS}/logs/bundles/{_stem}.log",
-        benchmark:
-            f"{RESULTS}/benchmarks_on_request/bundles/{_stem}.tsv"
-        threads: lambda w: dataset_config(w.dataset).evaluation.threads
-        resources:
-            mem_mb=max(1500, _method.needs.memory_mb),
-        params:
-            config=lambda w: settings("bundle", f"dataset={w.dataset}"),
-            source=source_hash("bundle", _method.__module__),
-            model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
-            # A model that comes with a package is small.
-            size=lambda w: ["--largest-mb=4.8"] * (w.dataset == SHIPPED_DATASET),
-        message:
-            f"Packing {_method.look.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
-        shell:
-            "psfdae paper bundle --config {params.config} --stars {input.stars} {params.model}"
-            " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"
-            " {params.size} --out {output} > {log} 2>&1"
+# A bundle of each method whose fit can be packed; its name ends in the method's suffix.
+rule bundle:
+    input:
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+        model=lambda w: fits.packed_files(RUN, w),
+    output:
+        f"{RESULTS}/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.psf.safetensors",
+    log:
+        f"{RESULTS}/logs/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.tsv"
+    wildcard_constraints:
+        suffix="|".join(fits.bundle_suffixes()),
+    threads: lambda w: dataset_config(RUN, w.dataset).evaluation.threads
+    resources:
+        mem_mb=lambda w: fits.bundle_memory(w.suffix),
+    params:
+        config=lambda w: settings(RUN, "bundle", f"dataset={w.dataset}"),
+        source=lambda w: fits.methods_code("bundle", [fits.bundle_suffixes()[w.suffix]]),
+        model=lambda w: fits.packed_option(RUN, w),
+        # A model that comes with a package is small.
+        size=lambda w: ["--largest-mb=4.8"] * (w.dataset == datasets.SHIPPED_DATASET),
+    message:
+        "Packing {wildcards.dataset}, {wildcards.split}, {wildcards.reference}{wildcards.suffix}"
+    shell:
+        "psfdae paper bundle --config {params.config} --stars {input.stars} {params.model}"
+        " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"
+        " {params.size} --out {output} > {log} 2>&1"
 
 
 rule bundles:
     input:
         lambda w: [
             path
-            for dataset in default_datasets()
-            for path in bundles_of(dataset, PACKED)
+            for dataset in default_datasets(RUN)
+            for path in fits.bundle_files(RUN, dataset, timings.PACKED)
         ],
     localrule: True
 
@@ -46,16 +41,18 @@ rule bundles:
 # The shipped model is committed, so nothing but an explicit request renews it.
 rule shipped:
     input:
-        stars=lambda w: stars_of(SHIPPED_DATASET),
-        bundles=lambda w: bundles_of(SHIPPED_DATASET, PACKED),
+        stars=lambda w: datasets.stars_file(RUN, datasets.SHIPPED_DATASET),
+        bundles=lambda w: fits.bundle_files(
+            RUN, datasets.SHIPPED_DATASET, timings.PACKED
+        ),
     output:
         touch(f"{RESULTS}/.shipped_renewed"),
     log:
         f"{RESULTS}/logs/bundles/shipped.log",
     localrule: True
     params:
-        config=lambda w: settings("ship", f"dataset={SHIPPED_DATASET}"),
-        source=source_hash("ship"),
+        config=lambda w: settings(RUN, "ship", f"dataset={datasets.SHIPPED_DATASET}"),
+        source=code_of("ship"),
         folder="src/psfdae/denoise/bundles",
         bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:

@@ -5,13 +5,13 @@ rule scan:
         f"{RESULTS}/logs/scan/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/scan/{{dataset}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).optics.threads
+    threads: lambda w: dataset_config(RUN, w.dataset).optics.threads
     resources:
         mem_mb=1000,
         runtime=30,
     params:
-        config=lambda w: settings("scan", f"dataset={w.dataset}"),
-        source=source_hash("scan"),
+        config=lambda w: settings(RUN, "scan", f"dataset={w.dataset}"),
+        source=code_of("scan"),
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
     shell:
@@ -21,8 +21,10 @@ rule scan:
 
 rule calibrate:
     input:
-        scans=expand(rules.scan.output, dataset=TABULATED),
-        stars=lambda w: [stars_of(dataset) for dataset in TABULATED],
+        scans=expand(rules.scan.output, dataset=datasets.TABULATED),
+        stars=lambda w: [
+            datasets.stars_file(RUN, dataset) for dataset in datasets.TABULATED
+        ],
     output:
         multiext(
             f"{RESULTS}/calibration/",
@@ -35,17 +37,17 @@ rule calibrate:
         f"{RESULTS}/logs/calibrate/all.log",
     benchmark:
         f"{RESULTS}/benchmarks/calibrate/all.tsv"
-    threads: lambda w: dataset_config(TABULATED[0]).evaluation.threads
+    threads: lambda w: dataset_config(RUN, datasets.TABULATED[0]).evaluation.threads
     resources:
         mem_mb=2000,
     params:
-        config=lambda w: settings("calibrate", f"dataset={TABULATED[0]}"),
-        source=source_hash("calibrate"),
+        config=lambda w: settings(RUN, "calibrate", f"dataset={datasets.TABULATED[0]}"),
+        source=code_of("calibrate"),
         folder=subpath(output.fit, parent=True),
         scans=lambda w, input: [f"--scan={path}" for path in input.scans],
         stars=lambda w, input: [
             word
-            for dataset, path in zip(TABULATED, input.stars)
+            for dataset, path in zip(datasets.TABULATED, input.stars)
             for word in ("--stars", dataset, path)
         ],
     message:

@@ -5,10 +5,10 @@ rule templates:
         f"{RESULTS}/logs/templates/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/templates/{{scene}}.tsv"
-    threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.scene_choice(w.scene))["optics"]["threads"]
     params:
-        config=lambda w: settings("templates", f"scene={w.scene}"),
-        source=source_hash("templates"),
+        config=lambda w: settings(RUN, "templates", datasets.scene_choice(w.scene)),
+        source=code_of("templates"),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
     shell:
@@ -17,20 +17,20 @@ rule templates:
 
 rule stars:
     input:
-        templates=lambda w: templates_of(w.stars),
+        templates=lambda w: datasets.templates_file(RUN, w.stars),
     output:
         f"{RESULTS}/data/{{scene}}/{{stars}}.h5",
     log:
         f"{RESULTS}/logs/stars/{{scene}}/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/stars/{{scene}}/{{stars}}.tsv"
-    threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.scene_choice(w.scene))["optics"]["threads"]
     resources:
         mem_mb=1000,
         runtime=30,
     params:
-        config=lambda w: settings("stars", f"stars={w.stars}"),
-        source=source_hash("stars"),
+        config=lambda w: settings(RUN, "stars", datasets.stars_choice(w.stars)),
+        source=code_of("stars"),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:

@@ -1,7 +1,7 @@
 rule evaluate:
     input:
-        stars=lambda w: stars_of(w.dataset),
-        models=lambda w: fitted(w.dataset, w.split, w.reference),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+        models=lambda w: fits.fitted_files(RUN, w.dataset, w.split, w.reference),
     output:
         summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
         per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
@@ -10,13 +10,13 @@ rule evaluate:
         f"{RESULTS}/logs/evaluate/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/evaluate/{{dataset}}/{{split}}-{{reference}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).evaluation.threads
+    threads: lambda w: dataset_config(RUN, w.dataset).evaluation.threads
     resources:
         mem_mb=1500,
     params:
-        config=lambda w: settings("evaluate", f"dataset={w.dataset}"),
-        source=lambda w: estimators_source("evaluate", w.dataset),
-        models=lambda w: model_options(w.dataset, w.split, w.reference),
+        config=lambda w: settings(RUN, "evaluate", f"dataset={w.dataset}"),
+        source=lambda w: fits.estimators_code(RUN, "evaluate", w.dataset),
+        models=lambda w: fits.fit_options(RUN, w.dataset, w.split, w.reference),
     message:
         "Evaluating {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
     shell:
@@ -28,20 +28,20 @@ rule evaluate:
 
 rule paper_tables:
     input:
-        lambda w: evaluations_of(w.dataset, ["random"]),
+        lambda w: datasets.evaluations(RUN, w.dataset, ["random"]),
     output:
         **{
             metric: report(
                 f"{RESULTS}/tables/{{dataset}}_{metric}.csv",
                 caption="../report/paper_tables.rst",
-                category=category_of,
+                category=lambda w: datasets.report_category(RUN, w),
                 subcategory="{dataset}",
                 labels={"figure": f"table of {metric}"},
             )
-            for metric in METRICS
+            for metric in datasets.METRICS
         },
         markdown=expand(
-            f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.md", metric=METRICS
+            f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.md", metric=datasets.METRICS
         ),
     log:
         f"{RESULTS}/logs/paper_tables/{{dataset}}.log",
@@ -49,8 +49,8 @@ rule paper_tables:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}.tsv"
     localrule: True
     params:
-        source=source_hash("paper-tables"),
-        out=by_metric,
+        source=code_of("paper-tables"),
+        out=datasets.metric_options,
     message:
         "Writing the paper's tables of {wildcards.dataset}"
     shell:
@@ -61,7 +61,9 @@ rule paper_tables:
 rule held_out:
     input:
         lambda w: [
-            path for dataset in default_datasets() for path in per_star_of(dataset)
+            path
+            for dataset in default_datasets(RUN)
+            for path in datasets.star_errors(RUN, dataset)
         ],
     output:
         f"{RESULTS}/tables/psf_held_out.csv",
@@ -71,7 +73,7 @@ rule held_out:
         f"{RESULTS}/benchmarks/held_out/all.tsv"
     localrule: True
     params:
-        source=source_hash("held-out"),
+        source=code_of("held-out"),
     message:
         "Comparing held-out with seen fields, star by star"
     shell:
@@ -82,7 +84,9 @@ rule psf_metrics:
     input:
         # Evaluated only where it is asked for: a job of a cluster reads all rules at its start.
         lambda w: [
-            csv for dataset in default_datasets() for csv in evaluations_of(dataset)
+            csv
+            for dataset in default_datasets(RUN)
+            for csv in datasets.evaluations(RUN, dataset)
         ],
     output:
         f"{RESULTS}/tables/psf_metrics.csv",
@@ -92,7 +96,7 @@ rule psf_metrics:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     localrule: True
     params:
-        source=source_hash("collect"),
+        source=code_of("collect"),
     message:
         "Collecting the metrics of all datasets"
     shell:

@@ -5,7 +5,7 @@ rule figure_templates:
         report(
             f"{RESULTS}/figures/{{scene}}/templates.png",
             caption="../report/figure_templates.rst",
-            category=category_of,
+            category=lambda w: datasets.report_category(RUN, w),
             subcategory="static PSFs",
             labels={"figure": "static PSFs"},
         ),
@@ -15,7 +15,7 @@ rule figure_templates:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
     params:
         kind="templates",
-        source=source_hash("figure templates"),
+        source=code_of("figure templates"),
     message:
         "Drawing the static PSFs of scene {wildcards.scene}"
     shell:
@@ -27,7 +27,7 @@ use rule figure_templates as figure_energy with:
         report(
             f"{RESULTS}/figures/{{scene}}/energy.png",
             caption="../report/figure_energy.rst",
-            category=category_of,
+            category=lambda w: datasets.report_category(RUN, w),
             subcategory="static PSFs",
             labels={"figure": "light in the stamp"},
         ),
@@ -37,7 +37,7 @@ use rule figure_templates as figure_energy with:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
     params:
         kind="energy",
-        source=source_hash("figure energy"),
+        source=code_of("figure energy"),
     message:
         "Drawing the light inside the stamps of scene {wildcards.scene}"
 
@@ -49,7 +49,7 @@ rule figure_strip:
         report(
             f"{RESULTS}/figures/{{dataset}}/strip_{{reference}}.png",
             caption="../report/figure_strip.rst",
-            category=category_of,
+            category=lambda w: datasets.report_category(RUN, w),
             subcategory="{dataset}",
             labels={"figure": "restored stars, {reference}"},
         ),
@@ -58,8 +58,10 @@ rule figure_strip:
     benchmark:
         f"{RESULTS}/benchmarks/figure_strip/{{dataset}}-{{reference}}.tsv"
     params:
-        source=lambda w: estimators_source("figure strip", w.dataset),
-        levels=lambda w: [f"--level={level:g}" for level in shown_levels(w.dataset)],
+        source=lambda w: fits.estimators_code(RUN, "figure strip", w.dataset),
+        levels=lambda w: [
+            f"--level={level:g}" for level in datasets.shown_levels(RUN, w.dataset)
+        ],
     message:
         "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
     shell:
@@ -69,12 +71,12 @@ rule figure_strip:
 
 rule figure_curves:
     input:
-        lambda w: list(histories_of(w.dataset)),
+        lambda w: list(fits.histories(RUN, w.dataset)),
     output:
         report(
             f"{RESULTS}/figures/{{dataset}}/curves.png",
             caption="../report/figure_curves.rst",
-            category=category_of,
+            category=lambda w: datasets.report_category(RUN, w),
             subcategory="{dataset}",
             labels={"figure": "training"},
         ),
@@ -83,8 +85,10 @@ rule figure_curves:
     benchmark:
         f"{RESULTS}/benchmarks/figure_curves/{{dataset}}.tsv"
     params:
-        labels=lambda w: [f"--label={x}" for x in histories_of(w.dataset).values()],
-        source=source_hash("figure curves"),
+        labels=lambda w: [
+            f"--label={x}" for x in fits.histories(RUN, w.dataset).values()
+        ],
+        source=code_of("figure curves"),
     message:
         "Drawing the training curves of {wildcards.dataset}"
     shell:
@@ -93,25 +97,25 @@ rule figure_curves:
 
 rule figure_errors:
     input:
-        lambda w: evaluations_of(w.dataset),
+        lambda w: datasets.evaluations(RUN, w.dataset),
     output:
         **{
             metric: report(
                 f"{RESULTS}/figures/{{dataset}}/errors_{metric}.png",
                 caption="../report/figure_errors.rst",
-                category=category_of,
+                category=lambda w: datasets.report_category(RUN, w),
                 subcategory="{dataset}",
                 labels={"figure": f"{metric} against noise"},
             )
-            for metric in METRICS
+            for metric in datasets.METRICS
         },
     log:
         f"{RESULTS}/logs/figure_errors/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_errors/{{dataset}}.tsv"
     params:
-        source=lambda w: estimators_source("figure errors", w.dataset),
-        out=by_metric,
+        source=lambda w: fits.estimators_code(RUN, "figure errors", w.dataset),
+        out=datasets.metric_options,
     message:
         "Drawing errors of {wildcards.dataset} against the noise level"
     shell:

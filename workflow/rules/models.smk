@@ -1,47 +1,132 @@
-# A rule for each method that stores a fit: train (DAE), baseline (PCA+SOM), fit_gmm, fit_gmm_position,
-# … (`Storage.rule` of the method's class). A method that is plugged in gets its rule here, too.
-for _method in (m for m in registered() if m.storage):
-    _rule = fit_files.get_rule_name(_method)
-    _stem = fit_files.stem(_method, "{dataset}", "{split}", "{reference}")
-    _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
-    _place = model_of(_method, "{dataset}", "{split}", "{reference}")
+# A rule for each of our methods that store a fit. `fits.fit_params` has their parameters.
+rule train:
+    input:
+        unpack(fits.start_files(RUN, "dae")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "dae"),
+    log:
+        f"{RESULTS}/logs/train/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/train/{{dataset}}/{{split}}-{{reference}}.tsv"
+    # Fits that take longest are started first.
+    priority: fits.fit_resources("dae")["runtime"]
+    threads: fits.fit_threads(RUN, "dae")
+    resources:
+        **fits.fit_resources("dae"),
+    params:
+        **fits.fit_params(RUN, "dae"),
+    message:
+        "Training the DAE on {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+    shell:
+        "psfdae paper fit {params.method} --config {params.config} --stars {input.stars}"
+        " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"
+        " --out {params.place} > {log} 2>&1"
+
+
+use rule train as baseline with:
+    input:
+        unpack(fits.start_files(RUN, "pca_som")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "pca_som"),
+    log:
+        f"{RESULTS}/logs/baseline/{{dataset}}/{{split}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/baseline/{{dataset}}/{{split}}.tsv"
+    priority: fits.fit_resources("pca_som")["runtime"]
+    threads: fits.fit_threads(RUN, "pca_som")
+    resources:
+        **fits.fit_resources("pca_som"),
+    params:
+        **fits.fit_params(RUN, "pca_som"),
+    message:
+        "Fitting PCA and SOM to {wildcards.dataset}, {wildcards.split}"
+
+
+use rule train as fit_gmm with:
+    input:
+        unpack(fits.start_files(RUN, "gmm")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "gmm"),
+    log:
+        f"{RESULTS}/logs/fit_gmm/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_gmm/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("gmm")["runtime"]
+    threads: fits.fit_threads(RUN, "gmm")
+    resources:
+        **fits.fit_resources("gmm"),
+    params:
+        **fits.fit_params(RUN, "gmm"),
+    message:
+        "Fitting the Gaussian mixture to {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
+use rule train as fit_gmm_position with:
+    input:
+        unpack(fits.start_files(RUN, "gmm_position")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "gmm_position"),
+    log:
+        f"{RESULTS}/logs/fit_gmm_position/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_gmm_position/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("gmm_position")["runtime"]
+    threads: fits.fit_threads(RUN, "gmm_position")
+    resources:
+        **fits.fit_resources("gmm_position"),
+    params:
+        **fits.fit_params(RUN, "gmm_position"),
+    message:
+        "Fitting the Gaussian mixture with positions to {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
+use rule train as fit_field with:
+    input:
+        unpack(fits.start_files(RUN, "field")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "field"),
+    log:
+        f"{RESULTS}/logs/fit_field/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_field/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("field")["runtime"]
+    threads: fits.fit_threads(RUN, "field")
+    resources:
+        **fits.fit_resources("field"),
+    params:
+        **fits.fit_params(RUN, "field"),
+    message:
+        "Fitting the field to {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
+# Methods of other packages (entry points psfdae.methods) have rules with the names that they give.
+for _rule, _name in fits.rules_without(rule.name for rule in workflow.rules).items():
 
     rule:
         name:
             _rule
         input:
-            unpack(lambda w, m=_method: start_of(m, w)),
-            stars=lambda w: stars_of(w.dataset),
+            unpack(fits.start_files(RUN, _name)),
+            stars=lambda w: datasets.stars_file(RUN, w.dataset),
         output:
-            [str(path) for path in fit_files.outputs(_method, _place)],
+            fits.fit_outputs(RUN, _name),
         log:
-            f"{RESULTS}/logs/{_rule}/{_stem}.log",
+            f"{RESULTS}/logs/{fits.fit_log(_name)}.log",
         benchmark:
-            f"{RESULTS}/benchmarks/{_rule}/{_stem}.tsv"
-        # What takes longest is started first.
-        priority: _method.needs.minutes
-        threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
+            f"{RESULTS}/benchmarks/{fits.fit_log(_name)}.tsv"
+        priority: fits.fit_resources(_name)["runtime"]
+        threads: fits.fit_threads(RUN, _name)
         resources:
-            mem_mb=_method.needs.memory_mb,
-            runtime=_method.needs.minutes,
+            **fits.fit_resources(_name),
         params:
-            config=lambda w, m=_method: settings(
-                "fit", f"dataset={w.dataset}", name=m.name
-            ),
-            source=source_hash("fit", _method.__module__),
-            method=_method.name,
-            more=lambda w, input, m=_method: [
-                *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),
-                *(
-                    f"--start={model_of(m, w.dataset, w.split, 'realisation')}"
-                    for _ in input.get("start", "")[:1]
-                ),
-            ],
-            place=_place,
-            # Not an output: Snakemake would delete it with a failed job's outputs.
-            checkpoint=f"{RESULTS}/checkpoints/{_method.name}/{_stem}.pt",
+            **fits.fit_params(RUN, _name),
         message:
-            f"Fitting {_method.look.label} to {fit_files.stem(_method, *_names)}"
+            f"Fitting {_name} to {{wildcards.dataset}}, {{wildcards.split}}"
         shell:
             "psfdae paper fit {params.method} --config {params.config} --stars {input.stars}"
             " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"

@@ -1,8 +1,8 @@
 rule night_images:
     input:
-        lambda w: night_files(w.part),
+        lambda w: night.image_files(RUN, w.part),
     output:
-        f"{NIGHT}/rows/{{part}}.csv",
+        f"{RESULTS}/night/rows/{{part}}.csv",
     log:
         f"{RESULTS}/logs/night/images/{{part}}.log",
     benchmark:
@@ -15,9 +15,9 @@ rule night_images:
         mem_mb=lambda w, attempt: 1500 * attempt,
         runtime=60,
     params:
-        rows=lambda w: night_rows(w.part),
-        folder=f"{NIGHT}/images",
-        source=source_hash("night images", method("field").__module__),
+        rows=lambda w: night.rows_file(RUN, w.part),
+        folder=f"{RESULTS}/night/images",
+        source=code_of("night images", "psfdae.methods.field"),
     message:
         "Measuring images of part {wildcards.part}"
     shell:
@@ -27,16 +27,16 @@ rule night_images:
 
 rule night_table:
     input:
-        lambda w: [f"{NIGHT}/rows/{part}.csv" for part in range(len(night_parts()))],
+        lambda w: night.part_tables(RUN),
     output:
-        multiext(f"{NIGHT}/night", csv=".csv", ecsv=".ecsv"),
+        multiext(f"{RESULTS}/night/night", csv=".csv", ecsv=".ecsv"),
     log:
         f"{RESULTS}/logs/night/table.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/night/table.tsv"
     localrule: True
     params:
-        source=source_hash("night table"),
+        source=code_of("night table"),
     message:
         "Judging the images of the night"
     shell:
@@ -47,15 +47,15 @@ rule night_page:
     input:
         rules.night_table.output.csv,
     output:
-        f"{NIGHT}/night.html",
+        f"{RESULTS}/night/night.html",
     log:
         f"{RESULTS}/logs/night/page.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/night/page.tsv"
     localrule: True
     params:
-        folder=f"{NIGHT}/images",
-        source=source_hash("night page"),
+        folder=f"{RESULTS}/night/images",
+        source=code_of("night page"),
     message:
         "Drawing the night"
     shell:
@@ -78,7 +78,7 @@ use rule track as track_night with:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("track"),
+        source=code_of("track"),
     message:
         "Importing the images of the night into MLflow"
 

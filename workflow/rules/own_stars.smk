@@ -1,24 +1,13 @@
-OWN_STARS_EXAMPLE = f"{RESULTS}/own_stars/example"
-# All methods are compared here, those that the command leaves out for their time, too.
-OWN_STARS_METHODS = [
-    *dict.fromkeys(
-        name
-        for dataset in (default_datasets()[0], OWN_STARS)
-        for name in names_of(dataset)
-    )
-]
-
-
 rule example_field:
     output:
-        image=f"{OWN_STARS_EXAMPLE}/image.fits",
-        catalogue=f"{OWN_STARS_EXAMPLE}/stars.csv",
+        image=f"{RESULTS}/own_stars/example/image.fits",
+        catalogue=f"{RESULTS}/own_stars/example/stars.csv",
     log:
         f"{RESULTS}/logs/own_stars/example_field.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/example_field.tsv"
     params:
-        source=source_hash("example-field"),
+        source=code_of("example-field"),
     message:
         "Simulating an image of a star field"
     shell:
@@ -32,7 +21,7 @@ rule own_stars:
         catalogue=rules.example_field.output.catalogue,
     output:
         multiext(
-            f"{OWN_STARS_EXAMPLE}/model/",
+            f"{RESULTS}/own_stars/example/model/",
             bundle="example.psf.safetensors",
             stars="stars.h5",
             report="report.csv",
@@ -43,19 +32,18 @@ rule own_stars:
         f"{RESULTS}/logs/own_stars/model.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/model.tsv"
-    threads: lambda w: fit_threads(OWN_STARS)
+    threads: lambda w: fits.most_threads(RUN, datasets.OWN_STARS)
     resources:
         mem_mb=1500,
         runtime=30,
     params:
         config=lambda w: settings(
-            "from-stars",
-            f"dataset={OWN_STARS}",
-            more=(f"methods=[{','.join(OWN_STARS_METHODS)}]",),
+            RUN,
+            "train",
+            f"dataset={datasets.OWN_STARS}",
+            more=(f"methods=[{','.join(datasets.compared_methods(RUN))}]",),
         ),
-        source=source_hash(
-            "from-stars", *(method(m).__module__ for m in OWN_STARS_METHODS)
-        ),
+        source=lambda w: fits.methods_code("train", datasets.compared_methods(RUN)),
         folder=subpath(output.bundle, parent=True),
     message:
         "Training on the bright stars of the image"

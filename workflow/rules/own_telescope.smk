@@ -1,18 +1,18 @@
 use rule templates as telescope_templates with:
     output:
-        f"{OWN_TELESCOPES}/{{stars}}/templates.h5",
+        f"{RESULTS}/data/telescope/{{stars}}/templates.h5",
     log:
         f"{RESULTS}/logs/templates/telescope/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/templates/telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars="|".join(ALL_DATASETS),
-    threads: lambda w: dataset_config(w.stars).optics.threads
+        stars=any_of(datasets.simulated_datasets()),
+    threads: lambda w: dataset_config(RUN, w.stars).optics.threads
     resources:
         mem_mb=1000,
     params:
-        config=lambda w: settings("templates", f"dataset={w.stars}"),
-        source=source_hash("templates"),
+        config=lambda w: settings(RUN, "templates", f"dataset={w.stars}"),
+        source=code_of("templates"),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
 
@@ -21,20 +21,20 @@ use rule stars as telescope_stars with:
     input:
         templates=rules.telescope_templates.output,
     output:
-        f"{OWN_TELESCOPES}/{{stars}}.h5",
+        f"{RESULTS}/data/telescope/{{stars}}.h5",
     log:
         f"{RESULTS}/logs/stars/telescope/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/stars/telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars="|".join(ALL_DATASETS),
-    threads: lambda w: dataset_config(w.stars).optics.threads
+        stars=any_of(datasets.simulated_datasets()),
+    threads: lambda w: dataset_config(RUN, w.stars).optics.threads
     resources:
         mem_mb=1000,
         runtime=60,
     params:
-        config=lambda w: settings("stars", f"dataset={w.stars}"),
-        source=source_hash("stars"),
+        config=lambda w: settings(RUN, "stars", f"dataset={w.stars}"),
+        source=code_of("stars"),
 
 
 rule figure_telescope:
@@ -44,7 +44,7 @@ rule figure_telescope:
         picture=report(
             f"{RESULTS}/figures/telescope/{{stars}}.png",
             caption="../report/own_telescope.rst",
-            category=SCENE_HEADINGS["own_telescope"],
+            category=datasets.SCENE_HEADINGS["own_telescope"],
             subcategory="{stars}",
             labels={"figure": "static PSFs"},
         ),
@@ -54,9 +54,9 @@ rule figure_telescope:
     benchmark:
         f"{RESULTS}/benchmarks/figure_telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars="|".join(ALL_DATASETS),
+        stars=any_of(datasets.simulated_datasets()),
     params:
-        source=source_hash("figure telescope"),
+        source=code_of("figure telescope"),
     message:
         "Drawing the static PSFs of the telescope of {wildcards.stars}"
     shell:

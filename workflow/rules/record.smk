@@ -1,13 +1,14 @@
 rule runtime:
     input:
         lambda w: [
-            file for dataset in default_datasets() for file in products_of(dataset)
+            file
+            for dataset in default_datasets(RUN)
+            for file in datasets.products(RUN, dataset)
         ],
         rules.psf_metrics.output,
         rules.held_out.output,
         rules.calibrate.output,
-        ALIGNMENT_PRODUCTS,
-        rules.track_alignment.output,
+        rules.scene3.input,
     output:
         f"{RESULTS}/runtime.csv",
     log:
@@ -15,7 +16,7 @@ rule runtime:
     localrule: True
     params:
         results=lambda w: RESULTS,
-        source=source_hash("runtime"),
+        source=code_of("runtime"),
     message:
         "Collecting what the jobs cost"
     shell:

@@ -5,9 +5,11 @@ rule reference:
         rules.calibrate.output,
         rules.runtime.output,
         lambda w: [
-            file for dataset in default_datasets() for file in figures_of(dataset)
+            file
+            for dataset in default_datasets(RUN)
+            for file in datasets.figures(RUN, dataset)
         ],
-        ALIGNMENT_PRODUCTS,
+        rules.scene3.input,
         rules.benchmark.input,
         rules.stability.input,
         rules.bounds.input,

@@ -1,14 +1,8 @@
-STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
-STABILITY_READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
-STRESS = SOURCES.parent / "tests/stress"
-STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py"))]
-
-
 # Writes the table whatever it says: a failed job would lose it.
 rule stability_table:
     input:
-        stars=lambda w: stars_of(STABILITY_DATASET),
-        turbulence=lambda w: stars_of(STABILITY_OTHER),
+        stars=lambda w: datasets.stars_file(RUN, "dataset3"),
+        turbulence=lambda w: datasets.stars_file(RUN, "dataset8"),
     output:
         table=f"{RESULTS}/tables/stability.csv",
         graded=f"{RESULTS}/tables/stability_graded.csv",
@@ -21,18 +15,15 @@ rule stability_table:
         mem_mb=3000,
         runtime=20,
     params:
-        config=lambda w: str(
-            write_settings(
-                Path(RESULTS, ".settings"),
-                "stability",
-                STABILITY_READS,
-                composed(f"dataset={STABILITY_DATASET}"),
-                dry=workflow.dryrun,
-            )
+        config=lambda w: write_groups(
+            RUN,
+            "stability",
+            ("seed", "noise", "dae", "train", "baseline", "evaluation"),
+            compose_choice(RUN, "dataset=dataset3"),
         ),
-        source=lambda w: source_hash(*(f"tests/stress/{name}" for name in STRESS_CODE)),
+        source=lambda w: stress_code(),
         # Asks for `threads` as a sign that another place is no reason to repeat a job.
-        tests=lambda w, threads: str(STRESS),
+        tests=lambda w, threads: str(STRESS_TESTS),
     message:
         "Stressing the whole chain"
     shell:
@@ -57,8 +48,8 @@ rule figure_stability:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
     params:
-        source=source_hash("workflow/benchmarks/figures.py"),
-        program=program("figures.draw"),
+        source=code_of("workflow/benchmarks/figures.py"),
+        program=program_of("figures.draw"),
     message:
         "Drawing error against stress"
     shell:

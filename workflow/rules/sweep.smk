@@ -1,5 +1,5 @@
 wildcard_constraints:
-    sweep="|".join(sweep_names()) or "none",
+    sweep=any_of(sweep_names()),
 
 
 # States of their own choose between networks: all others train or test.
@@ -7,7 +7,7 @@ use rule alignment_states as sweep_validation_states with:
     input:
         model=rules.alignment_model.output,
     output:
-        f"{ALIGNMENT_DATA}/validation.h5",
+        f"{RESULTS}/data/alignment/validation.h5",
     log:
         f"{RESULTS}/logs/alignment/validation.log",
     benchmark:
@@ -15,7 +15,9 @@ use rule alignment_states as sweep_validation_states with:
     params:
         kind="uniform",
         config=lambda w: settings(
-            "alignment states", more=(f"seed={alignment_config().seed + 1}",)
+            RUN,
+            "alignment states",
+            more=(f"seed={alignment.alignment_config(RUN).seed + 1}",),
         ),
     message:
         "Propagating the stamps of scene 3, uniform states that choose between networks"
@@ -23,27 +25,29 @@ use rule alignment_states as sweep_validation_states with:
 
 rule sweep_point:
     input:
-        unpack(sweep_data),
-        known=sweep_known,
+        unpack(lambda w: sweeps.sweep_data(RUN, w.sweep)),
+        known=lambda w: sweeps.known_results(RUN, w),
     output:
-        f"{SWEEPS}/{{sweep}}/points/{{point}}/result.json",
+        f"{RESULTS}/sweeps/{{sweep}}/points/{{point}}/result.json",
     log:
         f"{RESULTS}/logs/sweeps/{{sweep}}/{{point}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{point}}.tsv"
     wildcard_constraints:
         point="[0-9a-f]{12}",
-    threads: sweep_threads
+    threads: lambda w: sweeps.point_threads(RUN, w)
     resources:
         mem_mb=2000,
     params:
         # The point's name is the hash of its settings, so that these need not be compared: asking
         # for `threads` tells Snakemake that they are no reason to repeat a job.
-        given=lambda w, threads: GIVEN,
+        given=lambda w, threads: RUN.overrides,
         data=lambda w, input: [
-            word for role in sweep_data(w) for word in ("--data", role, input[role])
+            word
+            for role in sweeps.sweep_data(RUN, w.sweep)
+            for word in ("--data", role, input[role])
         ],
-        source=lambda w: sweep_source(w.sweep),
+        source=lambda w: sweeps.sweep_code(RUN, w.sweep),
         folder=subpath(output[0], parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
         checkpoint=lambda w: f"{RESULTS}/checkpoints/sweep-{w.sweep}-{w.point}.pt",
@@ -57,10 +61,10 @@ rule sweep_point:
 
 rule sweep_summary:
     input:
-        sweep_results,
+        lambda w: sweeps.sweep_results(RUN, w.sweep),
     output:
         multiext(
-            f"{SWEEPS}/{{sweep}}/",
+            f"{RESULTS}/sweeps/{{sweep}}/",
             summary="summary.csv",
             cost="cost.csv",
             best="best.yaml",
@@ -74,10 +78,10 @@ rule sweep_summary:
     resources:
         mem_mb=500,
     params:
-        given=GIVEN,
-        definition=lambda w: sweep_plan(w.sweep).sweep.model_dump_json(),
-        source=source_hash("sweep summary"),
-        points=lambda w: f"{SWEEPS}/{w.sweep}/points",
+        given=RUN.overrides,
+        definition=lambda w: sweeps.sweep_plan(RUN, w.sweep).sweep.model_dump_json(),
+        source=code_of("sweep summary"),
+        points=lambda w: f"{RESULTS}/sweeps/{w.sweep}/points",
         folder=subpath(output.summary, parent=True),
     message:
         "Summarising sweep {wildcards.sweep}"
@@ -92,7 +96,7 @@ rule figure_sweep:
         definition=rules.sweep_summary.output.definition,
     output:
         report(
-            f"{SWEEPS}/{{sweep}}/figures/{{sweep_figure}}.png",
+            f"{RESULTS}/sweeps/{{sweep}}/figures/{{sweep_figure}}.png",
             caption="../report/figure_sweep.rst",
             category="Sweeps",
             labels={"data": "{sweep}", "figure": "{sweep_figure}"},
@@ -102,12 +106,12 @@ rule figure_sweep:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{sweep_figure}}.tsv"
     wildcard_constraints:
-        sweep_figure="|".join(SWEEP_FIGURES),
+        sweep_figure=any_of(sweeps.FIGURES),
     threads: 1
     resources:
         mem_mb=500,
     params:
-        source=source_hash("sweep figure"),
+        source=code_of("sweep figure"),
     message:
         "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
     shell:
@@ -119,7 +123,7 @@ rule track_sweep:
     input:
         rules.sweep_summary.output,
         expand(
-            rules.figure_sweep.output, sweep_figure=SWEEP_FIGURES, allow_missing=True
+            rules.figure_sweep.output, sweep_figure=sweeps.FIGURES, allow_missing=True
         ),
     output:
         f"{RESULTS}/mlflow/sweep_{{sweep}}.csv",
@@ -136,7 +140,7 @@ rule track_sweep:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("track"),
+        source=code_of("track"),
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
     shell:
@@ -147,5 +151,5 @@ rule track_sweep:
 
 rule sweep:
     input:
-        sweep_products,
+        lambda w: sweeps.sweep_products(RUN),
     localrule: True

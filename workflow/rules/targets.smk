@@ -4,45 +4,107 @@ rule tables:
         rules.held_out.output,
         lambda w: [
             file
-            for dataset in TABULATED
-            if dataset in default_datasets()
-            for file in paper_tables_of(dataset)
+            for dataset in datasets.TABULATED
+            if dataset in default_datasets(RUN)
+            for file in datasets.paper_tables(RUN, dataset)
         ],
     localrule: True
 
 
 rule scene1:
     input:
-        lambda w: products_of_scene("scene1"),
+        lambda w: datasets.default_products(RUN, "scene1"),
     localrule: True
 
 
 rule scene2:
     input:
-        lambda w: products_of_scene("scene2"),
+        lambda w: datasets.default_products(RUN, "scene2"),
     localrule: True
-
-
-# A target for each file of config/dataset, such as dataset3.
-for _dataset in ALL_DATASETS:
-
-    rule:
-        name:
-            _dataset
-        input:
-            lambda w, dataset=_dataset: products_of(dataset),
-        localrule: True
 
 
 rule scene3:
     input:
-        ALIGNMENT_PRODUCTS,
+        rules.alignment_telescope.output,
+        rules.alignment_tables.output,
+        rules.alignment_paper_tables.output,
+        rules.alignment_time.output,
+        rules.figure_alignment_stamps.output,
+        rules.figure_alignment_predicted.output,
+        rules.figure_alignment_errors.output,
+        rules.figure_alignment_twin.output,
+        rules.figure_alignment_correlation.output,
         rules.track_alignment.output,
     localrule: True
 
 
 rule tracking:
     input:
-        expand(rules.track.output, dataset=default_datasets()),
+        lambda w: expand(rules.track.output, dataset=default_datasets(RUN)),
         rules.track_alignment.output,
     localrule: True
+
+
+rule dataset1:
+    input:
+        lambda w: datasets.products(RUN, "dataset1"),
+    localrule: True
+
+
+rule dataset2:
+    input:
+        lambda w: datasets.products(RUN, "dataset2"),
+    localrule: True
+
+
+rule dataset3:
+    input:
+        lambda w: datasets.products(RUN, "dataset3"),
+    localrule: True
+
+
+rule dataset4:
+    input:
+        lambda w: datasets.products(RUN, "dataset4"),
+    localrule: True
+
+
+rule dataset5:
+    input:
+        lambda w: datasets.products(RUN, "dataset5"),
+    localrule: True
+
+
+rule dataset6:
+    input:
+        lambda w: datasets.products(RUN, "dataset6"),
+    localrule: True
+
+
+rule dataset7:
+    input:
+        lambda w: datasets.products(RUN, "dataset7"),
+    localrule: True
+
+
+rule dataset8:
+    input:
+        lambda w: datasets.products(RUN, "dataset8"),
+    localrule: True
+
+
+rule field:
+    input:
+        lambda w: datasets.products(RUN, "field"),
+    localrule: True
+
+
+# A target for each further file of config/dataset.
+for _dataset in datasets.datasets_without(rule.name for rule in workflow.rules):
+
+    rule:
+        name:
+            _dataset
+        input:
+            lambda w, dataset=_dataset: datasets.products(RUN, dataset),
+        localrule: True

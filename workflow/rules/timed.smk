@@ -1,16 +1,9 @@
 # Timings: each takes all cores, so that no other job disturbs it, and leaves one table; others,
 # which measure no time, run side by side.
 # Programs are those of workflow/benchmarks, by file and function.
-TIMED_BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
-TIMED_MIXTURE = TIMED_BUNDLE.replace(
-    "realisation", f"realisation{fit_files.get_bundle_suffix(method('gmm'))}"
-)
-OWN_MODEL = f"{RESULTS}/own_stars/example/model"
-
-
 rule cost:
     input:
-        stars=lambda w: stars_of(w.dataset),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
         bounds=rules.dataset_bounds.output.summary,
     output:
         f"{RESULTS}/costs/{{dataset}}/{{method}}-{{point}}.csv",
@@ -26,13 +19,14 @@ rule cost:
         runtime=30,
     params:
         config=lambda w: settings(
+            RUN,
             "costs.cost",
             f"dataset={w.dataset}",
-            more=tuple(TIMED.overrides(w.dataset, w.method)[w.point]),
+            more=timings.timed_overrides(w),
             name=w.method,
         ),
-        source=lambda w: program_code("costs.cost", [timed_module(w.method)]),
-        program=program("costs.cost"),
+        source=lambda w: program_code("costs.cost", timings.timed_module(w.method)),
+        program=program_of("costs.cost"),
         inputs=as_options,
     message:
         "Timing {wildcards.method}, {wildcards.point}, on {wildcards.dataset}"
@@ -44,7 +38,7 @@ rule cost:
 
 rule benchmark_costs:
     input:
-        timed_points,
+        lambda w: timings.cost_tables(RUN),
     output:
         f"{RESULTS}/tables/benchmark_costs.csv",
     log:
@@ -53,9 +47,9 @@ rule benchmark_costs:
         f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_costs.tsv"
     localrule: True
     params:
-        source=program_code("costs.costs", []),
-        program=program("costs.costs"),
-        points=repr(TIMED),
+        source=program_code_of("costs.costs"),
+        program=program_of("costs.costs"),
+        points=lambda w: repr(timings.timed_points()),
     message:
         "Joining errors and times of all methods"
     shell:
@@ -75,9 +69,9 @@ rule benchmark_inference:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings("speed.inference", f"dataset={TIMED_DATASET}"),
-        source=program_code("speed.inference", []),
-        program=program("speed.inference"),
+        config=lambda w: settings(RUN, "speed.inference", timings.timed_choice()),
+        source=program_code_of("speed.inference"),
+        program=program_of("speed.inference"),
     message:
         "Measuring for the table benchmark_inference"
     shell:
@@ -98,9 +92,9 @@ rule benchmark_scaling:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings("speed.growth", f"dataset={TIMED_DATASET}"),
-        source=program_code("speed.growth", ["templates", "stars", "predict"]),
-        program=program("speed.growth"),
+        config=lambda w: settings(RUN, "speed.growth", timings.timed_choice()),
+        source=program_code_of("speed.growth", "templates", "stars", "predict"),
+        program=program_of("speed.growth"),
     message:
         "Measuring for the table benchmark_scaling"
     shell:
@@ -110,9 +104,9 @@ rule benchmark_scaling:
 
 rule predict_throughput:
     input:
-        stars=lambda w: stars_of(TIMED_DATASET),
-        bundle=TIMED_BUNDLE,
-        mixture=TIMED_MIXTURE,
+        stars=lambda w: datasets.stars_file(RUN, timings.timed_dataset()),
+        bundle=lambda w: timings.timed_bundle(RUN, "dae"),
+        mixture=lambda w: timings.timed_bundle(RUN, "gmm"),
     output:
         f"{RESULTS}/tables/predict_throughput.csv",
     log:
@@ -125,9 +119,9 @@ rule predict_throughput:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings("prediction.throughput", f"dataset={TIMED_DATASET}"),
-        source=program_code("prediction.throughput", ["predict"]),
-        program=program("prediction.throughput"),
+        config=lambda w: settings(RUN, "prediction.throughput", timings.timed_choice()),
+        source=program_code_of("prediction.throughput", "predict"),
+        program=program_of("prediction.throughput"),
         inputs=as_options,
     message:
         "Measuring for the table predict_throughput"
@@ -138,7 +132,7 @@ rule predict_throughput:
 
 rule predict_poppy:
     input:
-        bundle=every_bundle_of_timed,
+        bundle=lambda w: timings.timed_bundles(RUN),
     output:
         f"{RESULTS}/tables/predict_poppy.csv",
     log:
@@ -150,11 +144,11 @@ rule predict_poppy:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings("prediction.poppy", f"dataset={TIMED_DATASET}"),
-        source=program_code("prediction.poppy", []),
-        program=program("prediction.poppy"),
+        config=lambda w: settings(RUN, "prediction.poppy", timings.timed_choice()),
+        source=program_code_of("prediction.poppy"),
+        program=program_of("prediction.poppy"),
         inputs=as_options,
-        limit=lambda w: [f"--count={poppy_stars(w)}"],
+        limit=lambda w: [f"--count={timings.poppy_stars(RUN)}"],
     message:
         "Measuring for the table predict_poppy"
     shell:
@@ -164,10 +158,13 @@ rule predict_poppy:
 
 rule predict_coverage:
     input:
-        stars=lambda w: [stars_of(TIMED_DATASET), f"{OWN_MODEL}/stars.h5"],
+        stars=lambda w: [
+            datasets.stars_file(RUN, timings.timed_dataset()),
+            f"{RESULTS}/own_stars/example/model/stars.h5",
+        ],
         bundle=lambda w: [
-            *every_bundle_of_timed(w),
-            f"{OWN_MODEL}/example.psf.safetensors",
+            *timings.timed_bundles(RUN),
+            f"{RESULTS}/own_stars/example/model/example.psf.safetensors",
         ],
     output:
         f"{RESULTS}/tables/predict_coverage.csv",
@@ -180,9 +177,9 @@ rule predict_coverage:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings("prediction.coverage", f"dataset={TIMED_DATASET}"),
-        source=program_code("prediction.coverage", []),
-        program=program("prediction.coverage"),
+        config=lambda w: settings(RUN, "prediction.coverage", timings.timed_choice()),
+        source=program_code_of("prediction.coverage"),
+        program=program_of("prediction.coverage"),
         inputs=as_options,
     message:
         "Measuring for the table predict_coverage"
@@ -193,8 +190,8 @@ rule predict_coverage:
 
 rule predict_strange:
     input:
-        stars=lambda w: stars_of(TIMED_DATASET),
-        bundle=TIMED_MIXTURE,
+        stars=lambda w: datasets.stars_file(RUN, timings.timed_dataset()),
+        bundle=lambda w: timings.timed_bundle(RUN, "gmm"),
     output:
         f"{RESULTS}/tables/predict_strange.csv",
     log:
@@ -206,9 +203,9 @@ rule predict_strange:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings("prediction.outliers", f"dataset={TIMED_DATASET}"),
-        source=program_code("prediction.strange", []),
-        program=program("prediction.strange"),
+        config=lambda w: settings(RUN, "prediction.outliers", timings.timed_choice()),
+        source=program_code_of("prediction.strange"),
+        program=program_of("prediction.strange"),
         inputs=as_options,
     message:
         "Measuring for the table predict_strange"
@@ -230,11 +227,11 @@ rule scaling_stages:
         runtime=60,
         disk_mb=2000,
     params:
-        config=lambda w: settings("speed.stages", f"dataset={TIMED_DATASET}"),
-        source=program_code(
-            "speed.stages", ["templates", "stars", "fit", "evaluate", "predict"]
+        config=lambda w: settings(RUN, "speed.stages", timings.timed_choice()),
+        source=program_code_of(
+            "speed.stages", "templates", "stars", "fit", "evaluate", "predict"
         ),
-        program=program("speed.stages"),
+        program=program_of("speed.stages"),
     message:
         "Measuring for the table scaling_stages"
     shell:

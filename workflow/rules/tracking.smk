@@ -1,8 +1,8 @@
 rule track:
     input:
-        stars=lambda w: stars_of(w.dataset),
-        evaluations=lambda w: evaluations_of(w.dataset),
-        figures=lambda w: figures_of(w.dataset),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+        evaluations=lambda w: datasets.evaluations(RUN, w.dataset),
+        figures=lambda w: datasets.figures(RUN, w.dataset),
     output:
         f"{RESULTS}/mlflow/{{dataset}}.csv",
     log:
@@ -17,7 +17,7 @@ rule track:
         preset=PRESET,
         # Not an output: Snakemake would delete it, and with it the runs of older configs.
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("track"),
+        source=code_of("track"),
     message:
         "Importing the runs of {wildcards.dataset} into MLflow"
     shell:
@@ -46,6 +46,6 @@ use rule track as track_alignment with:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("track"),
+        source=code_of("track"),
     message:
         "Importing the runs of scene 3 into MLflow"

@@ -326,8 +326,15 @@ def groups() -> dict[str, str]:
     return help_texts
 
 
+def full_name(name: str) -> str:
+    """Return the name of a command; `paper` before the name of a stage may be left out."""
+    stage_name = f"paper {name}"
+    return stage_name if stage_name in command_modules() else name
+
+
 def stage(name: str) -> Callable[..., Any]:
-    """Return the function of a command, whose module is imported."""
+    """Return the function of a command (`full_name`), whose module is imported."""
+    name = full_name(name)
     module = import_module(command_modules()[name][0])
     stages = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
     function: Callable[..., Any] = next(f for f in stages if f.stage.name == name)

@@ -1,7 +1,7 @@
 """Settings of a model of an image: defaults, and values from a command line or from keywords.
 
 A word of a command line is `group.key=value`. A word that chooses a file of a configuration, such
-as `train=onecycle` or `preset=smoke`, is read by the extra "paper", by its entry point of the group
+as `dataset=field` or `preset=smoke`, is read by the extra "paper", by its entry point of the group
 "psfdae.base.settings".
 """
 

@@ -103,13 +103,12 @@ def _primary(folder: Path) -> str:
         for name, group_class in _group_classes().items()
     }
     class_defaults = {name: values for name, values in class_defaults.items() if values}
-    # Groups that the root's list has, each with the name of one of its files.
     tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
-    listed_groups = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    # Settings of methods come before the file's list: datasets and presets may change them.
+    # The root file has settings of our own methods; those of other packages have files of their
+    # own, which come before its list: datasets and presets may change them.
     method_defaults = [
-        {f"optional {group}": "default"} for group in sorted({*all_groups()} - listed_groups)
+        {f"optional {group}": "default"} for group in sorted({*all_groups()} - tree.keys())
     ]
     # From the weakest to the strongest.
     all_defaults = ["class_defaults", *method_defaults, *defaults]
@@ -428,7 +427,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
 
     The workflow takes one list for everything. A key that only other datasets have is left
     out; one that no dataset has stays, so that it is refused by name. Options of a group, such as
-    train=onecycle, apply to all datasets, but to scene 3 only those of groups that it has as well.
+    telescope=wfsat_literal, apply to all datasets, but to scene 3 only presets.
 
     Parameters
     ----------
@@ -446,12 +445,11 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     tuple of str
         Overrides in the order in which they were given.
     """
-    # Words such as train=onecycle choose a file of a group; scene 3 takes few of these groups.
+    # Words such as preset=smoke choose a file of a group; scene 3 has a telescope of its own.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
     applicable_options = options
     if tuple(choice) == Alignment.choice:
-        shared_groups = ("preset", "prescription", "dae_train", "network_train")
-        applicable_options = [word for word in options if _key(word) in shared_groups]
+        applicable_options = [word for word in options if _key(word) == "preset"]
 
     def has_key(choice: Sequence[str], dotted_key: str) -> bool:
         """Return True if the configuration of a dataset has a key."""

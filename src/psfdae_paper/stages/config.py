@@ -37,14 +37,12 @@ def config(
         settings = load(overrides)
     else:
         # "alignment model", "alignment_model" and "alignment-model" name the same stage.
-        names = {_key(name): name for name in command_modules()}
+        names = {_key(name.removeprefix("paper ")): name for name in command_modules()}
         reader = None
         if _key(only) in names:
             reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
         if reader is None:
-            raise click.BadParameter(
-                f"{only!r} is not one of {', '.join(sorted(command_modules()))}"
-            )
+            raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names.values()))}")
         # Groups of the stage without options; a stage may read more with some of them.
         groups = Groups(reader.names({}), reader.choice)
         settings = load_stage(groups.names({}), groups.with_choice(overrides))

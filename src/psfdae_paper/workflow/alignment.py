@@ -1,0 +1,61 @@
+"""Files of scene 3: states of misalignment, networks that estimate them, and fits."""
+
+from __future__ import annotations
+
+from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.workflow.run import SCENE3, Run, dataset_config
+
+TEST_SETS = ("uniform", "grid")
+PAPER_TABLES = {
+    "0.002": "table of errors at λ = 0.002",
+    "0.005": "table of errors at λ = 0.005",
+    "correlation": "table of correlations",
+}
+"""Tables that the paper prints, with their titles in the report."""
+
+
+def alignment_config(run: Run) -> Config:
+    """Return the checked configuration of scene 3; a wrong key ends the program."""
+    return dataset_config(run, SCENE3)
+
+
+def training_states(run: Run, network: str) -> str:
+    """Return the states on which a network is trained."""
+    return f"{run.results}/data/alignment/{ESTIMATORS[network].states}.h5"
+
+
+def network_dae(run: Run, network: str) -> list[str]:
+    """Return the weights of the DAE, if a network is trained on its output."""
+    weights = f"{run.results}/alignment/dae/dae.safetensors"
+    return [weights] if ESTIMATORS[network].denoised else []
+
+
+def network_files(run: Run, name: str, weights: str) -> dict[str, str]:
+    """Return the files of a training by the names of a rule's outputs.
+
+    Parameters
+    ----------
+    run : Run
+        Run of the training.
+    name : str
+        Network, or "dae".
+    weights : str
+        Name of the file with the weights.
+    """
+    folder = f"{run.results}/alignment/{name}"
+    files = ("config.yaml", "trained_on.yaml", "history.csv")
+    named = {file.partition(".")[0]: f"{folder}/{file}" for file in files}
+    return {"weights": f"{folder}/{weights}", **named}
+
+
+def likelihood_network(run: Run) -> str:
+    """Return the weights of the network at whose estimates the fits start."""
+    return f"{run.results}/alignment/{ESTIMATORS['max_likelihood'].network}/network.safetensors"
+
+
+def fit_files(run: Run, *test_sets: str, ending: str = ".h5") -> list[str]:
+    """Return the fits of test sets at all noise levels; their times have the ending _times.csv."""
+    levels = [f"{level:g}" for level in alignment_config(run).noise.levels]
+    folder = f"{run.results}/alignment/fits"
+    return [f"{folder}/{name}_{level}{ending}" for name in test_sets for level in levels]

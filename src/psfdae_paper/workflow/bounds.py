@@ -1,0 +1,39 @@
+"""Files of the lower bounds of errors, and of the estimates by the optics of the telescope."""
+
+from __future__ import annotations
+
+from psfdae_paper.workflow.run import Run, dataset_config, default_datasets
+
+
+def dataset_files(run: Run, ending: str) -> list[str]:
+    """Return the bounds of the datasets of the default target.
+
+    The ending is ".csv" for means, "_growth.csv" for banks of several sizes, or ".parquet" for
+    single stars.
+    """
+    return [f"{run.results}/bounds/{dataset}{ending}" for dataset in default_datasets(run)]
+
+
+def has_bank(run: Run, dataset: str) -> bool:
+    """Return True if stars have random aberrations, of which a bank is drawn."""
+    return bool(dataset_config(run, dataset).stars.aberration_fraction > 0)
+
+
+def bank_files(run: Run, dataset: str) -> list[str]:
+    """Return the bank of simulated stars of a dataset, if it has one."""
+    stars = dataset_config(run, dataset).stars.name
+    return [f"{run.results}/bounds/bank/{stars}.h5"] if has_bank(run, dataset) else []
+
+
+def optics_files(run: Run, dataset: str, ending: str) -> list[str]:
+    """Return the errors of the methods that know the telescope, if there is a bank.
+
+    The ending is "csv" for means, or "parquet" for single stars.
+    """
+    return [f"{run.results}/wavefront/{dataset}.{ending}"] if has_bank(run, dataset) else []
+
+
+def bound_figures(run: Run, dataset: str) -> list[str]:
+    """Return the figures of a dataset's bounds."""
+    kinds = ["errors", "efficiency"] + (["growth"] if has_bank(run, dataset) else [])
+    return [f"{run.results}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]

@@ -1,0 +1,235 @@
+"""Files of datasets and scenes: stars, evaluations, tables, figures, products of a target."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Any
+
+from psfdae.base.reading import read_yaml
+from psfdae.base.settings import ConfigError
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.compose import dataset_names
+from psfdae_paper.configuration.consistency import simulation_changes
+from psfdae_paper.workflow.fits import bundle_files, histories, method_names
+from psfdae_paper.workflow.run import (
+    SCENE3,
+    Run,
+    Wildcards,
+    compose_choice,
+    dataset_config,
+    default_datasets,
+    exit_in_one_line,
+)
+
+OWN_STARS = "from_stars"
+"""The dataset whose stars are those of an image, and not simulated."""
+METRICS = ("ssim", "mse")
+TABULATED = ("dataset3", "dataset5", "dataset8")
+"""The datasets that the paper tabulates; the calibration compares with their rows."""
+SHIPPED_DATASET = "field"
+"""The stars and the training of the model that comes with the package."""
+SCENE_HEADINGS = {
+    "scene1": "Scene 1: field-dependent aberrations",
+    "scene2": "Scene 2: static turbulence",
+    "scene3": "Scene 3: alignment of a mirror",
+    "own_telescope": "Own telescopes",
+}
+"""Headings of the report."""
+
+
+def simulated_datasets() -> list[str]:
+    """Return the datasets with simulated stars."""
+    return [name for name in dataset_names() if name not in (OWN_STARS, SCENE3)]
+
+
+def datasets_without(names: Iterable[str]) -> list[str]:
+    """Return the simulated datasets that are none of some rules."""
+    return sorted(set(simulated_datasets()) - set(names))
+
+
+def compared_methods(run: Run) -> list[str]:
+    """Return the methods of the example of an image: those of the datasets and of own stars.
+
+    The command leaves out the methods that take long; here all are compared.
+    """
+    datasets = (default_datasets(run)[0], OWN_STARS)
+    return list(dict.fromkeys(name for d in datasets for name in method_names(run, d)))
+
+
+@cache
+def _owners() -> tuple[dict[str, str], dict[str, str]]:
+    """Return the first dataset of each set of stars, and of each scene.
+
+    The files are read as they are, without their defaults: that takes a hundredth of the time of
+    their composition. A dataset that has the stars of another one does not name them itself.
+    Datasets of the default target come first, so that a further one does not become the first.
+    """
+    stars: dict[str, str] = {}
+    scenes: dict[str, str] = {}
+    usual = read_yaml(config_dir() / "config.yaml")["workflow"]["datasets"]
+    for dataset in dict.fromkeys([*usual, *simulated_datasets()]):
+        path = config_dir() / f"dataset/{dataset}.yaml"
+        tree = read_yaml(path) if path.is_file() else {}
+        if name := (tree.get("stars") or {}).get("name"):
+            stars.setdefault(name, dataset)
+        for entry in tree.get("defaults", []):
+            if isinstance(entry, dict) and "/scene" in entry:
+                scenes.setdefault(entry["/scene"], dataset)
+    return stars, scenes
+
+
+def stars_names() -> list[str]:
+    """Return the names of the sets of stars that datasets share."""
+    return list(_owners()[0])
+
+
+def scene_names() -> list[str]:
+    """Return the names of the scenes."""
+    return sorted(_owners()[1])
+
+
+def stars_choice(stars: str) -> str:
+    """Return the override that chooses the dataset by which a set of stars is simulated."""
+    return f"dataset={_owners()[0][stars]}"
+
+
+def scene_choice(scene: str) -> str:
+    """Return the override that chooses the dataset by which static PSFs are computed."""
+    return f"dataset={_owners()[1][scene]}"
+
+
+def templates_file(run: Run, stars: str) -> str:
+    """Return the static PSFs from which a set of stars is made."""
+    tree = compose_choice(run, stars_choice(stars))
+    return f"{run.results}/data/{tree['scene']['name']}/templates.h5"
+
+
+@cache
+@exit_in_one_line()
+def stars_file(run: Run, dataset: str) -> str:
+    """Return the stars of a dataset: those of its `stars.name`, or of its own telescope.
+
+    Datasets share the stars of a name, which are simulated by the first of them. A dataset that
+    changes a group of the simulation would get the stars of the others: it ends the program.
+
+    Parameters
+    ----------
+    run : Run
+        Run of the job.
+    dataset : str
+        Option of the group dataset.
+    """
+    config = dataset_config(run, dataset)
+    name = config.stars.name
+    # Datasets of own telescopes have stars of their own (own_telescope.smk).
+    if config.scene.name != "telescope":
+        file = os.path.relpath(config_dir() / f"dataset/{dataset}.yaml")
+        advice = f"stars of its own have another stars.name in {file}"
+        if name not in stars_names():
+            raise ConfigError(
+                f"dataset={dataset}: stars.name = {name}: no dataset has these stars; {advice}"
+            )
+        tree, choice = compose_choice(run, f"dataset={dataset}"), stars_choice(name)
+        for key, value, simulated in simulation_changes(tree, compose_choice(run, choice)):
+            raise ConfigError(
+                f"dataset={dataset}: {key} = {value}, but its stars are those of {choice} with "
+                f"{simulated}; {advice}"
+            )
+    return f"{run.results}/data/{config.scene.name}/{name}.h5"
+
+
+def networks(run: Run, dataset: str) -> list[tuple[str, str]]:
+    """Return split and reference of each network of a dataset."""
+    chosen = dataset_config(run, dataset).dataset
+    return [(split, reference) for split in chosen.splits for reference in chosen.references]
+
+
+def evaluations(run: Run, dataset: str, splits: Sequence[str] = ()) -> list[str]:
+    """Return the evaluations (CSV) of a dataset, of all its splits unless some are named."""
+    return [
+        f"{run.results}/evaluation/{dataset}/{split}-{reference}.csv"
+        for split, reference in networks(run, dataset)
+        if not splits or split in splits
+    ]
+
+
+def star_errors(run: Run, dataset: str, splits: Sequence[str] = ()) -> list[str]:
+    """Return the errors of the methods on single test stars (parquet), as `evaluations`."""
+    files = evaluations(run, dataset, splits)
+    return [csv.removesuffix(".csv") + ".parquet" for csv in files]
+
+
+def paper_tables(run: Run, dataset: str) -> list[str]:
+    """Return the paper's tables of a dataset, as CSV and as Markdown."""
+    stems = [f"{run.results}/tables/{dataset}_{metric}" for metric in METRICS]
+    return [f"{stem}.{ending}" for stem in stems for ending in ("csv", "md")]
+
+
+def metric_options(wildcards: Wildcards, output: Any) -> list[str]:
+    """Return the options of a command that makes a file of each metric."""
+    return [f"--out {metric} {output[metric]}" for metric in METRICS]
+
+
+def shown_levels(run: Run, dataset: str) -> list[float]:
+    """Return the noise levels λ of the figure of restored stars.
+
+    These are the levels `dataset.shown_levels` that the noise band has, or its extremes.
+    """
+    config = dataset_config(run, dataset)
+    band = config.noise.levels
+    asked = [level for level in config.dataset.shown_levels if level in band]
+    return asked or sorted({min(band), max(band)})
+
+
+def report_category(run: Run, wildcards: Wildcards) -> str:
+    """Return the heading of a figure in the report: its scene."""
+    experiment: str
+    if "scene" in wildcards.keys():  # type: ignore[operator]  # noqa: SIM118 (a named list)
+        experiment = compose_choice(run, scene_choice(wildcards.scene))["scene"]["experiment"]
+    else:
+        experiment = dataset_config(run, wildcards.dataset).scene.experiment
+    return SCENE_HEADINGS.get(experiment, experiment)
+
+
+def has_own_telescope(run: Run, dataset: str) -> bool:
+    """Return True if a dataset has a telescope with aberrations of its own."""
+    return bool(dataset_config(run, dataset).scene.name == "telescope")
+
+
+def figures(run: Run, dataset: str) -> list[str]:
+    """Return the figures of a dataset and of its scene, or of its own telescope."""
+    config, folder = dataset_config(run, dataset), f"{run.results}/figures"
+    if has_own_telescope(run, dataset):
+        fields = [f"telescope/{config.stars.name}"]
+    else:
+        fields = [f"{config.scene.name}/{name}" for name in ("templates", "energy")]
+    return [
+        *(f"{folder}/{field}.png" for field in fields),
+        *([f"{folder}/{dataset}/curves.png"] if histories(run, dataset) else []),
+        *(f"{folder}/{dataset}/errors_{metric}.png" for metric in METRICS),
+        *(f"{folder}/{dataset}/strip_{r}.png" for r in config.dataset.references),
+    ]
+
+
+def products(run: Run, dataset: str) -> list[str]:
+    """Return all files that the target of a dataset builds."""
+    has_bundles = has_own_telescope(run, dataset)
+    return [
+        *(bundle_files(run, dataset, networks(run, dataset)) if has_bundles else []),
+        *evaluations(run, dataset),
+        *paper_tables(run, dataset),
+        *figures(run, dataset),
+        f"{run.results}/mlflow/{dataset}.csv",
+    ]
+
+
+def default_products(run: Run, experiment: str = "") -> list[str]:
+    """Return all files of the datasets of the default target, or of those of one scene."""
+    return [
+        file
+        for dataset in default_datasets(run)
+        if not experiment or dataset_config(run, dataset).scene.experiment == experiment
+        for file in products(run, dataset)
+    ]

@@ -1,0 +1,229 @@
+"""Fits of the methods: their files, options of commands that read them, and resources."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from psfdae.methods import fit_files, method
+from psfdae.methods.interface import HISTORY, Method
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.source import source_hash
+from psfdae_paper.workflow.run import (
+    BUNDLE_SUFFIX,
+    Run,
+    Wildcards,
+    code_of,
+    dataset_config,
+    settings,
+)
+
+WILDCARDS = ("{dataset}", "{split}", "{reference}")
+
+
+def method_names(run: Run, dataset: str) -> list[str]:
+    """Return the names of a dataset's methods, in the order of tables."""
+    names: list[str] = dataset_config(run, dataset).methods
+    return names
+
+
+def stored_methods(run: Run, dataset: str) -> list[type[Method]]:
+    """Return the methods of a dataset whose fit leaves files."""
+    return [m for m in map(method, method_names(run, dataset)) if m.storage]
+
+
+def fit_place(run: Run, name: str, dataset: str, split: str, reference: str) -> str:
+    """Return the folder or file of a fit."""
+    return f"{run.results}/{fit_files.get_fit_path(method(name), dataset, split, reference)}"
+
+
+def fit_outputs(run: Run, name: str, *key: str) -> list[str]:
+    """Return all files of a fit of a dataset, split and reference; by default with wildcards."""
+    place = fit_place(run, name, *(key or WILDCARDS))
+    return [str(path) for path in fit_files.outputs(method(name), place)]
+
+
+def fit_option(run: Run, name: str, *key: str) -> str:
+    """Return the option of a command that takes the fit of a dataset, split and reference."""
+    return f"--{name.replace('_', '-')}={fit_place(run, name, *key)}"
+
+
+def fitted_files(run: Run, *key: str) -> list[str]:
+    """Return the files of all fits of a dataset that restore stars of a split and reference."""
+    return [p for m in stored_methods(run, key[0]) for p in fit_outputs(run, m.name, *key)]
+
+
+def fit_options(run: Run, *key: str) -> list[str]:
+    """Return the options of a command that takes these fits."""
+    return [fit_option(run, m.name, *key) for m in stored_methods(run, key[0])]
+
+
+def start_files(run: Run, name: str) -> Callable[[Wildcards], dict[str, list[str]]]:
+    """Return an input: the fit to the realisations from which the fit to the templates starts.
+
+    It is empty for fits to the realisations, and where the settings make no fit start there.
+    """
+
+    def start(wildcards: Wildcards) -> dict[str, list[str]]:
+        if wildcards.get("reference") != "template":
+            return {}
+        if not method(name).continues(dataset_config(run, wildcards.dataset)):
+            return {}
+        key = (wildcards.dataset, wildcards.split, "realisation")
+        return {"start": fit_outputs(run, name, *key)}
+
+    return start
+
+
+def fit_log(name: str) -> str:
+    """Return the path of the log of a fit below the folder of logs, without ending."""
+    kind = method(name)
+    return f"{fit_files.get_rule_name(kind)}/{fit_files.stem(kind, *WILDCARDS)}"
+
+
+def fit_params(run: Run, name: str) -> dict[str, Any]:
+    """Return the parameters of a rule that fits a method.
+
+    Parameters
+    ----------
+    run : Run
+        Run of the job.
+    name : str
+        Name of the method.
+    """
+    stem = fit_files.stem(method(name), *WILDCARDS)
+
+    def config(wildcards: Wildcards) -> str:
+        return settings(run, "fit", f"dataset={wildcards.dataset}", name=name)
+
+    def more(wildcards: Wildcards, input: Any) -> list[str]:
+        reference = wildcards.get("reference")
+        options = [f"--reference={reference}"] if reference else []
+        if input.get("start"):
+            key = (wildcards.dataset, wildcards.split, "realisation")
+            options.append(f"--start={fit_place(run, name, *key)}")
+        return options
+
+    return {
+        "config": config,
+        "source": code_of("fit", method(name).__module__),
+        "method": name,
+        "more": more,
+        "place": fit_place(run, name, *WILDCARDS),
+        # Not an output: Snakemake would delete it with the outputs of a job that fails.
+        "checkpoint": f"{run.results}/checkpoints/{name}/{stem}.pt",
+    }
+
+
+def fit_resources(name: str) -> dict[str, int]:
+    """Return memory in MB and time in minutes of a fit."""
+    needs = method(name).needs
+    return {"mem_mb": needs.memory_mb, "runtime": needs.minutes}
+
+
+def fit_threads(run: Run, name: str) -> Callable[[Wildcards], int]:
+    """Return the number of threads of a fit, as a function of wildcards."""
+    return lambda wildcards: method(name).threads(dataset_config(run, wildcards.dataset))
+
+
+def most_threads(run: Run, dataset: str) -> int:
+    """Return the largest number of threads of the fits of a dataset's methods."""
+    config = dataset_config(run, dataset)
+    return max([m.threads(config) for m in stored_methods(run, dataset)], default=1)
+
+
+def rules_without(names: Iterable[str]) -> dict[str, str]:
+    """Return rule and name of the methods that store a fit and have none of these rules.
+
+    These are methods of other packages: the rules of our own are written out.
+    """
+    known = set(names)
+    found = {fit_files.get_rule_name(m): m.name for m in registered() if m.storage}
+    return {rule: name for rule, name in found.items() if rule not in known}
+
+
+# Bundles.
+
+
+def bundle_suffixes() -> dict[str, str]:
+    """Return the names of the methods that can be packed, by the ending of their bundles."""
+    return {fit_files.get_bundle_suffix(m): m.name for m in registered() if m.storage and m.packing}
+
+
+def bundle_file(run: Run, dataset: str, split: str, reference: str, suffix: str) -> str:
+    """Return the bundle of a fit; the suffix is that of its method."""
+    return f"{run.results}/bundles/{dataset}-{split}-{reference}{suffix}{BUNDLE_SUFFIX}"
+
+
+def bundle_files(run: Run, dataset: str, networks: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the bundles of a dataset's methods for some pairs of split and reference."""
+    return [
+        bundle_file(run, dataset, split, reference, fit_files.get_bundle_suffix(m))
+        for m in stored_methods(run, dataset)
+        if m.packing
+        for split, reference in networks
+    ]
+
+
+def bundle_memory(suffix: str) -> int:
+    """Return the memory in MB that packing takes: a fit's, and errors of many stars."""
+    return max(1500, fit_resources(bundle_suffixes()[suffix])["mem_mb"])
+
+
+def packed_method(wildcards: Wildcards) -> str:
+    """Return the method of a bundle, whose name ends in the wildcard `suffix`."""
+    return bundle_suffixes()[wildcards.suffix]
+
+
+def packed_files(run: Run, wildcards: Wildcards) -> list[str]:
+    """Return the files of the fit that a bundle packs."""
+    key = (wildcards.dataset, wildcards.split, wildcards.reference)
+    return fit_outputs(run, packed_method(wildcards), *key)
+
+
+def packed_option(run: Run, wildcards: Wildcards) -> str:
+    """Return the option of a command that takes this fit."""
+    key = (wildcards.dataset, wildcards.split, wildcards.reference)
+    return fit_option(run, packed_method(wildcards), *key)
+
+
+def seed_fits(run: Run, wildcards: Wildcards) -> list[str]:
+    """Return the fits of a method with the usual seed; none of a method that stores no fit."""
+    if method(wildcards.method).storage is None:
+        return []
+    references = dataset_config(run, wildcards.dataset).dataset.references
+    return [
+        file
+        for reference in references
+        for file in fit_outputs(run, wildcards.method, wildcards.dataset, "random", reference)
+    ]
+
+
+# Code and courses of trainings.
+
+
+def estimators_code(run: Run, command: str, dataset: str) -> str:
+    """Return the hash of a command that applies the methods of a dataset."""
+    return methods_code(command, method_names(run, dataset))
+
+
+def methods_code(command: str, names: Iterable[str]) -> str:
+    """Return the hash of a command that applies some methods."""
+    return source_hash(command, *(method(name).__module__ for name in names))
+
+
+def histories(run: Run, dataset: str) -> dict[str, str]:
+    """Return the tables with the courses of a dataset's trainings, each with its label."""
+    chosen = dataset_config(run, dataset).dataset
+    trained = [
+        m for m in stored_methods(run, dataset) if HISTORY in fit_files.get_storage(m).diagnostics
+    ]
+    labels = {}
+    for m in trained:
+        for split in chosen.splits:
+            for reference in chosen.references:
+                place = fit_place(run, m.name, dataset, split, reference)
+                # The method's label distinguishes courses of several methods.
+                words = [dataset, split, reference, *([m.look.label] if len(trained) > 1 else [])]
+                labels[str(fit_files.path_beside(m, place, HISTORY))] = ", ".join(words)
+    return labels

@@ -1,0 +1,378 @@
+"""The run that a command line of snakemake describes, and the settings and code of its jobs."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+from pydantic import Field
+
+from psfdae.base.errors import Error, did_you_mean
+from psfdae.base.files import as_yaml, write_text
+from psfdae.base.reading import read_yaml
+from psfdae.base.settings import ConfigError, Group, Name, parse_settings
+from psfdae.commands.cli import stage
+from psfdae_paper.configuration.compose import compose, load, overrides_for, part, write_settings
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.source import SOURCES, source_hash
+
+BENCHMARKS = os.path.relpath(SOURCES.parent / "workflow/benchmarks")
+"""Folder of the programs that measure times, relative to the working directory."""
+STRESS_TESTS = SOURCES.parent / "tests/stress"
+BUNDLE_SUFFIX = ".psf.safetensors"
+SCENE3 = "alignment"
+"""The dataset with states of misalignment in place of stars."""
+
+ShellWord = Annotated[str, Field(pattern=r"^([A-Za-z0-9_./+=@%:,][A-Za-z0-9_./+=@%:,-]*)?$")]
+"""One word of a shell, and no option: commands of rules take it unquoted."""
+
+
+class CommandLine(Group):
+    """Words of snakemake's --config; all other settings are in the folder config."""
+
+    preset: Name = "fast"
+    """Option of the group config/preset."""
+    set: str = ""
+    """Hydra overrides for every dataset, separated by spaces."""
+    sweep: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]*$")] = ""
+    """File of config/sweep, for the target sweep."""
+    images: str = ""
+    """Images of a night, as night/*.fits or a CSV list, for the target night."""
+    telescope: str = ""
+    """YAML file of the telescope that took the images of a night."""
+    results: ShellWord = ""
+    """Folder of the results; results for the preset fast, else results/PRESET. A finished run in it
+    gives preset and set where the command has none."""
+
+
+class Wildcards(Protocol):
+    """Wildcards of a job, whose attributes depend on its rule."""
+
+    def __getattr__(self, name: str) -> str: ...
+
+    def get(self, name: str, default: str = "") -> str:
+        """Return a wildcard, or a default where the rule has none of this name."""
+        ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of the workflow.
+
+    Attributes
+    ----------
+    preset : str
+        Option of the group config/preset.
+    overrides : tuple of str
+        Hydra overrides of every dataset; the first chooses the preset.
+    results : str
+        Folder of the results.
+    is_folder_named : bool
+        The command line names this folder, so that its run may be replaced.
+    sweep, images, telescope : str
+        As of `CommandLine`; empty if they are not given.
+    is_dry : callable
+        Returns True if no file is to be written. Snakemake knows it after it has read all rules.
+    """
+
+    preset: str
+    overrides: tuple[str, ...]
+    results: str
+    is_folder_named: bool = False
+    sweep: str = ""
+    images: str = ""
+    telescope: str = ""
+    is_dry: Callable[[], bool] = bool
+
+
+@contextmanager
+def exit_in_one_line(prefix: str = "") -> Iterator[None]:
+    """End the program with the message of an error of the package, without a traceback.
+
+    Parameters
+    ----------
+    prefix : str
+        Begins the message, for example with the dataset that was chosen.
+    """
+    try:
+        yield
+    except Error as error:
+        sys.exit(f"psfdae: {prefix}{error}")
+
+
+@exit_in_one_line()
+def require_own_package(workflow_folder: str | Path) -> None:
+    """End the program if the package is that of another clone than the rules.
+
+    An environment is linked to the clone that made it. In a second clone, code and configuration
+    of the first one would run.
+
+    Parameters
+    ----------
+    workflow_folder : str or Path
+        Folder of the Snakefile.
+    """
+    root, folder = SOURCES.parent, Path(workflow_folder).resolve()
+    # An installed package has no rules beside it.
+    if (root / "workflow/Snakefile").is_file() and (root / "workflow").resolve() != folder:
+        raise ConfigError(
+            f"rules of {folder.parent}, but the package of {root}: run `make env` in "
+            f"{folder.parent}, or set PYTHONPATH={folder.parent / 'src'}"
+        )
+
+
+@exit_in_one_line()
+def read_run(words: Mapping[str, Any], is_dry: Callable[[], bool] = bool) -> Run:
+    """Return the run that a command line describes; end the program if a word is wrong.
+
+    Preset and overrides that are not given are those of the finished run in the folder, so that a
+    further target of it needs nothing but the folder's name.
+
+    Parameters
+    ----------
+    words : mapping
+        Snakemake's `config`.
+    is_dry : callable
+        See `Run`.
+    """
+    given = {key: value for key, value in words.items() if value}
+    known = list(CommandLine.model_fields)
+    for word in set(given) - set(known):
+        hint = did_you_mean(word, known)
+        raise ConfigError(f"--config {word}: there are {', '.join(known)}{hint}")
+    finished = read_finished_run(str(given["results"])) if "results" in given else {}
+    line = parse_settings(CommandLine, {**finished, **given})
+    try:
+        overrides = (f"preset={line.preset}", *shlex.split(line.set))
+    except ValueError as error:
+        raise ConfigError(f"set = {line.set!r}: {error}") from None
+    default_folder = "results" if line.preset == "fast" else f"results/{line.preset}"
+    return Run(
+        line.preset,
+        overrides,
+        line.results or default_folder,
+        bool(line.results),
+        line.sweep,
+        line.images,
+        line.telescope,
+        is_dry,
+    )
+
+
+def read_finished_run(folder: str) -> dict[str, str]:
+    """Return preset and overrides (`set`) of the finished run in a folder; empty without one.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If the record `run.yaml` is damaged.
+    """
+    record = Path(folder, "run.yaml")
+    if record.is_file():
+        tree = read_yaml(record)
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{record}: must be a mapping")
+        return tree
+    # Whole runs of earlier versions have no record.
+    return {"set": ""} if Path(folder, "runtime.csv").is_file() else {}
+
+
+@exit_in_one_line()
+def require_same_run(run: Run) -> None:
+    """End the program before a run with other overrides is replaced in an unnamed folder.
+
+    Points of sweeps are named by their content, and replace none; a night has its own folder.
+
+    Parameters
+    ----------
+    run : Run
+        Run that is about to start.
+    """
+    finished = read_finished_run(run.results)
+    if run.is_folder_named or run.sweep or run.images or not finished:
+        return
+    finished_words, words = shlex.split(finished.get("set") or ""), run.overrides[1:]
+    lost = " ".join(word for word in finished_words if word not in words)
+    added = " ".join(word for word in words if word not in finished_words)
+    if lost or added:
+        differences = [f"with {lost}"] * bool(lost) + [f"without {added}"] * bool(added)
+        purpose = "to replace it" if words else "to go on with it"
+        raise ConfigError(
+            f"{run.results} holds a finished run {' and '.join(differences)}; name a folder for "
+            f"this one, RESULTS={run.results}/NAME, or RESULTS={run.results} {purpose} "
+            "(snakemake: --config results=…)"
+        )
+
+
+def record_run(run: Run) -> None:
+    """Write preset and overrides of a finished run into its folder."""
+    if not (run.sweep or run.images):
+        record = {"preset": run.preset, "set": shlex.join(run.overrides[1:])}
+        write_text(Path(run.results, "run.yaml"), as_yaml(record))
+
+
+def close_target(words: Sequence[str], targets: Sequence[str]) -> str:
+    """Return a line that names the target which a mistyped word resembles; empty if none does.
+
+    Snakemake takes a mistyped target for a file that no rule makes. Values of options, such as
+    mtime, resemble no target as much as a typing error does.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Words of the command line.
+    targets : sequence of str
+        Names of all rules.
+    """
+    for word in words:
+        if word.isidentifier() and word not in targets and not Path(word).exists():
+            for name in get_close_matches(word, targets, n=1, cutoff=0.8):
+                return f"psfdae: no target {word}; did you mean {name}?"
+    return ""
+
+
+# Configuration.
+
+
+@exit_in_one_line()
+def compose_choice(run: Run, *choice: str, more: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return the configuration of a choice with the run's overrides that concern it, unchecked.
+
+    Parameters
+    ----------
+    run : Run
+        Its overrides are selected by `overrides_for`.
+    *choice : str
+        Such as dataset=dataset3.
+    more : tuple of str
+        Further overrides of one job.
+    """
+    return compose((*choice, *overrides_for(run.overrides, choice), *more))
+
+
+@cache
+def dataset_config(run: Run, dataset: str) -> Config:
+    """Return the checked configuration of a dataset; a wrong key ends the program."""
+    choice = f"dataset={dataset}"
+    with exit_in_one_line(f"{choice}: "):
+        return load((choice, *overrides_for(run.overrides, (choice,))))
+
+
+@cache
+@exit_in_one_line()
+def default_datasets(run: Run) -> list[str]:
+    """Return the datasets that are built if the command line names none.
+
+    Sizes that fit together in one dataset may not in another: they are checked where one is built.
+    """
+    names: list[str] = part(("workflow",), compose_choice(run)).workflow.datasets
+    if SCENE3 in names:
+        raise ConfigError(f"workflow.datasets: {SCENE3} is built by the target scene3")
+    return names
+
+
+# Settings and code of jobs.
+
+
+@cache
+@exit_in_one_line()
+def settings(
+    run: Run, name: str, /, *choice: str, more: tuple[str, ...] = (), **options: str
+) -> str:
+    """Return the file with the settings that a stage reads, and write it unless the run is dry.
+
+    The file's name follows from the settings that can change a result: another name repeats a job.
+
+    Parameters
+    ----------
+    run : Run
+        Run of the job.
+    name : str
+        Command, or module and function of a program in `BENCHMARKS`, such as "costs.cost".
+    *choice : str
+        Such as dataset=dataset3.
+    more : tuple of str
+        Further overrides.
+    **options : str
+        Options of the command on which its groups of settings depend.
+    """
+    program, _, function = name.rpartition(".")
+    command: Any = getattr(import_benchmark(program), function) if program else stage(name)
+    reader = command.stage.settings
+    tree = compose_choice(run, *reader.choice, *choice, more=more)
+    return write_groups(run, name, reader.names(options), tree)
+
+
+def write_groups(run: Run, name: str, groups: tuple[str, ...], tree: Mapping[str, Any]) -> str:
+    """Write groups of a configuration for a job; return the file's name.
+
+    Snakemake records no parameters that are paths, hence a text.
+    """
+    folder = Path(run.results, ".settings")
+    return str(write_settings(folder, name, groups, tree, dry=run.is_dry()))
+
+
+def import_benchmark(name: str) -> Any:
+    """Return the module of a program in `BENCHMARKS`."""
+    folder = os.path.abspath(BENCHMARKS)  # noqa: PTH100 (keeps symbolic links)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return import_module(name)
+
+
+def code_of(*names: str) -> Callable[[Wildcards], str]:
+    """Return a parameter with the hash of commands and modules, computed where a job needs it."""
+    return lambda wildcards: source_hash(*names)
+
+
+def program_of(name: str) -> Callable[[Wildcards, int], str]:
+    """Return a parameter with the file and the command of a program, such as "costs.cost".
+
+    It asks for threads because such parameters are not recorded: a run in another folder, with
+    another relative path, repeats no job.
+    """
+    file, command = name.split(".")
+    return lambda wildcards, threads: f"{BENCHMARKS}/{file}.py {command}"
+
+
+def program_code(name: str, *stages: str) -> str:
+    """Return the hash of a program, such as "costs.cost", and of the stages that it runs."""
+    return source_hash(f"workflow/benchmarks/{name.partition('.')[0]}.py", *stages)
+
+
+def program_code_of(name: str, *stages: str) -> Callable[[Wildcards], str]:
+    """Return a parameter with the hash of `program_code`, computed where a job needs it."""
+    return lambda wildcards: program_code(name, *stages)
+
+
+def stress_code() -> str:
+    """Return the hash of the stress tests."""
+    return source_hash(*(f"tests/stress/{path.name}" for path in STRESS_TESTS.glob("*.py")))
+
+
+def as_options(wildcards: Wildcards, input: Any) -> list[str]:
+    """Return named inputs as options of the same names.
+
+    The weights of a network stand for its folder; bundles have the same ending, and are files.
+    """
+    options = []
+    for name, files in input.items():
+        for path in [files] if isinstance(files, str) else files:
+            is_weights = path.endswith(".safetensors") and not path.endswith(BUNDLE_SUFFIX)
+            value = Path(path).parent if is_weights else path
+            options.append(f"--{name.replace('_', '-')}={value}")
+    return options
+
+
+def any_of(names: Sequence[str]) -> str:
+    """Return the pattern of a wildcard that is one of some names; "none" if there are none."""
+    return "|".join(names) or "none"

@@ -1,0 +1,97 @@
+"""Points of sweeps: their files, their data, threads and code."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from psfdae.methods import method
+from psfdae_paper.configuration.aligners import swept_networks
+from psfdae_paper.configuration.sweep import sweep_names
+from psfdae_paper.source import source_hash
+from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
+from psfdae_paper.workflow.datasets import stars_file
+from psfdae_paper.workflow.run import Run, Wildcards, exit_in_one_line
+
+FIGURES = ("parallel", "response")
+
+
+@cache
+@exit_in_one_line()
+def sweep_plan(run: Run, name: str) -> Plan:
+    """Return the points of a sweep; a wrong key ends the program."""
+    plan = plan_sweep(name, run.overrides)
+    # Points are computed once, and checked here.
+    assert plan.points
+    return plan
+
+
+@exit_in_one_line()
+def sweep_point(run: Run, wildcards: Wildcards) -> Point:
+    """Return the point of a job; a name that the sweep does not have ends the program."""
+    points = sweep_plan(run, wildcards.sweep).points
+    if wildcards.point not in points:
+        raise SweepError(f"sweep {wildcards.sweep} has no point {wildcards.point}")
+    return points[wildcards.point]
+
+
+def result_file(run: Run, sweep: str, point: str) -> str:
+    """Return the result of a point."""
+    return f"{run.results}/sweeps/{sweep}/points/{point}/result.json"
+
+
+def sweep_data(run: Run, name: str) -> dict[str, str]:
+    """Return the products that all points of a sweep share, by role."""
+    sweep = sweep_plan(run, name).sweep
+    if sweep.dataset:
+        return {"stars": stars_file(run, sweep.dataset)}
+    folder = f"{run.results}/data/alignment"
+    return {
+        "states": f"{folder}/{'grid' if sweep.model == 'original' else 'train'}.h5",
+        "validation": f"{folder}/validation.h5",
+        "test": f"{folder}/uniform.h5",
+    }
+
+
+def known_results(run: Run, wildcards: Wildcards) -> list[str]:
+    """Return the results from which the values of an adaptive sweep's trial are proposed."""
+    earlier = sweep_plan(run, wildcards.sweep).earlier_trials(sweep_point(run, wildcards))
+    return [result_file(run, wildcards.sweep, point.name) for point in earlier]
+
+
+def point_threads(run: Run, wildcards: Wildcards) -> int:
+    """Return the threads of a point: the largest number of its groups of settings."""
+    config = sweep_point(run, wildcards).config
+    groups = [group for group in config.values() if isinstance(group, dict)]
+    return max(int(group.get("threads", 1)) for group in groups)
+
+
+@cache
+def sweep_code(run: Run, name: str) -> str:
+    """Return the hash of a point's code: its model's, and the search's of an adaptive sweep."""
+    from psfdae_paper.stages.sweep import training_module
+
+    sweep = sweep_plan(run, name).sweep
+    search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
+    own = [] if sweep.model in swept_networks() else [method(sweep.model).__module__]
+    return source_hash("sweep point", training_module(sweep.model), *own, *search)
+
+
+def sweep_results(run: Run, name: str) -> list[str]:
+    """Return the results of all points of a sweep."""
+    return [result_file(run, name, point) for point in sweep_plan(run, name).points]
+
+
+@exit_in_one_line()
+def sweep_products(run: Run) -> list[str]:
+    """Return all files that the target sweep builds."""
+    name = run.sweep
+    if not name:
+        there = ", ".join(sweep_names())
+        raise SweepError(f"which sweep? --config sweep=NAME, one of {there}")
+    sweep_plan(run, name)
+    folder = f"{run.results}/sweeps/{name}"
+    return [
+        *(f"{folder}/{file}" for file in ("summary.csv", "best.yaml")),
+        *(f"{folder}/figures/{kind}.png" for kind in FIGURES),
+        f"{run.results}/mlflow/sweep_{name}.csv",
+    ]
