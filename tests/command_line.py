@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from click.testing import CliRunner
 
-from psfdae.commands.cli import main
+from psfdae.commands.cli import main, present_name
 
 
 def psfdae(*words):
-    """A command's result; a test fails on a traceback."""
+    """A command's result; a test fails on a traceback. `paper` before a stage may be left out."""
+    return typed(*present_name(str(words[0])), *words[1:])
+
+
+def typed(*words):
+    """The result of the words as they are typed."""
     result = CliRunner().invoke(main, list(map(str, words)))
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result

@@ -21,6 +21,7 @@ from psfdae.denoise.bundle import (
     write_bundle,
 )
 from psfdae.denoise.flux_model import FluxModel, robust_flux
+from psfdae.methods.bundle_info import FORMAT_VERSION
 from psfdae.methods.networks.dae import build_dae, run_network
 from psfdae.training import packing
 
@@ -98,7 +99,7 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
     newer = with_text(file.read_bytes(), lambda text: text.update(format_version=7, info="other"))
     path.write_bytes(newer)
     line = command_line.refused("describe", path)
-    assert f"{path}: format 7" in line and "format 1" in line
+    assert f"{path}: format 7" in line and f"format {FORMAT_VERSION}" in line
 
 
 @pytest.mark.parametrize(

@@ -401,7 +401,7 @@ def test_errors_of_stars_on_a_halo_include_the_error_of_the_halo(sky, light, mid
     add_stamps(added, flux[faint, None, None] * stamps(*place[faint].T), *place[faint].T)
     image = np.minimum(fits.getdata(folder / "i.fits") + rng.poisson(added), 6e4)
     source = ImageInput(image, catalogue=place, origin=0, gain=1.0, saturate=6e4)
-    rows = crowded.photometry(load_model(model), source.open(STAMP)).stars[faint]
+    rows = crowded.photometry(load_model(model), open_observation(source, STAMP)).stars[faint]
     pull = ((rows["flux"] - flux[faint]) / rows["flux_error"])[rows["flags"] == 0]
     assert len(pull) > 0.6 * len(rows) > 12
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.5 and np.abs(pull).max() < 3.5

@@ -8,19 +8,19 @@ from command_line import refused as refusal
 from psfdae.base.files import ProductError
 from psfdae.base.reading import read_yaml
 
-GOOD = b"# One.\nepochs: 12\nbatch: 32"
-TRAIN = "train/onecycle.yaml"
+GOOD = b"# @package _global_\ntrain:\n  epochs: 12"
+PRESET = "preset/fast.yaml"
 
 
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        (TRAIN, GOOD + b"\n\tlr: 3", ("line 4, column 1", "'\\t'")),
-        (TRAIN, GOOD + b"\nlr: 0.1\nlr: 0.2", ("line 5, column 1", "'lr'")),
-        (TRAIN, GOOD + b"\nlr: \xff", ("line 4, column 5", "0xff")),
-        (TRAIN, b"epochs: " + b"[" * 1000, (TRAIN, "nested too deeply")),
-        (TRAIN, b"epochs: " + b"x" * 10_000, ("train.epochs",)),
-        ("gmm/default.yaml", b"- stars\n", ("gmm/default",)),
+        (PRESET, GOOD + b"\n\tlr: 3", ("line 4, column 1", "'\\t'")),
+        (PRESET, GOOD + b"\n  lr: 0.1\n  lr: 0.2", ("line 5, column 3", "'lr'")),
+        (PRESET, GOOD + b"\n  lr: \xff", ("line 4, column 7", "0xff")),
+        (PRESET, b"train:\n  epochs: " + b"[" * 1000, (PRESET, "nested too deeply")),
+        (PRESET, GOOD.replace(b"12", b"x" * 10_000), ("train.epochs",)),
+        (PRESET, b"- stars\n", ("preset: unknown key",)),
     ],
 )
 def test_a_mistake_is_one_short_line_with_its_place(config_folder, name, content, words):
@@ -28,7 +28,7 @@ def test_a_mistake_is_one_short_line_with_its_place(config_folder, name, content
     line = refusal("config")
     assert all(word in line for word in words), line
     assert len(line) < 500
-    if name == TRAIN:
+    if name == PRESET:
         assert refusal("fit", "dae", "--stars=x", "--out=y") == line
 
 

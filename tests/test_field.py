@@ -146,7 +146,7 @@ def size(images):
 def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     faint = Faint(1000, snr)
     result = faint.measured(field)
-    measured = result.measured
+    measured = result.measurements
     error = np.sqrt(np.einsum("nii->ni", measured.covariance))
     off = np.stack(
         [measured.flux - 1000, measured.background - 3, *(measured.centre.T - faint.centre.T)], 1
@@ -241,9 +241,9 @@ def test_flux_and_sky_that_are_known_are_taken(field):
     faint = Faint(300, 20.0)
     result = faint.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
     assert faint.mse(result) < faint.mse(faint.measured(field))
-    assert result.measured.flux == pytest.approx(1000, rel=0.02)
-    assert result.measured.background == pytest.approx(3.0)
-    assert (result.measured.covariance[:, 1, 1] == 0).all()
+    assert result.measurements.flux == pytest.approx(1000, rel=0.02)
+    assert result.measurements.background == pytest.approx(3.0)
+    assert (result.measurements.covariance[:, 1, 1] == 0).all()
     # A method of flux 1 is that, and the same as other methods see it.
     restored = field.estimate((faint.stamps - 3) / 1000, faint.sigma / 1000, faint.position).psf
     assert restored == pytest.approx(result.psf, abs=2e-3)
@@ -255,7 +255,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field):
     joint = field.measure(*inputs)
     batched = replace(field, limits=PosteriorLimits(stars_at_once=13)).measure(*inputs)
     assert batched.psf == pytest.approx(joint.psf, abs=1e-7)
-    assert batched.measured.flux == pytest.approx(joint.measured.flux, rel=1e-9)
+    assert batched.measurements.flux == pytest.approx(joint.measurements.flux, rel=1e-9)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
@@ -265,7 +265,7 @@ def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr):
     limits = PosteriorLimits(min_nodes=round(PosteriorLimits.max_node_area_px2 * 16))
     every = faint.measured(replace(field, limits=limits))
     assert np.abs(result.psf - every.psf).max() < 0.01 * every.sigma.max()
-    assert result.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
+    assert result.measurements.flux == pytest.approx(every.measurements.flux, rel=1e-3)
     assert result.evidence == pytest.approx(every.evidence, abs=2e-3)
 
 
@@ -608,8 +608,8 @@ def test_sigma_knows_the_doubt_about_the_flux(field, snr):
     """Flux and sky found: the nine brightest pixels are within σ as often as of a normal law."""
     faint = Faint(500, snr)
     result = faint.measured(field)
-    error = np.abs(result.measured.flux[:, None, None] * result.psf - 1000 * faint.psf)
-    sigma = result.measured.flux[:, None, None] * result.sigma
+    error = np.abs(result.measurements.flux[:, None, None] * result.psf - 1000 * faint.psf)
+    sigma = result.measurements.flux[:, None, None] * result.sigma
     bright = result.psf >= np.sort(result.psf.reshape(500, -1))[:, -9, None, None]
     for width, part in ((1.0, 0.683), (1.96, 0.95)):
         assert (error <= width * sigma)[bright].mean() == pytest.approx(part, abs=0.04)

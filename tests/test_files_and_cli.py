@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from command_line import printed, psfdae, refused
+from command_line import printed, psfdae, refused, typed
 from psfdae.base import progress
 from psfdae.base.files import (
     Column,
@@ -396,7 +396,7 @@ def test_the_help_lists_the_calls_of_python_and_the_stages_below_paper():
 def test_a_former_name_of_a_command_works_and_says_the_present_one(former, present):
     word, *more = former.split()
     new_word = " ".join(present.split()[: len(present.split()) - len(more)])
-    output = psfdae(*former.split(), "--help").output
+    output = typed(*former.split(), "--help").output
     line, _, help_text = output.partition("\n")
     assert line == f"psfdae: {word} is now psfdae {new_word}"
     assert f" {present} " in help_text.splitlines()[0]

@@ -89,7 +89,7 @@ def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, n
         assert (psf.psf[1] == mixture).all()
         psfs = kind.mixture.estimate(images, LEVEL, position).psf
         assert np.abs(psf.psf[0] - psfs[0]).max() > 1e-5
-        assert psf.explained.tolist() == [True, False, True]
+        assert psf.is_explained.tolist() == [True, False, True]
 
 
 def test_sigma_covers_the_errors(stars, data, fitted, noisy):

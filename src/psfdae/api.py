@@ -342,7 +342,7 @@ def fit(
 
     Returns
     -------
-    StarModel
+    PsfModel
         `save` writes it to a file.
 
     Raises
@@ -354,7 +354,7 @@ def fit(
     Examples
     --------
     >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
-    StarModel('mine', 16×16 px of 1", S/N 5 … 50)
+    PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
     model = fit_model(stars, method, name=name, licence=licence, **settings)
     return PsfModel(model.bundle, model.method)

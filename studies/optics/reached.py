@@ -61,7 +61,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
             row |= {"noise_level": level, "mse": mse, "stderr": stderr, "bound": limit}
             row |= {"tight": tight, "ratio": mse / limit}
             row |= {"ratio_stderr": cluster_mean(gap, pair.field.to_numpy())[1] / limit}
-            row["flagged"] = int((pairs.explained == 0).sum())
+            row["flagged"] = int((pairs.is_explained == 0).sum())
             if reference == "realisation":
                 floor = floors[np.isclose(floors.noise_level, level)]
                 floored = pairs.merge(floor[["star", "mse_floor"]], on="star")
