@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from pydantic import BaseModel
 
 from psfdae.base.files import Product, ProductError, as_yaml, write_text
 from psfdae.base.reading import read_yaml
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 STATIC = (
     *("scene.name", "telescope", "framing.stamp_px", "framing.jitter_px", "framing.tie"),

@@ -12,15 +12,12 @@ from dataclasses import dataclass
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.files import write_bytes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from psfdae.base.types import Axes, Figure
 
 WIDTH_IN = 8.0
 """Width of every figure in inches."""

@@ -21,17 +21,13 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.errors import Error, no_such_file, require_file
+from psfdae.base.types import DataFrame, Dataset, File, HDUList
 from psfdae.base.version import __version__
-
-if TYPE_CHECKING:
-    from astropy.io.fits import HDUList
-    from h5py import Dataset, File
-    from pandas import DataFrame
 
 
 class ProductError(Error, RuntimeError):

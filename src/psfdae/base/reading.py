@@ -9,15 +9,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from psfdae.base.errors import no_such_file, require_file
 from psfdae.base.files import ProductError, map_texts, strip_apostrophe
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from psfdae.base.types import DataFrame
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

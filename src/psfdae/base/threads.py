@@ -14,10 +14,9 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
+from psfdae.base.types import ThreadpoolController
 
 Batch = TypeVar("Batch")
 Result = TypeVar("Result")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from astropy.table import Column, QTable, Table
     from astropy.units import Quantity, UnitBase
     from astropy.wcs import WCS
+    from batoid import CompoundOptic
     from h5py import Dataset, File
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
@@ -23,11 +24,13 @@ if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel
     from scipy.sparse import csc_array
     from threadpoolctl import ThreadpoolController
+    from torch import Tensor
+    from torch.nn import Module
 else:
     BaseCoordinateFrame = SkyCoord = BinTableHDU = HDUList = Header = ImageHDU = PrimaryHDU = Any
     CCDData = NDData = Column = QTable = Table = Quantity = UnitBase = WCS = Any
     Dataset = File = Axes = LineCollection = Figure = DataFrame = GriddedPSFModel = Any
-    csc_array = ThreadpoolController = Any
+    csc_array = ThreadpoolController = CompoundOptic = Module = Tensor = Any
 
 __all__ = [
     "WCS",
@@ -36,6 +39,7 @@ __all__ = [
     "BinTableHDU",
     "CCDData",
     "Column",
+    "CompoundOptic",
     "DataFrame",
     "Dataset",
     "Figure",
@@ -45,12 +49,14 @@ __all__ = [
     "Header",
     "ImageHDU",
     "LineCollection",
+    "Module",
     "NDData",
     "PrimaryHDU",
     "QTable",
     "Quantity",
     "SkyCoord",
     "Table",
+    "Tensor",
     "ThreadpoolController",
     "UnitBase",
     "csc_array",

@@ -11,7 +11,8 @@ import numpy as np
 
 from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import from_tree, read_yaml
-from psfdae.base.settings import Config, dump_deciding
+from psfdae.base.settings import Config, Evaluation, dump_deciding
+from psfdae.methods.bundle_info import BundleInfo
 from psfdae.methods.interface import (
     CONFIG,
     HISTORY,
@@ -26,8 +27,6 @@ from psfdae.methods.interface import (
 from psfdae.methods.networks.settings import DaeSettings, Train
 
 if TYPE_CHECKING:
-    from psfdae.base.settings import Evaluation
-    from psfdae.methods.bundle_info import BundleInfo
     from psfdae.methods.networks.dae import DaeNetwork
 
 WEIGHTS = "dae.safetensors"

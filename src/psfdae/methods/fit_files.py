@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from pydantic import BaseModel
 
 from psfdae.base.belonging import TRAINED_ON, require_training, write_origin
 from psfdae.base.files import Product, as_csv, write_text
 from psfdae.methods.interface import Method, Storage
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 
 def get_storage(method: type[Method]) -> Storage:

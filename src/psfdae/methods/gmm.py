@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
 from psfdae.base.settings import Count, Group, Positive
+from psfdae.methods.bundle_info import BundleInfo
 from psfdae.methods.interface import (
     Estimate,
     FitError,
@@ -31,9 +32,6 @@ from psfdae.methods.mixture.fit import best_on_validation, k_means, mixture_arra
 from psfdae.methods.mixture.posterior import flux_factor, posterior_mean
 from psfdae.methods.mixture.prior import MixturePrior
 from psfdae.stars.noise import NoiseModel
-
-if TYPE_CHECKING:
-    from psfdae.methods.bundle_info import BundleInfo
 
 
 class Gmm(Group):

@@ -23,18 +23,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from psfdae.base.errors import Error
 from psfdae.base.files import Column, read_product, write_product
-from psfdae.base.settings import Config, Group
+from psfdae.base.settings import Config, Evaluation, Group
+from psfdae.methods.bundle_info import BundleInfo
+from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.noise import NoiseModel, draw_levels
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from psfdae.base.settings import Evaluation
-    from psfdae.methods.bundle_info import BundleInfo
-    from psfdae.stars.bright_stars import BrightStars
 
 CONFIG, HISTORY = "config.yaml", "history.csv"
 """Resolved configuration and course of a training, in the folder of a network."""

@@ -7,12 +7,11 @@ each star, and rows of tables.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from psfdae.methods.interface import Estimate
+from psfdae.methods.interface import Estimate
 
 
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:

@@ -24,15 +24,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from psfdae.base.threads import run_parallel
+from psfdae.base.types import Tensor
 from psfdae.optics.pupil import Pupil
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 Backend = Literal["numpy", "torch"]
 Precision = Literal["complex64", "complex128"]

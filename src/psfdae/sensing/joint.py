@@ -10,10 +10,11 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
+from psfdae.base.types import Table
 from psfdae.optics.derivatives import SampledStamps
 from psfdae.optics.pupil import SamplingError
 from psfdae.sensing.climbing import (
@@ -28,9 +29,6 @@ from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, Wav
 from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
 from psfdae.telescope.settings import Seeing
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 
 @dataclass(frozen=True)

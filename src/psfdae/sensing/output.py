@@ -6,18 +6,14 @@ prints the report.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from psfdae.base.types import HDUList
 from psfdae.base.version import __version__
 from psfdae.image.errors import ascii_line
 from psfdae.image.tables import fits_values
 from psfdae.sensing.joint import Joint
 from psfdae.sensing.results import Wavefronts
-
-if TYPE_CHECKING:
-    from astropy.io.fits import HDUList
 
 
 def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:

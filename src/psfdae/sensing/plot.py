@@ -6,15 +6,11 @@ pupil, or the stamp, of each star at its field angle.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from psfdae.base.figures import WIDTH_IN, apply_style, new_figure
+from psfdae.base.types import Figure
 from psfdae.sensing.results import Wavefronts, flat_modes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @apply_style

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import NonNegativeInt
 
 from psfdae.base.arguments import check_arguments, real_numbers
+from psfdae.base.types import Table
 from psfdae.image.stamps import Stamps, central_pixel
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, fit_telescope
@@ -23,9 +23,6 @@ from psfdae.sensing.stars import Photons, SensingError, StarModes, StarOptics, W
 from psfdae.sensing.summary import nearest_modes, summarise_modes
 from psfdae.telescope.field import Terms, build_terms, model_telescope
 from psfdae.telescope.settings import OwnTelescope, read_telescope
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 
 @check_arguments

@@ -15,19 +15,16 @@ vertex by the rotation vector (tilt x, tilt y, 0).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psfdae.base.errors import Error
+from psfdae.base.types import CompoundOptic
 from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_images
-
-if TYPE_CHECKING:
-    from batoid import CompoundOptic
-
-    from psfdae.telescope.aberrations import Lens, Mirror, Prescription
-    from psfdae.telescope.settings import Telescope
+from psfdae.telescope.aberrations import Lens, Mirror, Prescription
+from psfdae.telescope.settings import Telescope
 
 
 class RayTracingError(Error, ValueError):

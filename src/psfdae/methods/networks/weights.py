@@ -7,16 +7,13 @@ import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from psfdae.base.errors import no_such_file, require_file
 from psfdae.base.files import ProductError, atomic_path
-
-if TYPE_CHECKING:
-    from torch import Tensor
-    from torch.nn import Module
+from psfdae.base.types import Module, Tensor
 
 Network = TypeVar("Network", bound="Module")
 
